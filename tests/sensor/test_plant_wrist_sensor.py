@@ -80,11 +80,13 @@ def arm(builder, time_step, sampled=True, base=None, wall=None, X_FTool=None):
     return plant, weld
 
 
-def moving(time_step=0.0, config=None, frame=None, **options):
+def moving(time_step=0.0, config=None, frame=None, without_gravity=None, **options):
     """Return a running Diagram with the sensor at the wrist; constant torques drive the arm."""
     sensor_options = {k: options.pop(k) for k in ("period", "model_instance") if k in options}
     builder = DiagramBuilder()
     plant, weld = arm(builder, time_step, **options)
+    if without_gravity:
+        plant.set_gravity_enabled(plant.GetModelInstanceByName(without_gravity), False)
     if frame is not None:
         sensor_frame = plant.GetFrameByName("sensor")
         frame = plant.AddFrame(FixedOffsetFrame("S", sensor_frame, frame))
@@ -264,6 +266,15 @@ def test_a_weld_from_tool_to_arm_gives_the_wrench_on_the_tool():
     wrench = sensor.GetOutputPort("measured_wrench_S")
     wrench = wrench.Eval(sensor.GetMyContextFromRoot(simulator.get_context()))
     np.testing.assert_allclose(wrench, reading(twin, "measured_wrench_S"), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("off", ["gripper", "arm"])
+def test_specific_force_has_no_gravity_if_the_tool_has_none(off):
+    """Then V phi equals the wrench nevertheless."""
+    run = moving(without_gravity=off)
+    run.simulator.AdvanceTo(1e-4)
+    wrench = reading(run, "measured_wrench_S")
+    np.testing.assert_allclose(load_wrench(run), wrench, rtol=0, atol=1e-11)
 
 
 def test_outputs_before_the_first_sample_are_flagged():

@@ -93,7 +93,7 @@ class _Weld(NamedTuple):
 def AddWristSensor(
     builder: DiagramBuilder,
     plant: MultibodyPlant,
-    joint_or_frame: WeldJoint | Frame,
+    joint_or_frame: Joint | Frame,
     config: WristSensorConfig | None = None,
     *,
     period: float | None = None,
@@ -169,7 +169,7 @@ class PlantWristSensor(LeafSystem):
     def __init__(
         self,
         plant: MultibodyPlant,
-        joint_or_frame: WeldJoint | Frame,
+        joint_or_frame: Joint | Frame,
         config: WristSensorConfig,
         period: float | None = None,
         model_instance: ModelInstanceIndex | None = None,
@@ -340,7 +340,7 @@ def _steps(step: float | None, period: float | None) -> tuple[float, int]:
     return step, round(count)
 
 
-def _sensor_frame(plant: MultibodyPlant, joint_or_frame: object) -> tuple[Frame, WeldJoint]:
+def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple[Frame, WeldJoint]:
     """Return the sensor frame S and the weld beyond it."""
     expect((Joint, Frame), joint_or_frame, f"{_WHERE}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
@@ -380,11 +380,11 @@ def _joints(plant: MultibodyPlant) -> list[Joint]:
 def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
     """Return the arm's body at the weld, and all bodies of the load.
 
-    The load is on the side without the world, or else (floating bases) on the child's side.
+    The load is on the side of the weld that is not connected to the world.
     """
     neighbours: dict[BodyIndex, list[BodyIndex]] = {}
     for joint in _joints(plant):
-        if joint.index() != weld.index() and not joint.is_ephemeral():
+        if joint.index() != weld.index():
             parent, child = joint.parent_body().index(), joint.child_body().index()
             neighbours.setdefault(parent, []).append(child)
             neighbours.setdefault(child, []).append(parent)
