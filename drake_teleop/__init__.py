@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from drake_teleop.logs.read.reading import read_log
     from drake_teleop.station.result import SimulationResult
     from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioNames
+    from drake_teleop.station.sensor.plant_wrist_sensor import AddWristSensor
     from drake_teleop.station.simulation import simulate
     from drake_teleop.station.station import MakeIdentificationStation, MakeTeleopStation
 
 __all__ = [
+    "AddWristSensor",
     "DrakeTeleopError",
     "Identification",
     "LoadScenario",
@@ -63,6 +65,7 @@ _HOMES = {
     "logs.read.reading": ("read_log",),
     "station.result": ("SimulationResult",),
     "station.scenario": ("LoadScenario", "Scenario", "ScenarioNames"),
+    "station.sensor.plant_wrist_sensor": ("AddWristSensor",),
     "station.simulation": ("simulate",),
     "station.station": ("MakeIdentificationStation", "MakeTeleopStation"),
 }

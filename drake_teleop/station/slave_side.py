@@ -18,7 +18,7 @@ from drake_teleop.station.estimation.load_estimator import LoadEstimator
 from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE, ForceScaling
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
-from drake_teleop.station.sensor.wrist_sensor import AddWristSensor
+from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
 from drake_teleop.station.signals import POSE_OF
 from drake_teleop.station.slave.arm import ForwardKinematics
 from drake_teleop.station.slave.drake_contact import DrakeContact
@@ -206,7 +206,7 @@ def _add_slave_blocks(
     monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, MONITOR_PERIOD))
     builder.Connect(state, monitor.GetInputPort("slave_state"))
 
-    sample = AddWristSensor(
+    sample = AddCompiledWristSensor(
         builder,
         slave,
         sensor,

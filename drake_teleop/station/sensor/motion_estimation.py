@@ -297,15 +297,10 @@ def estimate_into(constants, memory, arm, reading, sample):
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
-    starts = memory[0] == 0.0
     motion, joints = memory[_MOTION:_JOINTS], memory[_JOINTS:][: _PER_JOINT * n]
     angles = sample[JOINT_POSITION]
-    put(angles, 0, reading, READ_ANGLES.start, n)
-    if starts:
-        settle(constants[_LOW_PASSES:_ANGULAR_GAINS], joints[5 * n :], angles)
-    low_pass(constants[_LOW_PASSES:_ANGULAR_GAINS], joints[5 * n :], angles)
-    _delay_paths(constants, memory, n, reading, sample)
-    if starts:
+    _align_paths(constants, memory, n, reading, sample)
+    if memory[0] == 0.0:
         for i in range(3 * n):
             joints[2 * n + i] = angles[i % n]
     _differentiate(constants, joints, angles)
@@ -315,6 +310,32 @@ def estimate_into(constants, memory, arm, reading, sample):
     else:
         _convert_accelerometer(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
+
+
+@njit(cache=True)
+def estimate_with_gyroscope_into(constants, memory, reading, sample):
+    """Convert one reading to one sample without an arm's kinematics.
+
+    Arguments as for `estimate_into` with source `accelerometer`, but the first three of the n
+    "joint angles" are the measured angular velocity of S, in S [rad/s].
+    """
+    n = sample.shape[0] - JOINT_POSITION.start
+    motion = memory[_MOTION:_JOINTS]
+    _align_paths(constants, memory, n, reading, sample)
+    put(motion, 3, sample, JOINT_POSITION.start, 3)
+    _convert_accelerometer(constants, memory, motion[:3], motion, sample)
+    memory[0] += 1.0
+
+
+@njit(cache=True)
+def _align_paths(constants, memory, n, reading, sample):
+    sections, angles = constants[_LOW_PASSES:_ANGULAR_GAINS], sample[JOINT_POSITION]
+    filtered = memory[_JOINTS:][: _PER_JOINT * n][5 * n :]
+    put(angles, 0, reading, READ_ANGLES.start, n)
+    if memory[0] == 0.0:
+        settle(sections, filtered, angles)
+    low_pass(sections, filtered, angles)
+    _delay_paths(constants, memory, n, reading, sample)
 
 
 @njit(cache=True)

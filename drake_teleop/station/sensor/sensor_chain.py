@@ -37,6 +37,9 @@ _CHANNELS = 12
 #: Standard normal numbers for NOISE_BLOCK samples: 12 for each, then 12 for the random walks.
 NOISE_SIZE = _CHANNELS * (NOISE_BLOCK + 1)
 
+#: Samples for which a lost sample stays flagged, so that the log contains the flag.
+LOST_FLAG_SAMPLES = 40
+
 #: Keys of `drake_teleop.station.sensor.presets.PRESETS`.
 PRESET_NAMES = (
     *("ideal", "jr3_85m35a3", "ati_gamma_imu", "ati_mini45", "bota_sensone", "bota_rokubi"),
@@ -226,7 +229,8 @@ class WristSensorConfig:
         filtered = not self.ideal and self.low_pass != "none"
         if filtered and self.bandwidth_hz >= 0.45 * rate_hz:
             raise DrakeTeleopError(
-                f"{self.bandwidth_hz:g} Hz is too near to half of rates.sensor_hz ({rate_hz:g} Hz)",
+                f"{self.bandwidth_hz:g} Hz is too near to half of the sensor's rate "
+                f"({rate_hz:g} Hz)",
                 where=f"{where}.bandwidth_hz",
                 remedy="lower the bandwidth below 0.45 of the sensor's rate, or set low_pass: none",
             )

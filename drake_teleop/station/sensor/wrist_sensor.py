@@ -51,6 +51,7 @@ from drake_teleop.station.sensor.motion_estimation import (
 )
 from drake_teleop.station.sensor.sensor_chain import (
     FILTERED,
+    LOST_FLAG_SAMPLES,
     NOISE_BLOCK,
     NOISE_SIZE,
     OFFSET,
@@ -88,8 +89,6 @@ _MAX_QUEUED_STEPS = 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _CHECK_PERIOD, _ACCELERATION_TOLERANCE = 0.1, 1e-6
-#: Samples for which a lost sample stays flagged, so that the log contains the flag.
-_LOST_FLAG_SAMPLES = 40
 #: Value of `touching_W` in `sample_step` that selects the compiled contact law.
 _USE_CONTACT_LAW = np.zeros(0)
 
@@ -149,7 +148,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     sample = memory[:size]
     put(memory, size, memory, 0, size)
     if not is_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATED] = LOST + _LOST_FLAG_SAMPLES
+        sample[SATURATED] = LOST + LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATED] - 1.0
     if ideal:
@@ -578,7 +577,7 @@ def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     return sample
 
 
-def AddWristSensor(
+def AddCompiledWristSensor(
     builder: DiagramBuilder,
     slave: SlavePlant,
     config: WristSensorConfig,

@@ -1,0 +1,433 @@
+"""Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
+
+The wrench is the reaction of the weld, the motion that of the sensor frame S. Both come from the
+plant's output ports, so joints, contact and controllers are arbitrary. With sampled output ports
+(Drake's default for discrete plants) reaction and acceleration belong to the state before a step,
+pose and velocity to the state after it; the block holds pose and velocity to pair the four.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common import RandomDistribution
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialAcceleration, SpatialForce, SpatialVelocity
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, Joint, ModelInstanceIndex, WeldJoint
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    LeafSystem,
+)
+from pydrake.systems.primitives import RandomSource
+
+from drake_teleop.common.blocks import ONE_DICT
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.vectors import (
+    apply,
+    cross,
+    minus,
+    nine,
+    plus,
+    plus_cross,
+    put,
+    three,
+    transposed,
+)
+from drake_teleop.load.regressor import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    JOINT_POSITION,
+    LOST,
+    SATURATED,
+    SPECIFIC_FORCE,
+    TIME,
+    WRENCH,
+    WRENCH_AND_MOTION,
+    sample_parts,
+    sample_size,
+)
+from drake_teleop.station.sensor.motion_estimation import (
+    MotionEstimationConfig,
+    estimate_with_gyroscope_into,
+    motion_estimator,
+)
+from drake_teleop.station.sensor.sensor_chain import (
+    LOST_FLAG_SAMPLES,
+    NOISE_BLOCK,
+    NOISE_SIZE,
+    TRUE_ANGLES,
+    WristSensorConfig,
+    is_plausible,
+    read_into,
+    sensor_chain,
+)
+
+Array = NDArray[np.float64]
+
+_WHERE = "AddWristSensor"
+#: Default sampling period for continuous plants [s].
+_DEFAULT_PERIOD = 1e-3
+#: Tolerance of whole multiples of the plant's time step, in steps.
+_STEP_TOLERANCE = 1e-6
+# Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
+# of the reaction (on the joint's child) as a wrench on the load.
+_POSITION, _ORIENTATION, _JOINT_ORIENTATION, _JOINT_POSITION, _GRAVITY, _SIGN = 0, 3, 12, 21, 24, 27
+# Configuration: R_WB, angular velocity of B in W, joint positions.
+_POSE_SIZE = 12
+
+
+class _Weld(NamedTuple):
+    reaction: int
+    body: int
+    geometry: Array
+
+
+def AddWristSensor(
+    builder: DiagramBuilder,
+    plant: MultibodyPlant,
+    joint_or_frame: Joint | Frame,
+    config: WristSensorConfig | None = None,
+    *,
+    period: float | None = None,
+    model_instance: ModelInstanceIndex | None = None,
+    name: str = "wrist_sensor",
+) -> PlantWristSensor:
+    """Add a wrist sensor to a finalized plant of this builder, and connect it.
+
+    Args:
+        joint_or_frame: weld between arm and tool; S is then its frame on the arm. Or S itself, a
+            frame on a body of the arm with exactly one weld to a body beyond it.
+        config: errors of the sensor; without it the sensor is ideal.
+        period: sampling period [s]; a multiple of a discrete plant's time step, by default equal
+            to it, or 1 ms for a continuous plant.
+        model_instance: source of `joint_position`; all joints of the plant by default.
+        name: name of the block; its noise source is `name`_noise.
+
+    Raises:
+        DrakeTeleopError: if the plant is not finalized, not in this builder or has no such weld, if
+            the tool has no mass, or for a period or bandwidth that does not fit.
+    """
+    _check_plant(builder, plant)
+    sensor = PlantWristSensor(
+        plant, joint_or_frame, config or WristSensorConfig(ideal=True), period, model_instance
+    )
+    builder.AddNamedSystem(name, sensor)
+    state = plant.get_state_output_port(*([] if model_instance is None else [model_instance]))
+    for port, source in {
+        "state": state,
+        "body_poses": plant.get_body_poses_output_port(),
+        "body_spatial_velocities": plant.get_body_spatial_velocities_output_port(),
+        "body_spatial_accelerations": plant.get_body_spatial_accelerations_output_port(),
+        "reaction_forces": plant.get_reaction_forces_output_port(),
+    }.items():
+        builder.Connect(source, sensor.GetInputPort(port))
+    if sensor.HasInputPort("noise"):
+        noise = RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * sensor.period)
+        builder.AddNamedSystem(f"{name}_noise", noise)
+        builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
+    return sensor
+
+
+class PlantWristSensor(LeafSystem):
+    """Sensor of force, torque and motion of S at a weld of a plant, see `AddWristSensor`.
+
+    The outputs hold the last sample, which belongs to the instant `sample_time`. The angular
+    velocity is that of an ideal gyroscope on the path of the joint encoders: their low-pass, delay
+    and rounding, no noise. Faster paths wait for the slowest one.
+
+    .. pydrake_system::
+
+        name: PlantWristSensor
+        input_ports:
+        - state: [q; v] of the plant or of one model instance
+        - body_poses
+        - body_spatial_velocities
+        - body_spatial_accelerations
+        - reaction_forces
+        - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
+        output_ports:
+        - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So, Eq. (1) [N, N m]
+        - specific_force_S: (3,) a - g of So [m/s^2]
+        - angular_velocity_S: (3,) [rad/s]
+        - angular_acceleration_S: (3,) [rad/s^2]
+        - status: 0 valid; 1 a channel is saturated; 2 and above no sample yet, or an impossible one
+        - joint_position: (n,) positions q
+        - sample_time: instant of the sample [s]
+        - sample: the parts above side by side, as `ForceScaling` reads them
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joint_or_frame: Joint | Frame,
+        config: WristSensorConfig,
+        period: float | None = None,
+        model_instance: ModelInstanceIndex | None = None,
+    ) -> None:
+        super().__init__()
+        S, joint = _sensor_frame(plant, joint_or_frame)
+        self._weld = _weld(plant, S, joint)
+        step = plant.time_step() or None
+        self._step_s, self._steps_per_sample = _steps(step, period)
+        self._pairs_steps = step is not None and plant.has_sampled_output_ports()
+        config.check(_WHERE, 1 / self.period)
+
+        which = [] if model_instance is None else [model_instance]
+        n = self._n = plant.num_positions(*which)
+        constants, chain = sensor_chain(config, 3 + n, self.period)
+        motion, estimator = motion_estimator(MotionEstimationConfig(), config, 3 + n, self.period)
+        sample = np.zeros(sample_size(n) + 1)
+        sample[SATURATED] = LOST
+        held = np.full(_POSE_SIZE + n, np.nan)
+        ends = np.cumsum([len(held), len(sample), len(chain), len(estimator)]).tolist()
+        self._held, self._sample = slice(0, ends[0]), slice(ends[0], ends[1])
+        self._sensor = (constants, motion, ends[2] - ends[1], config.ideal)
+        self._filters = slice(ends[1], None)
+        self._no_noise = np.zeros(NOISE_SIZE)
+
+        self._state = self.DeclareVectorInputPort("state", plant.num_multibody_states(*which))
+        self._poses, self._velocities, self._accelerations, self._reactions = (
+            self.DeclareAbstractInputPort(name, AbstractValue.Make([kind()]))
+            for name, kind in (
+                ("body_poses", RigidTransform),
+                ("body_spatial_velocities", SpatialVelocity),
+                ("body_spatial_accelerations", SpatialAcceleration),
+                ("reaction_forces", SpatialForce),
+            )
+        )
+        noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_SIZE)
+        self._noise = noise
+        self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
+        self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update)
+        if self._pairs_steps:
+            self.DeclareInitializationDiscreteUpdateEvent(self._hold)
+        first = 0
+        for name, size in {**sample_parts(n), "sample_time": 1}.items():
+            self._declare_output("status" if name == "saturated" else name, first, size)
+            first += size
+        self._declare_output("sample", 0, first)
+
+    @property
+    def period(self) -> float:
+        """Sampling period [s]."""
+        return self._step_s * self._steps_per_sample
+
+    def _declare_output(self, name: str, first: int, size: int) -> None:
+        part = slice(self._sample.start + first, self._sample.start + first + size)
+
+        def calc(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(context.get_discrete_state_vector().value()[part])
+
+        self.DeclareVectorOutputPort(name, size, calc, {self.xd_ticket()})
+
+    def _configuration(self, context: Context) -> Array:
+        _, body, _ = self._weld
+        R_WB = self._poses.Eval(context)[body].rotation().matrix()
+        omega_WB = self._velocities.Eval(context)[body].rotational()
+        return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
+
+    def _hold(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.get_mutable_value(0)[self._held] = self._configuration(context)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        step = round(context.get_time() / self._step_s)
+        held = discrete_state.value(0)[self._held].copy()
+        if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
+            # Drake has updated the plant: the state is that of the step's end.
+            self._hold(context, discrete_state)
+        if step % self._steps_per_sample == 0:
+            configuration = held if self._pairs_steps else self._configuration(context)
+            memory = discrete_state.get_mutable_value(0)
+            self._take_sample(context, configuration, memory)
+
+    def _take_sample(self, context: Context, configuration: Array, memory: Array) -> None:
+        reaction, body, geometry = self._weld
+        acceleration = self._accelerations.Eval(context)[body].get_coeffs()
+        force = self._reactions.Eval(context)[reaction].get_coeffs()
+        noise = self._no_noise if self._noise is None else self._noise.Eval(context)
+        truth = np.empty(TRUE_ANGLES.start + 3 + self._n)
+        _true_values_into(geometry, configuration, acceleration, force, truth)
+        sample = memory[self._sample]
+        _sample_into(self._sensor, truth, noise, memory[self._filters], sample[:TIME])
+        sample[TIME] = context.get_time()
+
+
+@njit(cache=True)
+def _true_values_into(geometry, configuration, acceleration, reaction, truth):
+    R_WB, omega = nine(configuration, 0), three(configuration, 9)
+    alpha, a_Bo = three(acceleration, 0), three(acceleration, 3)
+    r = apply(R_WB, three(geometry, _POSITION))
+    a = plus_cross(plus_cross(a_Bo, alpha, r), omega, cross(omega, r))
+    R_SB, R_BW = transposed(nine(geometry, _ORIENTATION)), transposed(R_WB)
+    s = apply(R_SB, apply(R_BW, minus(a, three(geometry, _GRAVITY))))
+    omega, alpha = apply(R_SB, apply(R_BW, omega)), apply(R_SB, apply(R_BW, alpha))
+    R_SJc = nine(geometry, _JOINT_ORIENTATION)
+    f, tau = apply(R_SJc, three(reaction, 3)), apply(R_SJc, three(reaction, 0))
+    tau = plus(tau, cross(three(geometry, _JOINT_POSITION), f))
+    for i in range(3):
+        truth[WRENCH.start + i] = geometry[_SIGN] * f[i]
+        truth[WRENCH.start + 3 + i] = geometry[_SIGN] * tau[i]
+        truth[SPECIFIC_FORCE.start + i] = s[i]
+        truth[ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
+        truth[ANGULAR_ACCELERATION.start + i] = alpha[i]
+    put(
+        truth, TRUE_ANGLES.start + 3, configuration, _POSE_SIZE, configuration.shape[0] - _POSE_SIZE
+    )
+
+
+@njit(cache=True)
+def _sample_into(sensor, truth, noise, memory, sample):
+    """Write the sample (16 + n,) for true values whose first three "angles" are omega."""
+    constants, motion_constants, end, ideal = sensor
+    n = sample.shape[0] - JOINT_POSITION.start
+    if not is_plausible(constants, truth):  # keeps it out of the filters
+        sample[SATURATED] = LOST + LOST_FLAG_SAMPLES
+        return
+    lost = sample[SATURATED] - 1.0
+    if ideal:
+        put(sample, 0, truth, 0, WRENCH_AND_MOTION.stop)
+        sample[SATURATED] = 0.0
+        put(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
+    else:
+        reading, estimate = np.empty(truth.shape[0] - 2), np.empty(truth.shape[0] + 1)
+        read_into(constants, memory[:end], noise, truth, reading)
+        estimate_with_gyroscope_into(motion_constants, memory[end:], reading, estimate)
+        put(sample, 0, estimate, 0, JOINT_POSITION.start)
+        put(sample, JOINT_POSITION.start, estimate, JOINT_POSITION.start + 3, n)
+    if lost >= LOST:
+        sample[SATURATED] = lost
+
+
+def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
+    expect(MultibodyPlant, plant, f"{_WHERE}: plant")
+    if not plant.is_finalized():
+        raise DrakeTeleopError(
+            f"plant '{plant.get_name()}' is not finalized",
+            where=_WHERE,
+            remedy="call plant.Finalize() first",
+        )
+    if plant not in builder.GetSystems():
+        raise DrakeTeleopError(
+            f"plant '{plant.get_name()}' is not in this builder",
+            where=_WHERE,
+            remedy="add it by builder.AddSystem(plant) first",
+        )
+
+
+def _steps(step: float | None, period: float | None) -> tuple[float, int]:
+    """Return the period of events [s], and the number of events per sample."""
+    if period is not None and not 0.0 < period < np.inf:
+        raise DrakeTeleopError(f"{period} s is not positive", where=f"{_WHERE}: period")
+    if step is None:
+        return period or _DEFAULT_PERIOD, 1
+    count = (period or step) / step
+    if count < 1 - _STEP_TOLERANCE or abs(count - round(count)) > _STEP_TOLERANCE:
+        raise DrakeTeleopError(
+            f"{period:g} s is no multiple of the plant's time step {step:g} s",
+            where=f"{_WHERE}: period",
+            remedy=f"choose a multiple, such as {max(1, round(count)) * step:g} s",
+        )
+    return step, round(count)
+
+
+def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple[Frame, WeldJoint]:
+    """Return the sensor frame S and the weld beyond it."""
+    expect((Joint, Frame), joint_or_frame, f"{_WHERE}: joint_or_frame")
+    if joint_or_frame.GetParentPlant() is not plant:
+        raise DrakeTeleopError(
+            f"'{joint_or_frame.name()}' is of another plant", where=f"{_WHERE}: joint_or_frame"
+        )
+    welds = [joint for joint in _joints(plant) if isinstance(joint, WeldJoint)]
+    if isinstance(joint_or_frame, Frame):
+        S = joint_or_frame
+        body = S.body().index()
+        beyond = [joint for joint in welds if _arm_and_load(plant, joint)[0] == body]
+        if len(beyond) != 1:
+            names = ", ".join(f"'{joint.name()}'" for joint in beyond)
+            found = f"several welds beyond it: {names}" if beyond else "no weld beyond it"
+            raise DrakeTeleopError(
+                f"the body '{S.body().name()}' of frame '{S.name()}' has {found}",
+                where=f"{_WHERE}: joint_or_frame",
+                remedy="pass the WeldJoint between arm and tool",
+            )
+        return S, beyond[0]
+    if not isinstance(joint_or_frame, WeldJoint):
+        raise DrakeTeleopError(
+            f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld",
+            where=f"{_WHERE}: joint_or_frame",
+            remedy="weld the tool to the arm and pass this WeldJoint",
+        )
+    parent = joint_or_frame.frame_on_parent()
+    arm, _ = _arm_and_load(plant, joint_or_frame)
+    on_parent = parent.body().index() == arm
+    return parent if on_parent else joint_or_frame.frame_on_child(), joint_or_frame
+
+
+def _joints(plant: MultibodyPlant) -> list[Joint]:
+    return [plant.get_joint(index) for index in plant.GetJointIndices()]
+
+
+def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
+    """Return the arm's body at the weld, and all bodies of the load.
+
+    The load is on the side of the weld that is not connected to the world.
+    """
+    neighbours: dict[BodyIndex, list[BodyIndex]] = {}
+    for joint in _joints(plant):
+        if joint.index() != weld.index():
+            parent, child = joint.parent_body().index(), joint.child_body().index()
+            neighbours.setdefault(parent, []).append(child)
+            neighbours.setdefault(child, []).append(parent)
+    parent, child = weld.parent_body().index(), weld.child_body().index()
+    load = _reached(neighbours, child)
+    if plant.world_body().index() in load:
+        return child, _reached(neighbours, parent)
+    return parent, load
+
+
+def _reached(neighbours: dict[BodyIndex, list[BodyIndex]], start: BodyIndex) -> set[BodyIndex]:
+    found, ahead = {start}, [start]
+    while ahead:
+        new = set(neighbours.get(ahead.pop(), ())) - found
+        found |= new
+        ahead += new
+    return found
+
+
+def _weld(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Weld:
+    arm, load = _arm_and_load(plant, joint)
+    if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
+        raise DrakeTeleopError(
+            f"the tool beyond joint '{joint.name()}' has no mass",
+            where=f"{_WHERE}: joint_or_frame",
+            remedy="give a body of the tool a SpatialInertia",
+        )
+    on_parent = joint.parent_body().index() == arm
+    X_BS, X_BJc = S.GetFixedPoseInBodyFrame(), joint.frame_on_child().GetFixedPoseInBodyFrame()
+    if on_parent:
+        X_BJc = joint.frame_on_parent().GetFixedPoseInBodyFrame() @ joint.X_FM()
+    X_SJc = X_BS.InvertAndCompose(X_BJc)
+    instance = (joint.child_body() if on_parent else joint.parent_body()).model_instance()
+    gravity = plant.gravity_field().gravity_vector() * plant.is_gravity_enabled(instance)
+    geometry = np.concatenate(
+        [
+            X_BS.translation(),
+            X_BS.rotation().matrix().ravel(),
+            X_SJc.rotation().matrix().ravel(),
+            X_SJc.translation(),
+            gravity,
+            [1.0 if on_parent else -1.0],
+        ]
+    )
+    reaction = list(plant.GetJointIndices()).index(joint.index())
+    return _Weld(reaction, int(S.body().index()), geometry)
