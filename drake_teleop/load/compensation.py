@@ -104,9 +104,7 @@ def add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_obj
 @njit(cache=True)
 def _add_weights(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
     for i in range(out.shape[0]):
-        add_weight_into(
-            gravity[i], phi_gripper, phi_object, excess_gripper, excess_object, out[i]
-        )
+        add_weight_into(gravity[i], phi_gripper, phi_object, excess_gripper, excess_object, out[i])
 
 
 @njit(cache=True)

@@ -52,9 +52,7 @@ def low_pass_into(x, low_pass, memory):
 
 
 @njit(cache=True)
-def eliminate_into(
-    values, gravity, offsets, phi, nothing, scales, low_pass, memory, rest, at, out
-):
+def eliminate_into(values, gravity, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
     """Write the contact wrench and scaled wrench of a valid reading to out (12,).
 
     Args:

@@ -25,8 +25,8 @@ from drake_teleop.station.master.force_display import display_into, initial_disp
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master
-from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
@@ -63,7 +63,7 @@ GENERIC = ("NonContactWrench", "WrenchScaling")
 
 
 def rotations(count: int, rng: np.random.Generator) -> np.ndarray:
-    q, r = np.linalg.qr(rng.normal(size=(count, 3, 3)))
+    q, _r = np.linalg.qr(rng.normal(size=(count, 3, 3)))
     return q * np.linalg.det(q)[:, None, None]
 
 
@@ -178,7 +178,7 @@ def test_missing_orientation_is_one_line():
     values = random_inputs(rng, np.eye(3))
     del values["R_WS"]
     block = blocks.WrenchScaling(CONFIG)
-    with pytest.raises(DrakeTeleopError, match="gravity in S: is unknown.*; connect R_WS"):
+    with pytest.raises(DrakeTeleopError, match=r"gravity in S: is unknown.*; connect R_WS"):
         output(block, fixed(block, **values), "scaled_wrench_S")
     block = blocks.WrenchScaling()
     with pytest.raises(DrakeTeleopError, match="wrench_to_master: R_WS is not connected"):
@@ -204,7 +204,7 @@ def samples(rng, count):
     q, names = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), ("measured_wrench_S", *MOTION)
     plain, fused = [], []
     for k in range(count):
-        motion = rng.normal(size=(3, 3)) + [[0, 0, 9.81], [0, 0, 0], [0, 0, 0]]
+        motion = [*rng.normal(size=(3, 3)), [0, 0, 9.81], [0, 0, 0], [0, 0, 0]]
         wrench = non_contact_wrench(*motion, PHI) + OFFSETS + 0.1 * rng.normal(size=6)
         wrench[0] += 20.0 * (k > count // 2)
         invalid = [float(k % 13 == 5)]
@@ -300,7 +300,14 @@ def test_two_ends_and_two_networks_equal_the_channel_of_the_station(method):
             method=method, slave_mass=[10.0, 0.1], servo_stiffness=[2e5, 2e3],
             servo_damping=[4e3, 40.0],
         )  # fmt: skip
-    names = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
+    names = (
+        "pose_command",
+        "wrench_B",
+        "hand_wrench_E",
+        "pose_slave",
+        "saturated",
+        "load_wrench_B",
+    )
     channel = TeleopChannel(
         Channel(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1, timeout=0.1), passivity,
         np.eye(3), scales, 0.1, START, T, 7,
@@ -351,7 +358,7 @@ def test_network_delays_by_whole_periods():
 def test_a_block_of_compiled_code_refuses_other_scalars_in_one_line():
     block = blocks.NetworkChannel(2, T)
     for convert in (block.ToAutoDiffXd, block.ToSymbolic):
-        with pytest.raises(DrakeTeleopError, match="^NetworkChannel: computes with compiled code"):
+        with pytest.raises(DrakeTeleopError, match=r"^NetworkChannel: computes with compiled code"):
             convert()
 
 

@@ -154,12 +154,12 @@ def test_equal_shares_are_sigma_to_the_last_bit(gravity):
 
 
 def test_different_shares_need_gravity():
-    with pytest.raises(DrakeTeleopError, match="gravity: is unknown.*; pass gravity"):
+    with pytest.raises(DrakeTeleopError, match=r"gravity: is unknown.*; pass gravity"):
         scaled_wrench(
             np.zeros(6), OFFSETS, *np.zeros((3, 3)), TOOL, TOOL, **named(1.0, 1.0, 1.0),
             sigma_weight=0.5,
         )  # fmt: skip
-    with pytest.raises(DrakeTeleopError, match="sigma_inertia: .* is not a finite number >= 0"):
+    with pytest.raises(DrakeTeleopError, match=r"sigma_inertia: .* is not a finite number >= 0"):
         scaled_wrench(
             np.zeros(6), OFFSETS, *np.zeros((3, 3)), TOOL, TOOL, **named(1.0, 1.0, 1.0),
             sigma_inertia=-0.5,

@@ -16,7 +16,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked
+from drake_teleop.common.numeric import checked
 from drake_teleop.load.compensation import (
     add_weight_into,
     scaled_wrench_into,
@@ -145,9 +145,7 @@ def WrenchScaling_(T: Any) -> Any:
                 self.DeclareVectorOutputPort(name, 6, weak_callback(calc), tickets | more)
 
         def _construct_copy(self, other: Any, converter: Any = None) -> None:
-            Impl._construct(
-                self, other._config, other._R_WB, other._gravity_W, converter=converter
-            )
+            Impl._construct(self, other._config, other._R_WB, other._gravity_W, converter=converter)
 
         def _scaled(self, context: Any, scales: tuple[float, float, float]) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)

@@ -46,7 +46,7 @@ _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
 
 
 class Scales(NamedTuple):
-    """Scales of a wrench: shares of the inertia and weight of gripper and object, and of contact."""
+    """Scales of a wrench: shares of inertia and weight, of gripper and object; and of contact."""
 
     sigma_gripper: float
     sigma_object: float
