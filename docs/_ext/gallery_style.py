@@ -44,6 +44,7 @@ class Order:
             "own_arm",
             "own_device",
             "own_block",
+            "own_plant",
         ),
         *("log_identification", "log_contact", "conventions", "excitation", "sensor_noise"),
         *("networks", "energy", "passivity_methods", "ledger_under_loss", "letting_go"),
