@@ -1,5 +1,5 @@
 """
-What the hand feels, by frequency
+Displayed impedance, by frequency
 =================================
 
 The impedance at the hand in free motion and on a wall, sampled, for three values of sigma. Dotted:
@@ -27,8 +27,8 @@ for axes, wall, title in zip(
 ):
     for sigma, colour in ((0.0, "C0"), (0.5, "C2"), (1.0, "C1")):
         one = replace(axis, sigma=sigma)
-        felt = transmitted_impedance(sampled_two_port(one, Sampling(), omega), wall)
-        axes.loglog(omega / (2 * np.pi), abs(felt), color=colour, label=f"sigma = {sigma:g}")
+        displayed = transmitted_impedance(sampled_two_port(one, Sampling(), omega), wall)
+        axes.loglog(omega / (2 * np.pi), abs(displayed), color=colour, label=f"sigma = {sigma:g}")
         axes.loglog(omega / (2 * np.pi), abs(ideal_impedance(one, s, wall)), ":", color=colour)
     axes.set(title=title, xlabel="frequency [Hz]")
 panels[0].set(ylabel="|Z| [N s/m]")

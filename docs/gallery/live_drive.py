@@ -29,7 +29,7 @@ while session.ms < 3500:
     session.advance()  # 5 ms
 log = session.log()
 figure, (above, below) = plt.subplots(2, sharex=True, figsize=(7, 5))
-above.plot(log.t, log["force_to_master"][:, 2], label="felt")
+above.plot(log.t, log["force_to_master"][:, 2], label="displayed")
 above.set(ylabel="vertical force [N]")
 below.plot(
     log.t, 1e3 * np.diff(log["pose_command"][:, 6], append=np.nan), label="step of the command"

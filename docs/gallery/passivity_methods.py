@@ -3,7 +3,7 @@ Every passivity method over one network
 =======================================
 
 In one degree of freedom: the hand swings freely, presses a wall of 5.1 kN/m, holds and goes back,
-over a round trip of 100 ms with jitter and loss. Blue is what the hand feels, grey what the wall
+over a round trip of 100 ms with jitter and loss. Blue is the displayed force, grey what the wall
 gives.
 """
 

@@ -2,7 +2,7 @@
 One contact, three shares of the tool
 =====================================
 
-Sigma is the share of the tool's weight and inertia that is left in what the hand feels. With all
+Sigma is the share of the tool's weight and inertia that is left in the displayed force. With all
 of it (1) a touch is a notch in the swing, with none of it (0) it is all that there is.
 """
 

@@ -2,9 +2,8 @@
 Where is it stable?
 ===================
 
-Round trip against the share sigma of the tool that is felt, for a wall of 5.1 kN/m and the medium
-grip. Blue is the limit; the colour says how far off the force is that the hand exerts, from 0.5 to
-5 Hz.
+Round trip against the displayed share sigma of the tool, for a wall of 5.1 kN/m and the medium
+grip. Blue is the limit of stability. The colour is the error of the hand's force, 0.5 to 5 Hz.
 """
 
 from dataclasses import replace

@@ -1,9 +1,9 @@
 """
-A simulated operator feels a touch
-==================================
+A simulated operator notices contact
+====================================
 
-The operator moves on until the force tells of contact, late and noisy as people are. What was felt
-before the touch is the tool: with all of it in the hand (sigma = 1) contact is noticed later.
+The operator moves on until the displayed force indicates contact, with human delay and noise. The
+force before the contact is the tool's: with all of it (sigma = 1) contact is noticed later.
 """
 
 import matplotlib.pyplot as plt
@@ -17,9 +17,9 @@ for axes, sigma in zip(panels, (0.0, 1.0), strict=True):
     scenario = dt.LoadScenario("touch")
     scenario.force_scaling.sigma = sigma
     result = dt.run_scenario(scenario, progress=False).result
-    felt = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
+    displayed = np.linalg.norm(result["force_to_master"][:, :3], axis=1)
     contact = np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
-    axes.plot(result.t, felt, label="felt")
+    axes.plot(result.t, displayed, label="displayed")
     axes.plot(result.t, scenario.force_scaling.force_scale * contact, label="contact / 17.5")
     noticed = task_measures(result, scenario)["detection_time_s"]
     axes.set(title=f"sigma = {sigma:g}: noticed after {1e3 * noticed:.0f} ms", ylabel="force [N]")
