@@ -300,8 +300,9 @@ def test_eliminate_passes_the_scaling_law_on(capsys, install):
             (Path("a.csv"), Path("i.json"), Path("out/eliminate")),
             {
                 "gripper": None, "sigma": 0.5, "sigma_object": None, "gamma": 2.0, "eta": 0.25,
-                "offsets": "record", "untouched_s": None, "causal": None,
-                "causal_tare_s": None, "free": None, "cutoff_hz": 20.0,
+                "sigma_weight": None, "sigma_inertia": None, "offsets": "record",
+                "untouched_s": None, "causal": None, "causal_tare_s": None, "free": None,
+                "cutoff_hz": 20.0,
                 "delay": "auto", "quiet": False,
             },
         )

@@ -36,10 +36,12 @@ RUNS_WHAT_IT_READS = re.compile(
 )
 EXPLAINED = {
     # The compiled code of this package, which lies where its .pyc files lie; see the file itself.
-    ("common/compiled.py", "pickle"), ("common/compiled.py", "pickles"),
+    ("common/compiled.py", "pickle"),
     # Of NumPy's formats those without objects.
     ("lab/identified_load.py", "np.load"), ("lab/identified_load.py", "allow_pickle"),
-    ("logs/read/tables.py", "np.load"), ("logs/read/tables.py", "allow_pickle"),
+    ("logs/read/table_files.py", "np.load"), ("logs/read/table_files.py", "allow_pickle"),
+    # One of two names that the code contains.
+    ("logs/read/array_files.py", "import_module"),
     # Processes that this one starts: what they say to each other goes through pipes.
     ("lab/studies/processes.py", "joblib"), ("lab/comparison/compare_passivity.py", "joblib"),
     # A module of the package by its name.
@@ -84,7 +86,8 @@ WRITING = {
     ("common/compiled.py", ".touch"), ("common/compiled.py", ".write_bytes"),
     ("common/compiled.py", "os.replace"),
     ("lab/identified_load.py", 'open("wb'), ("lab/identified_load.py", "np.savez"),
-    ("station/slave/meshes.py", ".write_text"),
+    ("station/slave/meshes.py", ".write_text"), ("station/slave/mjcf_meshes.py", ".write_text"),
+    ("station/slave/model_files.py", ".write_text"), ("station/slave/sdf_repair.py", ".write_text"),
     # A line for each change of a drive's inputs, which is to outlive the process.
     ("live/record.py", 'open("x'),
     # To memory, and then into the file with the wrenches that have come before.

@@ -95,6 +95,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "identify": (lambda: dt.identify(N3, N3, N3, N3), "wrench"),
     "a delay": (lambda: dt.identify(N6, N3, N3, N3, delay_s=HALF), "delay_s"),
     "noise": (lambda: identify_batch(N6, N3, N3, N3, noise=HALF), "noise"),
+    "a plant": (lambda: dt.AddWristSensor(None, 7, None), "AddWristSensor"),
     # Logs.
     "read_log": (lambda: dt.read_log(7), "log"),  # type: ignore[arg-type]
     "a filter": (lambda: dt.read_log("log.csv", bandwidth_hz=HALF), "bandwidth_hz"),

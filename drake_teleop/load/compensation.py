@@ -189,16 +189,12 @@ def scaled_wrench(
     Raises:
         DrakeTeleopError: for a negative scale, or a missing gravity.
     """
-    given = {
-        "sigma_gripper": sigma_gripper,
-        "sigma_object": sigma_object,
-        "sigma_weight": sigma_weight,
-        "sigma_inertia": sigma_inertia,
-    }
-    for name, value in given.items():
-        if value is not None:
-            _scale(name, value)
-    weights, inertias = weight_and_inertia_scales(**given)
+    weights, inertias = weight_and_inertia_scales(
+        _scale("sigma_gripper", sigma_gripper),
+        _scale("sigma_object", sigma_object),
+        None if sigma_weight is None else _scale("sigma_weight", sigma_weight),
+        None if sigma_inertia is None else _scale("sigma_inertia", sigma_inertia),
+    )
     scales = [*inertias, _scale("gamma", gamma)]
     if weights != inertias and gravity is None:
         raise unknown_gravity("gravity", "pass gravity, g in S, for each sample")

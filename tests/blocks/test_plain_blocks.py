@@ -204,7 +204,7 @@ def samples(rng, count):
     q, names = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), ("measured_wrench_S", *MOTION)
     plain, fused = [], []
     for k in range(count):
-        motion = [*rng.normal(size=(3, 3)), [0, 0, 9.81], [0, 0, 0], [0, 0, 0]]
+        motion = rng.normal(size=(3, 3)) + np.outer([1, 0, 0], [0, 0, 9.81])
         wrench = non_contact_wrench(*motion, PHI) + OFFSETS + 0.1 * rng.normal(size=6)
         wrench[0] += 20.0 * (k > count // 2)
         invalid = [float(k % 13 == 5)]

@@ -471,7 +471,7 @@ def test_force_walk_equals_its_record():
     [
         ({"R_SA": [1.0, 0, 0, 0, 1.1, 0, 0, 0, 1]}, r"^sensor\.R_SA: is not a rotation"),
         ({"R_SA": [1.0, 0, 0, 0, 1, 0, 0, 0, -1]}, r"^sensor\.R_SA: is not a rotation"),
-        ({"bandwidth_hz": 3700.0}, r"^sensor\.bandwidth_hz: .*rates.sensor_hz"),
+        ({"bandwidth_hz": 3700.0}, r"^sensor\.bandwidth_hz: .*the sensor's rate"),
     ],
 )
 def test_invalid_sensor_is_rejected(changes, message):

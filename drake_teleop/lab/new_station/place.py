@@ -8,7 +8,6 @@ the z axis of frame A; S and A are the same for tools along z_S.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -108,7 +107,6 @@ class Place(NamedTuple):
         return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
-@dataclass
 class TrialWalls(Environment):
     """Walls of each size in `WALL_EDGES_M` that can be moved below the tool."""
 

@@ -7,10 +7,13 @@ from typing import Any, NoReturn
 from drake_teleop.common.errors import DrakeTeleopError
 
 
+_NO_SLOTS: tuple[str, ...] = ()
+
+
 class DoubleOnly:
     """Base class of blocks for double only; a conversion raises one clear error."""
 
-    __slots__ = ()
+    __slots__ = _NO_SLOTS  # a second dictionary would keep the block alive
 
     def _refuse(self, *_: Any) -> NoReturn:
         raise DrakeTeleopError(

@@ -31,7 +31,7 @@ _MOTION = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 def _for_scalar(function: Any, T: Any) -> Callable[..., None]:
     """Return the compiled function for double, its Python source for other scalar types."""
-    return function if T is float else function.py_func  # type: ignore[no-any-return]
+    return function if T is float else function.py_func
 
 
 def _vector(T: Any, size: int) -> Any:
@@ -42,7 +42,7 @@ def _vector(T: Any, size: int) -> Any:
 def NonContactWrench_(T: Any) -> Any:
     """Return the class of the block for the scalar type T."""
 
-    class Impl(LeafSystem_[T]):  # type: ignore[misc, valid-type]
+    class Impl(LeafSystem_[T]):
         """Wrench V phi of a load's weight and inertia, Eq. (12).
 
         .. pydrake_system::
@@ -95,7 +95,7 @@ NonContactWrench = NonContactWrench_[float]
 def WrenchScaling_(T: Any) -> Any:
     """Return the class of the block for the scalar type T."""
 
-    class Impl(LeafSystem_[T]):  # type: ignore[misc, valid-type]
+    class Impl(LeafSystem_[T]):
         """Contact wrench and scaled wrench of a measured wrench, Eqs. (13) and (T7).
 
         .. pydrake_system::

@@ -66,12 +66,6 @@ class ForceScalingConfig:
     """Scales sigma, gamma, eta of the paper, and force scale from slave to master."""
 
     sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
-    sigma_weight: float | None = quantity(
-        None, "1", 0.0, 100.0, "share of the load's weight that is kept; null: sigma"
-    )
-    sigma_inertia: float | None = quantity(
-        None, "1", 0.0, 100.0, "share of the load's inertia that is kept; null: sigma"
-    )
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
     eta: float | None = quantity(
         None, "1", 0.0, 1.0, "Eq. (14): share of the object kept; needs sigma = 0 and gamma = 1"
@@ -81,6 +75,12 @@ class ForceScalingConfig:
     )
     force_scale: float = quantity(
         1 / 17.5, "1", 0.0, 100.0, "force and torque, slave to master (VI-B)"
+    )
+    sigma_weight: float | None = quantity(
+        None, "1", 0.0, 100.0, "share of the load's weight that is kept; null: sigma"
+    )
+    sigma_inertia: float | None = quantity(
+        None, "1", 0.0, 100.0, "share of the load's inertia that is kept; null: sigma"
     )
 
     def scales(self, where: str = "force_scaling") -> Scales:

@@ -15,7 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
-from drake_teleop.station.slave.model_numbers import number
+from drake_teleop.station.slave.model_numbers import MAX_VALUE, number
 from drake_teleop.station.slave.model_references import ModelFiles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
@@ -78,13 +78,14 @@ def _shape_fault(shape: ElementTree.Element) -> str | None:
     sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS[kind]
     for name, count in sizes.items():
         values = _values(inner.get(name) or inner.findtext(name))
-        if len(values) != count or not all(0.0 < value < np.inf for value in values):
+        if len(values) != count or not all(0.0 < value <= MAX_VALUE for value in values):
             return f"the {name} of a {kind} is no usable size"
     scale = _values(inner.get("scale") or inner.findtext("scale"))
     places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
     texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
     numbers = [value for text in texts for value in _values(text)]
-    return None if all(scale) and np.isfinite(numbers).all() else "of an invalid place or scale"
+    valid = all(scale) and all(abs(value) <= MAX_VALUE for value in numbers)
+    return None if valid else "of an invalid place or scale"
 
 
 def _values(text: str | None) -> list[float]:

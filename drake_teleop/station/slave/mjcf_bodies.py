@@ -71,10 +71,12 @@ class Geom:
 
     @property
     def touches(self) -> bool:
+        """Whether the shape takes part in contacts."""
         return touches(self.attributes)
 
     @property
     def visible(self) -> bool:
+        """Whether MuJoCo shows the shape by default."""
         return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GROUP
 
 

@@ -56,6 +56,7 @@ class Attributes(dict[str, str]):
         return np.array(values)
 
     def number(self, name: str, default: float) -> float:
+        """Return the number of an attribute, or a default."""
         return self.numbers(name, (default,))[0]
 
     def limits(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:

@@ -21,6 +21,7 @@ class MassProperties(NamedTuple):
     inertia: _Array
 
     def transformed(self, X_BG: RigidTransform) -> MassProperties:
+        """Return the properties in the frame B, for properties in G."""
         R = X_BG.rotation().matrix()
         return MassProperties(self.mass, X_BG @ self.centre, R @ self.inertia @ R.T)
 

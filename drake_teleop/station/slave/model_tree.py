@@ -25,7 +25,7 @@ def joint_end(joint: Element, name: str) -> str:
     return "" if element is None else (element.get("link") or element.text or "").strip()
 
 
-@dataclass
+@dataclass(eq=False)
 class ModelTree:
     """Joints up to the sensor from the base outwards, and all links by the nearest of them.
 
