@@ -25,6 +25,8 @@ STEPS = 8
 MAX_LAG_FRAMES = 8
 KINDS = ("sensor", "weight removed", "base")
 """Wrenches of the load: in S; without its weight; in the axes of the base."""
+CALM_WIDTH = 0.674
+"""Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(
     [
         np.array(signs)[:, None] * np.eye(3)[list(order)]
@@ -44,7 +46,6 @@ _PARTS = 4
 _FLOOR_SHARE = 0.3
 _INLIER, _STEP_DEVIATIONS = 5.0, 5.0
 _FEWEST_STEP_FRAMES, _STEP_SHARE, _TRIED_STEPS = 12, 0.12, 20
-_HALF_WIDTH = 0.674  # of the calmer half of normal numbers, in standard deviations
 _NOISE_MARGIN = 1.5
 _FEWEST_SATURATED = 4
 
@@ -98,6 +99,11 @@ class Hypothesis:
         return np.hstack([f / self.gain[0], tau / self.gain[1]])
 
 
+def as_described(lag: float) -> Hypothesis:
+    """Return the hypothesis without a fault."""
+    return Hypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
+
+
 def calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
     """Return log half widths (6,) of the narrowest half of residuals (N, 6), and its centres."""
     ordered = np.sort(residual, axis=0)
@@ -117,8 +123,8 @@ def find_hypothesis(
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = _Search(predict, regress, usual_lag, _FLOOR_SHARE * typical)
-    usual = search.judged(Hypothesis("sensor", usual_lag, np.eye(3), np.eye(3), np.ones(2)))
+    search = Search(predict, regress, usual_lag, _FLOOR_SHARE * typical)
+    usual = search.judged(as_described(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual
     found = [usual]
@@ -141,7 +147,9 @@ def unexplained(x: Hypothesis, predict: Predict, regress: Regress) -> Array:
     return wrench - x.apply(load_wrench)
 
 
-class _Search:
+class Search:
+    """Hypotheses for one episode; arguments as for `find_hypothesis`, `floor` (6,) of spreads."""
+
     def __init__(
         self, predict: Predict, regress: Regress, usual_lag: float, floor: Array
     ) -> None:
@@ -232,7 +240,7 @@ class _Search:
     def fitted_load(
         self, wrench: Array, V: Array, lag: float, rows: NDArray[np.bool_]
     ) -> Hypothesis:
-        x = Hypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
+        x = as_described(lag)
         weights = np.exp(-calm_half(wrench, self.floor)[0])
         for _ in range(_ITERATIONS):
             w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
@@ -323,8 +331,8 @@ def offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | No
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
-    noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (np.sqrt(2.0) * _HALF_WIDTH)
-    deviation = np.minimum(np.exp(spread) / _HALF_WIDTH, _NOISE_MARGIN * noise)
+    noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (np.sqrt(2.0) * CALM_WIDTH)
+    deviation = np.minimum(np.exp(spread) / CALM_WIDTH, _NOISE_MARGIN * noise)
     fewest = max(_FEWEST_STEP_FRAMES, int(_STEP_SHARE * n))
 
     def inliers(part: Array) -> tuple[NDArray[np.bool_], Array]:
