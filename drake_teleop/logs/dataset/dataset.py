@@ -8,6 +8,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +48,12 @@ from drake_teleop.logs.dataset.episode_verdict import (
     saturated_channels,
     unexplained,
 )
-from drake_teleop.logs.dataset.shared_load import SharedLoad, contact_samples, shared_load
+from drake_teleop.logs.dataset.shared_load import (
+    SharedLoad,
+    contact_samples,
+    own_load,
+    shared_load,
+)
 from drake_teleop.logs.figures import load_figures, plain
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
@@ -55,7 +61,7 @@ from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_description
 
 _MAX_CALIBRATION = 24  # episodes that determine load, lag and noise
-_DRAFTS, _CORRECTIONS = 3, 5
+_DRAFTS, _CORRECTIONS, _DRAFT_SPACING = 3, 5, 3.0
 _STREAMS = ("wrench", "imu", "pose")
 _UNDETERMINED = 1.5  # log spread beyond the usual one that no hypothesis explains
 _WORK = "unfinished"
@@ -163,7 +169,35 @@ def _drafted(dataset: Dataset) -> dict[str, Any]:
     drafts = [_draft(dataset, dataset.episodes[k]) for k in chosen]
     texts = Counter(json.dumps(draft, sort_keys=True) for draft in drafts)
     text, votes = texts.most_common(1)[0]
-    return dict(json.loads(text)) if votes > 1 or count == 1 else drafts[0]
+    streams = dict(json.loads(text)) if votes > 1 or count == 1 else drafts[0]
+    return _with_fitting_signs(dataset, streams, [dataset.episodes[k] for k in chosen])
+
+
+def _with_fitting_signs(
+    dataset: Dataset, streams: dict[str, Any], episodes: Sequence[Episode]
+) -> dict[str, Any]:
+    """Return the streams with the quaternion order and the sign with which a load fits best."""
+    form = streams.get("pose", {}).get("orientation", {}).get("form", "")
+    found = []
+    for order in ("quaternion_xyzw", "quaternion_wxyz") if "quaternion" in form else (form,):
+        tried = copy.deepcopy(streams)
+        if "quaternion" in form:
+            tried["pose"]["orientation"]["form"] = order
+        loads = []
+        for episode in episodes:
+            with suppress(DrakeTeleopError):
+                log, _ = _episode_log(dataset, tried, episode)
+                loads.append(own_load(EpisodeSignals(log, _DRAFT_SPACING)))
+        if loads:
+            spread = float(np.median([x.spread.sum() for x in loads]))
+            mass = float(np.median([x.phi[0] for x in loads if x.phi is not None]))
+            found.append((spread, order, mass, tried))
+    if not found:
+        return streams
+    _, _, mass, streams = min(found, key=lambda x: x[:2])
+    if mass < 0.0:
+        streams["wrench"]["sign"] = -streams["wrench"].get("sign", 1)
+    return streams
 
 
 def _draft(dataset: Dataset, episode: Episode) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     """
     spacing = _best_spacing(logs)
     episodes = [EpisodeSignals(log, spacing) for log in logs]
-    own = [_own_load(signals) for signals in episodes]
+    own = [own_load(signals) for signals in episodes]
     if load is None:
         candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
         if not candidates:
@@ -103,12 +103,13 @@ def _best_spacing(logs: Sequence[Log]) -> float:
     some = logs[:: max(1, len(logs) // 6)]
 
     def cost(spacing: float) -> float:
-        return float(np.median([_own_load(EpisodeSignals(log, spacing)).spread.sum() for log in some]))
+        return float(np.median([own_load(EpisodeSignals(log, spacing)).spread.sum() for log in some]))
 
     return min(choices, key=cost)
 
 
-def _own_load(signals: EpisodeSignals) -> Hypothesis:
+def own_load(signals: EpisodeSignals) -> Hypothesis:
+    """Return the load that explains an episode best, and its lag."""
     search = Search(signals.predictor(np.zeros(10)), signals.regress, 0.0, _SMALLEST_WIDTH)
     lags = np.arange(-_MAX_LAG, _MAX_LAG + 0.1, _LAG_STEP)
     return min((search.other_load(float(lag)) for lag in lags), key=lambda x: x.spread.sum())
