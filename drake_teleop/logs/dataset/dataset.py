@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import (
@@ -40,7 +41,9 @@ from drake_teleop.logs.dataset.dataset_files import (
 )
 from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
+    CALM_WIDTH,
     Finding,
+    Hypothesis,
     calm_half,
     find_hypothesis,
     name_faults,
@@ -55,6 +58,7 @@ from drake_teleop.logs.dataset.shared_load import (
     shared_load,
 )
 from drake_teleop.logs.figures import load_figures, plain
+from drake_teleop.logs.read.alignment import widened
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
@@ -64,6 +68,7 @@ _MAX_CALIBRATION = 24  # episodes that determine load, lag and noise
 _DRAFTS, _CORRECTIONS, _DRAFT_SPACING = 3, 5, 3.0
 _STREAMS = ("wrench", "imu", "pose")
 _UNDETERMINED = 1.5  # log spread beyond the usual one that no hypothesis explains
+_FREE_MARGIN, _FEWEST_FREE = 2, 20  # frames around contact; free frames for the offsets
 _WORK = "unfinished"
 
 
@@ -333,14 +338,12 @@ def _verdict(task: Task, episode: Episode) -> tuple[dict[str, Any], Columns]:
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(Finding("tared", text, float(log.t[k])))
-    contact = found.correct(residual - offsets)
     spread = calm_half(residual - offsets, 0.1 * shared.typical)[0] - np.log(shared.typical)
     spread -= np.log(found.gain).repeat(3)
     if not faults and spread.mean() > _UNDETERMINED:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(Finding("unexplained", f"{text} changes", None))
-    detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)
-    touched = detector.detect(*contact_samples(signals, found.lag, contact))
+    contact, touched = _without_load(shared, signals, found, residual - offsets)
     rows = np.array([np.interp(at, log.t, x) for x in contact.T]).T
     nearest = np.clip(np.round((at - log.t[0]) / log.dt).astype(int), 0, len(log) - 1)
     free = contact[~touched]
@@ -359,6 +362,21 @@ def _verdict(task: Task, episode: Episode) -> tuple[dict[str, Any], Columns]:
     return row, Columns(rows.astype(np.float32), touched[nearest])
 
 
+def _without_load(
+    shared: SharedLoad, signals: EpisodeSignals, found: Hypothesis, residual: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return contact wrench and flags of contact; the offsets are the mean of the free frames."""
+    for _ in range(3):
+        contact = found.correct(residual)
+        detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)
+        touched = detector.detect(*contact_samples(signals, found.lag, contact))
+        free = ~widened(touched, _FREE_MARGIN)
+        if free.sum() < _FEWEST_FREE:
+            break
+        residual = residual - residual[free].mean(axis=0)
+    return contact, touched
+
+
 def _summary(
     dataset: Dataset, copied: Path, shared: SharedLoad, rows: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
@@ -372,7 +390,7 @@ def _summary(
         "ok": names["ok"],
         "faults": dict(sorted((k, n) for k, n in names.items() if k != "ok")),
         "lag_frames": shared.lag,
-        "noise": shared.typical / 0.674,
+        "noise": shared.typical / CALM_WIDTH,
         "spline_frames": shared.spacing,
         "contact_threshold": shared.threshold,
         **load_figures(shared.identification),
