@@ -84,7 +84,9 @@ def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
             load = _pooled(episodes, own, members, phi)
             phi = load.phi
     assert load is not None
-    phi = usable_phi(load)[0]
+    # Uncertain inertias are nearer to the truth than those of a point mass.
+    determined = np.isfinite(load.standard_deviations).all()
+    phi = load.phi if determined else usable_phi(load)[0]
     members = _excess(episodes, own, phi) < _MEMBER_EXCESS
     chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
     usual = [_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
