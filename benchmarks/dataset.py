@@ -52,11 +52,7 @@ def late(frames: int) -> Fault:
 
 def tared(share: float) -> Fault:
     def fault(x: SampleEpisode, phi: np.ndarray) -> SampleEpisode:
-        free = [
-            k
-            for k in range(12, len(x.t) - 12)
-            if not x.contact_wrench[k - 4 : k + 4].any()
-        ]
+        free = [k for k in range(12, len(x.t) - 12) if not x.contact_wrench[k - 4 : k + 4].any()]
         k = min(free, key=lambda row: abs(row - share * len(x.t)))
         wrench = x.wrench.copy()
         wrench[k:] -= wrench[k]

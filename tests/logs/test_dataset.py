@@ -64,9 +64,7 @@ def mapped(M: Any, force: float = 1.0, torque: float = 1.0) -> Callable[..., Sam
 
 
 def tared(x: SampleEpisode) -> SampleEpisode:
-    quiet = [
-        k for k in range(40, len(x.t) - 40) if not x.contact_wrench[k - 5 : k + 5].any()
-    ]
+    quiet = [k for k in range(40, len(x.t) - 40) if not x.contact_wrench[k - 5 : k + 5].any()]
     k = min(quiet, key=lambda row: abs(row - len(x.t) // 2))
     wrench = x.wrench.copy()
     wrench[k:] -= wrench[k]
@@ -145,7 +143,10 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     truth = np.vstack([x.contact_wrench for x in episodes])
     free = ~truth.any(axis=1)
     assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * NOISE).all()
-    touched, true = new["observation.in_contact"].to_numpy(), np.hstack([x.in_contact for x in episodes])
+    touched, true = (
+        new["observation.in_contact"].to_numpy(),
+        np.hstack([x.in_contact for x in episodes]),
+    )
     assert 2 * (touched & true).sum() / (touched.sum() + true.sum()) > 0.9
     copied = files_of(tmp_path / "out" / "demo")
     changed = {data, "meta/info.json", "meta/stats.json"}

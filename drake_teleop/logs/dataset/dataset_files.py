@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,11 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, whole_file, write_table
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.array_files import read_hdf5, read_zarr
+from drake_teleop.logs.read.array_files import library, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.table_files import FORMATS, expanded_columns, read_table
+from drake_teleop.logs.read.table_files import expanded_columns, read_table
 from drake_teleop.logs.read.tables import Table
-
-if TYPE_CHECKING:
-    import polars as pl
 
 CONTACT_WRENCH, IN_CONTACT = "observation.contact_wrench", "observation.in_contact"
 _TABLES = (".csv", ".tsv", ".parquet")
@@ -129,12 +126,13 @@ def _open_lerobot(path: Path) -> Dataset:
 
 
 def _open_hdf5(path: Path) -> Dataset:
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        data = file["data"] if "data" in file else {}
-        names = sorted(data, key=lambda name: (len(name), name))
-        settings = json.loads(data.attrs.get("env_args", "{}")) if names else {}
+    names: list[str] = []
+    settings: dict[str, Any] = {}
+    with library("h5py", path).File(path, "r") as file:
+        if "data" in file:
+            data = file["data"]
+            names = sorted(data, key=lambda name: (len(name), name))
+            settings = json.loads(data.attrs.get("env_args", "{}"))
         episodes = [Episode(name, path, 0, 0, f"data/{name}") for name in names]
     fps = settings.get("env_kwargs", {}).get("control_freq", "nan")
     return Dataset(path, "hdf5", episodes, float(fps))
@@ -254,15 +252,14 @@ def _write_csv(path: Path, target: Path, new: Columns) -> None:
 
 
 def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
-    import h5py
-
+    h5py = library("h5py", dataset.path)
     make_folder(out.parent)
     with whole_file(out) as temporary:
         shutil.copyfile(dataset.path, temporary)
         with h5py.File(temporary, "r+") as file:
             for episode, new in zip(dataset.episodes, columns, strict=True):
                 group = file[episode.group]
-                group = group["obs"] if "obs" in group else group
+                group = group.get("obs", group)
                 for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
                     if name in group:
                         del group[name]
@@ -270,8 +267,7 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None
 
 
 def _write_zarr(out: Path, columns: Sequence[Columns]) -> None:
-    import zarr
-
+    zarr = library("zarr", out)
     group, new = zarr.open_group(out / "data", mode="r+"), _joined(columns)
     for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
         array = values.astype(np.float32 if values.ndim == 2 else bool)
@@ -290,7 +286,10 @@ def _write_meta(source: Path, target: Path, columns: Sequence[Columns]) -> None:
         return
     stats, new = json.loads((source / "stats.json").read_text(encoding="utf-8")), _joined(columns)
     with_quantiles = any("q50" in x for x in stats.values())
-    for name, values in ((CONTACT_WRENCH, new.contact_wrench), (IN_CONTACT, new.in_contact[:, None])):
+    for name, values in (
+        (CONTACT_WRENCH, new.contact_wrench),
+        (IN_CONTACT, new.in_contact[:, None]),
+    ):
         x = values.astype(float)
         parts = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
         if with_quantiles:

@@ -1,9 +1,9 @@
 """Faults of an episode's wrench, found by comparison with the wrench of a known load.
 
-A hypothesis is a reading G M p(t + lag) + offsets, with the load's wrench p, a rotation or mirroring
-M and a factor G of forces and of torques. The simplest hypothesis wins unless another one reduces
-the spread of the residual decisively. The spread is that of the calmer half of the frames, so that
-contact has no influence.
+A hypothesis is a reading G M p(t + lag) + offsets, with the load's wrench p, a rotation or
+mirroring M and a factor G of forces and of torques. The simplest hypothesis is chosen unless
+another one reduces the spread of the residual decisively. The spread is that of the calmer half of
+the frames, so that contact has no influence.
 """
 
 from __future__ import annotations
@@ -36,7 +36,18 @@ _SIGNED_PERMUTATIONS = np.array(
 )
 _FORCE, _TORQUE = slice(0, 3), slice(3, 6)
 _FORCE_UNITS = ("mN", "kN", "daN", "gf", "kgf", "ozf", "lbf")
-_TORQUE_UNITS = ("mN m", "kN m", "daN m", "N cm", "gf cm", "kgf cm", "kgf m", "ozf in", "lbf in", "lbf ft")
+_TORQUE_UNITS = (
+    "mN m",
+    "kN m",
+    "daN m",
+    "N cm",
+    "gf cm",
+    "kgf cm",
+    "kgf m",
+    "ozf in",
+    "lbf in",
+    "lbf ft",
+)
 _UNIT_TOLERANCE, _SMALLEST_GAIN = 0.04, 0.06
 _SMALLEST_TURN_DEG = 4.0
 _SMALLEST_LAG = 0.6  # frames
@@ -150,9 +161,7 @@ def unexplained(x: Hypothesis, predict: Predict, regress: Regress) -> Array:
 class Search:
     """Hypotheses for one episode; arguments as for `find_hypothesis`, `floor` (6,) of spreads."""
 
-    def __init__(
-        self, predict: Predict, regress: Regress, usual_lag: float, floor: Array
-    ) -> None:
+    def __init__(self, predict: Predict, regress: Regress, usual_lag: float, floor: Array) -> None:
         self.predict, self.regress = predict, regress
         self.usual_lag, self.floor = usual_lag, floor
         self.frames = len(predict("sensor", usual_lag)[0])
@@ -253,7 +262,7 @@ class Search:
 
     def best_lag(self, x: Hypothesis) -> float:
         """Return the lag with the least spread of a hypothesis."""
-        lag, reach = self.usual_lag, MAX_LAG_FRAMES
+        lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / STEPS):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)
             costs = [self.judged(replace(x, lag=float(y))).spread.sum() for y in lags]
@@ -370,7 +379,9 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(Finding("weight removed", text, None))
-    found += _turn_findings(x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force")
+    found += _turn_findings(
+        x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force"
+    )
     if not np.allclose(x.force, x.torque):
         found += _turn_findings(x.torque, "the torque")
     found += _unit_findings(x.gain)

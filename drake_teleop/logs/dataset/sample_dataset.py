@@ -38,8 +38,14 @@ class SampleEpisode(NamedTuple):
 
 
 def sample_episode(
-    number: int, *, fps: float = 30.0, duration_s: float = 6.0, seed: int = 0,
-    phi: Array = PHI, contacts: int = 2, lag_frames: float = 0.0,
+    number: int,
+    *,
+    fps: float = 30.0,
+    duration_s: float = 6.0,
+    seed: int = 0,
+    phi: Array = PHI,
+    contacts: int = 2,
+    lag_frames: float = 0.0,
 ) -> SampleEpisode:
     """Return an episode whose motion, contacts and noise follow from its number and the seed.
 
@@ -82,8 +88,14 @@ Fault = Callable[[SampleEpisode], SampleEpisode]
 
 
 def write_sample_dataset(
-    folder: Path, *, episodes: int = 5, fps: float = 30.0, duration_s: float = 6.0, seed: int = 0,
-    faults: Mapping[int, Fault] | None = None, changes: Mapping[int, Mapping[str, Any]] | None = None,
+    folder: Path,
+    *,
+    episodes: int = 5,
+    fps: float = 30.0,
+    duration_s: float = 6.0,
+    seed: int = 0,
+    faults: Mapping[int, Fault] | None = None,
+    changes: Mapping[int, Mapping[str, Any]] | None = None,
 ) -> list[SampleEpisode]:
     """Write a LeRobot dataset (v3.0) in one data file, and return its episodes.
 

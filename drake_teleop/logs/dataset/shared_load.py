@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +77,9 @@ def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
                 where="dataset",
                 remedy="set wrench.sign: -1 in a --description",
             )
-        phi = min(candidates, key=lambda phi: _excess(episodes, own, phi).clip(max=_LARGEST_EXCESS).sum())
+        phi = min(
+            candidates, key=lambda phi: _excess(episodes, own, phi).clip(max=_LARGEST_EXCESS).sum()
+        )
         for _ in range(2):
             members = _excess(episodes, own, phi) < _MEMBER_EXCESS
             members = members if members.any() else np.ones(len(own), bool)
@@ -105,7 +107,9 @@ def _best_spacing(logs: Sequence[Log]) -> float:
     some = logs[:: max(1, len(logs) // 6)]
 
     def cost(spacing: float) -> float:
-        return float(np.median([own_load(EpisodeSignals(log, spacing)).spread.sum() for log in some]))
+        return float(
+            np.median([own_load(EpisodeSignals(log, spacing)).spread.sum() for log in some])
+        )
 
     return min(choices, key=cost)
 
@@ -117,9 +121,7 @@ def own_load(signals: EpisodeSignals) -> Hypothesis:
     return min((search.other_load(float(lag)) for lag in lags), key=lambda x: x.spread.sum())
 
 
-def _excess(
-    episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array
-) -> Array:
+def _excess(episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array) -> Array:
     """Return by how much each episode's spread exceeds that with its own load."""
     usual = [_at_best_lag(s, phi, x.lag).spread.sum() for s, x in zip(episodes, own, strict=True)]
     return np.array(usual) - [x.spread.sum() for x in own]
@@ -142,7 +144,7 @@ def _pooled(
     """Return the load fitted to the calm frames of the member episodes, with own offsets."""
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets = []
-    for k in np.flatnonzero(members):
+    for k in (int(row) for row in np.flatnonzero(members)):
         x = _at_best_lag(episodes[k], phi, own[k].lag)
         r = unexplained(x, episodes[k].predictor(phi), episodes[k].regress)
         sigma = np.exp(x.spread) / CALM_WIDTH
@@ -179,9 +181,7 @@ def _pooled(
     )
 
 
-def _free_samples(
-    signals: EpisodeSignals, x: Hypothesis, phi: Array, typical: Array
-) -> Samples:
+def _free_samples(signals: EpisodeSignals, x: Hypothesis, phi: Array, typical: Array) -> Samples:
     residual = unexplained(x, signals.predictor(phi), signals.regress) - x.offsets
     far = (np.abs(residual) > _FREE_DEVIATIONS * typical / CALM_WIDTH).any(axis=1)
     near = np.convolve(far, np.ones(2 * _FREE_MARGIN + 1), "same") > 0.5

@@ -138,9 +138,7 @@ def _collected(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, ND
     return {series.name: _to_numpy(series) for series in whole.get_columns()}
 
 
-def _expand(
-    label: str, column: pl.Expr, dtype: pl.DataType, frame: pl.LazyFrame
-) -> dict[str, pl.Expr]:
+def _expand(label: str, column: pl.Expr, dtype: Any, frame: pl.LazyFrame) -> dict[str, pl.Expr]:
     """Return the numeric parts of a column by name."""
     import polars as pl
 
