@@ -18,12 +18,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
+from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
 from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
     find_hypothesis,
-    name_faults,
     offset_step,
-    saturated_channels,
     unexplained,
 )
 from drake_teleop.logs.dataset.sample_dataset import (

@@ -39,16 +39,14 @@ from drake_teleop.logs.dataset.dataset_files import (
     open_dataset,
     write_copy,
 )
+from drake_teleop.logs.dataset.episode_faults import Finding, name_faults, saturated_channels
 from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
     CALM_WIDTH,
-    Finding,
     Hypothesis,
     calm_half,
     find_hypothesis,
-    name_faults,
     offset_step,
-    saturated_channels,
     unexplained,
 )
 from drake_teleop.logs.dataset.shared_load import (
