@@ -46,7 +46,14 @@ class Order:
             "own_block",
             "own_plant",
         ),
-        *("log_identification", "log_contact", "conventions", "excitation", "sensor_noise"),
+        *(
+            "log_identification",
+            "log_contact",
+            "dataset",
+            "conventions",
+            "excitation",
+            "sensor_noise",
+        ),
         *("networks", "energy", "passivity_methods", "ledger_under_loss", "letting_go"),
         *("stability_map", "felt_impedance", "z_width", "study", "live_drive"),
     )

@@ -310,6 +310,31 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 
 
 @cli.command()
+@click.argument("path", type=option.PATH)
+@option.load()
+@click.option("--identify", is_flag=True, help="Identify the load from the episodes.")
+@click.option(
+    "--description",
+    type=option.PATH,
+    metavar="FILE",
+    help="Log description of an episode, without file.  [default: drafted from the episodes]",
+)
+@option.jobs
+@option.out("dataset")
+@option.quiet
+def dataset(path: Path, out: Path, **options: Any) -> None:
+    """Add contact wrenches to a robot-learning dataset.
+
+    PATH is a LeRobot folder, a robomimic file (.hdf5), a .zarr, or a folder with a table for each
+    episode. Needs --load or --identify. Writes a copy with contact wrench and contact flags, and a
+    verdict for each episode. After an interruption the same command continues.
+    """
+    from drake_teleop.logs.dataset.dataset import dataset_command
+
+    dataset_command(path, out, **options)
+
+
+@cli.command()
 @click.argument("source")
 @option.load(required=True)
 @click.option("--out", "sink", default="-", metavar="SINK", help="Destination.  [default: stdout]")

@@ -47,7 +47,7 @@ _DH = np.array(
         [0.0996, 0.0, 0.0],
     ]
 )
-_HOME = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
+HOME = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
 _SIZE = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # amplitudes of the joints [rad]
 _HARMONICS = 6
 
@@ -183,7 +183,7 @@ class _Motion:
 def _motion(number: int) -> _Motion:
     random = np.random.default_rng([2009, number])
     sine, cosine = random.normal(size=(2, 6, _HARMONICS - 1)) * _SIZE[:, np.newaxis] / 2
-    return _Motion(FourierTrajectory.at_rest(_HOME, sine, cosine, 1 / PERIOD_S))
+    return _Motion(FourierTrajectory.at_rest(HOME, sine, cosine, 1 / PERIOD_S))
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:

@@ -15,19 +15,20 @@ from drake_teleop.common.errors import DrakeTeleopError, install_extra
 _MAX_VALUES, _MAX_ROW = 2**28, 64  # numbers of an array, and of one row: wider ones are images
 
 
-def read_hdf5(path: Path, *, transpose: bool = False) -> dict[str, NDArray]:
+def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[str, NDArray]:
     """Return the numeric arrays of an HDF5 file; links to other files are not followed.
 
     Args:
         path: the file.
         transpose: reverse the axes, as for files of MATLAB.
+        group: only arrays in this group, with names relative to it.
 
     Raises:
         DrakeTeleopError: if h5py is not installed.
         OSError: if the file is damaged.
         ValueError: for an array that is too large or in another file.
     """
-    h5py, found = _library("h5py", path), dict[str, NDArray]()
+    h5py, found = library("h5py", path), dict[str, NDArray]()
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:
@@ -37,18 +38,18 @@ def read_hdf5(path: Path, *, transpose: bool = False) -> dict[str, NDArray]:
                 array = np.asarray(item[()])
                 found[name.replace("/", ".")] = array.T if transpose else array
 
-        file.visititems(visit)
+        file[group].visititems(visit)
     return found
 
 
-def read_zarr(path: Path) -> dict[str, NDArray]:
-    """Return the numeric arrays of a Zarr folder; raises errors as `read_hdf5`."""
-    zarr = _library("zarr", path)
+def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
+    """Return some rows of the numeric arrays of a Zarr folder; raises errors as `read_hdf5`."""
+    zarr = library("zarr", path)
     group = zarr.open_group(path, mode="r")
     members = group.members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}
     return {
-        name.replace("/", "."): np.asarray(item[...])
+        name.replace("/", "."): np.asarray(item[rows])
         for name, item in arrays.items()
         if _is_table(item, False)
     }
@@ -63,7 +64,8 @@ def _is_table(item: Any, transpose: bool) -> bool:
     return True
 
 
-def _library(name: str, path: Path) -> Any:
+def library(name: str, path: Path) -> Any:
+    """Return an optional package that reads a file; raise DrakeTeleopError if it is missing."""
     try:
         return import_module(name)
     except ImportError:

@@ -101,10 +101,14 @@ def read_log(
 
 
 def read_description(
-    description: Description, source: str, *, tables: dict[Path, Table] | None = None
+    description: Description,
+    source: str,
+    *,
+    tables: dict[Path, Table] | None = None,
+    differentiate: bool = True,
 ) -> Log:
     """Return the log of a description with absolute paths, as `read_log`."""
-    return _Reader(description, source, 30.0, tables).log()
+    return _Reader(description, source, 30.0, tables).log(differentiate=differentiate)
 
 
 class _Reader:

@@ -100,24 +100,45 @@ def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
     else:
         read = pl.read_ipc if kind in (".arrow", ".feather") else pl.read_ndjson
         frame = read(path.read_bytes()).lazy()
+    columns = _column_expressions(frame)
+    rows = frame.select(pl.len()).collect().item()
+    if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
+        return _LazyColumns(frame, columns)
+    return _collected(frame, columns)
+
+
+def expanded_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
+    """Return the columns of a frame by name, also the elements of lists and structures.
+
+    Columns of text and binary data, such as images, are left out.
+    """
+    import polars as pl
+
+    numeric = [
+        name
+        for name, dtype in frame.collect_schema().items()
+        if dtype.is_numeric() or isinstance(dtype, (pl.List, pl.Array))
+    ]
+    frame = frame.select(numeric).collect().lazy()
+    return _collected(frame, _column_expressions(frame))
+
+
+def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
+    import polars as pl
+
     columns: dict[str, pl.Expr] = {}
     for name, dtype in frame.collect_schema().items():
         columns |= _expand(name.strip(), pl.col(name), dtype, frame)
     _strip_names(list(frame.collect_schema()))
-    columns = _with_canonical(columns)
-    rows = frame.select(pl.len()).collect().item()
-    if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
-        return _LazyColumns(frame, columns)
+    return _with_canonical(columns)
+
+
+def _collected(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
     whole = frame.select(column.alias(name) for name, column in columns.items()).collect()
     return {series.name: _to_numpy(series) for series in whole.get_columns()}
 
 
-def _expand(
-    label: str,
-    column: pl.Expr,
-    dtype: pl.DataType | pl.datatypes.DataTypeClass,
-    frame: pl.LazyFrame,
-) -> dict[str, pl.Expr]:
+def _expand(label: str, column: pl.Expr, dtype: Any, frame: pl.LazyFrame) -> dict[str, pl.Expr]:
     """Return the numeric parts of a column by name."""
     import polars as pl
 

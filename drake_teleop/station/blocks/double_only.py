@@ -6,7 +6,6 @@ from typing import Any, NoReturn
 
 from drake_teleop.common.errors import DrakeTeleopError
 
-
 _NO_SLOTS: tuple[str, ...] = ()
 
 

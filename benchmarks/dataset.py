@@ -1,0 +1,153 @@
+"""Datasets: share of planted faults that are named, false findings, residual and contact.
+
+Usage: python benchmarks/dataset.py [EPISODES] [FRAMES]: clean episodes per rate, frames for time.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.dataset.dataset import dataset_command
+from drake_teleop.logs.dataset.sample_dataset import (
+    NOISE,
+    SampleEpisode,
+    write_sample_dataset,
+)
+
+RATES = (10.0, 15.0, 30.0, 50.0)
+TOOLS = [
+    phi_from_mass_com_inertia(m, np.array(c), m * 2e-3 * np.eye(3))
+    for m, c in ((0.95, (0.004, -0.011, 0.058)), (0.5, (0, 0, 0.04)), (1.8, (0.02, 0.01, 0.09)))
+]
+OTHER = phi_from_mass_com_inertia(1.3, np.array([-0.01, 0.02, 0.07]), 3e-3 * np.eye(3))
+Fault = Callable[[SampleEpisode, np.ndarray], SampleEpisode]
+
+
+def turn(axis: str, degrees: float) -> np.ndarray:
+    return np.asarray(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
+
+
+def mapped(M: np.ndarray, force: float = 1.0, torque: float = 1.0) -> Fault:
+    def fault(x: SampleEpisode, phi: np.ndarray) -> SampleEpisode:
+        f, tau = x.wrench[:, :3] @ M.T, x.wrench[:, 3:] @ M.T
+        return x._replace(wrench=np.hstack([force * f, torque * tau]))
+
+    return fault
+
+
+def late(frames: int) -> Fault:
+    return lambda x, phi: x._replace(wrench=np.roll(x.wrench, -frames, axis=0))
+
+
+def tared(share: float) -> Fault:
+    def fault(x: SampleEpisode, phi: np.ndarray) -> SampleEpisode:
+        free = [k for k in range(12, len(x.t) - 12) if not x.contact_wrench[k - 4 : k + 4].any()]
+        k = min(free, key=lambda row: abs(row - share * len(x.t)))
+        wrench = x.wrench.copy()
+        wrench[k:] -= wrench[k]
+        return x._replace(wrench=wrench)
+
+    return fault
+
+
+def weight_removed(x: SampleEpisode, phi: np.ndarray) -> SampleEpisode:
+    R = Rotation.from_quat(x.quaternion[:, [1, 2, 3, 0]]).as_matrix()
+    gravity = np.einsum("nji,j->ni", R, [0, 0, -9.80665])
+    rest = np.zeros_like(gravity)
+    return x._replace(wrench=x.wrench - non_contact_wrench(-gravity, rest, rest, phi))
+
+
+def in_base(x: SampleEpisode, phi: np.ndarray) -> SampleEpisode:
+    R = Rotation.from_quat(x.quaternion[:, [1, 2, 3, 0]]).as_matrix()
+    parts = np.einsum("nij,nkj->nki", R, x.wrench.reshape(-1, 2, 3))
+    return x._replace(wrench=parts.reshape(-1, 6))
+
+
+def clipped(x: SampleEpisode, phi: np.ndarray) -> SampleEpisode:
+    return x._replace(wrench=np.minimum(x.wrench, np.quantile(x.wrench, 0.9, axis=0)))
+
+
+FAULTS: dict[str, tuple[set[str], Fault]] = {
+    "z 90": ({"frame"}, mapped(turn("z", 90))),
+    "x 90": ({"frame"}, mapped(turn("x", 90))),
+    "y -90": ({"frame"}, mapped(turn("y", -90))),
+    "z 180": ({"frame"}, mapped(turn("z", 180))),
+    "z 45": ({"frame"}, mapped(turn("z", 45))),
+    "x 20": ({"frame"}, mapped(turn("x", 20))),
+    "base": ({"frame"}, in_base),
+    "negated": ({"sign"}, mapped(-np.eye(3))),
+    "z 90, negated": ({"frame", "sign"}, mapped(-turn("z", 90))),
+    "x reversed": ({"sign"}, mapped(np.diag([-1.0, 1.0, 1.0]))),
+    "lbf": ({"unit"}, mapped(np.eye(3), 1 / 4.4482, 1 / 0.112985)),
+    "kgf": ({"unit"}, mapped(np.eye(3), 1 / 9.80665, 1 / 9.80665)),
+    "N mm": ({"unit"}, mapped(np.eye(3), 1.0, 1000.0)),
+    "1 frame late": ({"lag"}, late(1)),
+    "3 frames late": ({"lag"}, late(3)),
+    "2 frames early": ({"lag"}, late(-2)),
+    "tared": ({"tared"}, tared(0.5)),
+    "weight removed": ({"weight removed"}, weight_removed),
+    "saturated": ({"saturated"}, clipped),
+    "other tool": ({"tool changed"}, lambda x, phi: x),
+}
+
+
+def planted(folder: Path, fps: float, phi: np.ndarray, clean: int) -> str:
+    changes = {k: {"phi": phi} for k in range(clean + len(FAULTS))}
+    order = {clean + k: name for k, name in enumerate(FAULTS)}
+    faults = {k: lambda x, f=FAULTS[n][1]: f(x, phi) for k, n in order.items()}
+    changes |= {k: {"phi": OTHER} for k, name in order.items() if name == "other tool"}
+    made = write_sample_dataset(
+        folder / "in", episodes=clean + len(FAULTS), fps=fps, faults=faults, changes=changes
+    )
+    started = time.process_time()
+    summary = dataset_command(folder / "in", folder / "out", identify=True, quiet=True)
+    cpu = time.process_time() - started
+    rows = summary["episodes"]
+    missed = [n for k, n in order.items() if set(rows[k]["verdict"]) != FAULTS[n][0]]
+    false = sum(row["verdict"] != ["ok"] for row in rows[:clean])
+    table = pl.read_parquet(next((folder / "out" / "in" / "data").glob("**/*.parquet")))
+    table = table.filter(pl.col("episode_index") < clean)
+    contact = np.array(table["observation.contact_wrench"].to_list())
+    truth = np.vstack([x.contact_wrench for x in made[:clean]])
+    touched = table["observation.in_contact"].to_numpy()
+    true = np.hstack([x.in_contact for x in made[:clean]])
+    free = ~truth.any(axis=1)
+    residual = np.sqrt(np.mean(contact[free] ** 2, axis=0)) / NOISE
+    f1 = 2 * (touched & true).sum() / (touched.sum() + true.sum())
+    return (
+        f"{fps:3.0f} Hz {phi[0]:.2f} kg: named {len(FAULTS) - len(missed)}/{len(FAULTS)}, false"
+        f" {false}/{clean}, residual/noise force {residual[:3].mean():.2f} torque"
+        f" {residual[3:].mean():.2f}, F1 {f1:.3f}, mass {summary['mass']:.4f} kg, {cpu:.0f} s CPU;"
+        f" missed: {', '.join(missed) or 'none'}"
+    )
+
+
+def main() -> None:
+    clean = int(sys.argv[1]) if len(sys.argv) > 1 else 30
+    frames = int(sys.argv[2]) if len(sys.argv) > 2 else 10**6
+    with tempfile.TemporaryDirectory() as name:
+        for fps in RATES:
+            for k, phi in enumerate(TOOLS):
+                print(planted(Path(name) / f"{fps}_{k}", fps, phi, clean), flush=True)
+        folder = Path(name) / "long"
+        length = 1000
+        write_sample_dataset(folder / "in", episodes=frames // length, duration_s=length / 30)
+        started = time.process_time()
+        dataset_command(folder / "in", folder / "out", identify=True, quiet=True)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        print(f"{frames} frames: {time.process_time() - started:.0f} s CPU, {peak:.2f} GB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Robot-learning datasets with a wrench: verdict for each episode, and contact wrench."""

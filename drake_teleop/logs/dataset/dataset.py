@@ -1,0 +1,408 @@
+"""Command `dataset`: contact wrench and verdict for each episode of a robot-learning dataset."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import (
+    make_folder,
+    output_folder,
+    whole_file,
+    write_json,
+    write_text,
+)
+from drake_teleop.common.html import render
+from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.common.progress import show_progress
+from drake_teleop.common.texts import read_yaml, yaml_text
+from drake_teleop.load.contact.detection import ContactDetector
+from drake_teleop.load.identification import Identification
+from drake_teleop.logs.check.conventions import check_conventions
+from drake_teleop.logs.check.draft import Draft, draft_description
+from drake_teleop.logs.dataset.dataset_files import (
+    Columns,
+    Dataset,
+    Episode,
+    open_dataset,
+    write_copy,
+)
+from drake_teleop.logs.dataset.episode_faults import Finding, name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
+from drake_teleop.logs.dataset.episode_verdict import (
+    CALM_WIDTH,
+    Hypothesis,
+    calm_half,
+    find_hypothesis,
+    offset_step,
+    unexplained,
+)
+from drake_teleop.logs.dataset.shared_load import (
+    SharedLoad,
+    contact_samples,
+    own_load,
+    shared_load,
+)
+from drake_teleop.logs.figures import load_figures, plain
+from drake_teleop.logs.read.alignment import widened
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.clocks import read_clock
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.reading import read_description
+
+_MAX_CALIBRATION = 24  # episodes that determine load, lag and noise
+_DRAFTS, _CORRECTIONS, _DRAFT_SPACING = 3, 5, 3.0
+_STREAMS = ("wrench", "imu", "pose")
+_UNDETERMINED = 1.5  # log spread beyond the usual one that no hypothesis explains
+_FREE_MARGIN, _FEWEST_FREE = 2, 20  # frames around contact; free frames for the offsets
+_WORK = "unfinished"
+
+
+class Task(NamedTuple):
+    """Input for the verdict of an episode."""
+
+    dataset: Dataset
+    streams: dict[str, Any]
+    shared: SharedLoad
+
+
+def dataset_command(
+    path: Path,
+    out: Path,
+    *,
+    load: Path | None = None,
+    identify: bool = False,
+    description: Path | None = None,
+    jobs: int = 1,
+    quiet: bool = False,
+) -> dict[str, Any]:
+    """Write a copy of a dataset with contact wrenches, summary.json and report.html.
+
+    After an interruption the same command continues. The dataset stays unchanged.
+
+    Args:
+        load: identification.json of the load.
+        identify: identify the load from the episodes instead.
+        description: log description whose `file` is omitted or one of the episodes.
+        jobs: number of processes as in joblib.
+
+    Raises:
+        DrakeTeleopError: for an unusable dataset, load or description.
+    """
+    if (load is None) != identify:
+        raise DrakeTeleopError(
+            "needs one of --load and --identify", where="dataset", remedy="give one of them"
+        )
+    known = None if load is None else Identification.load(load)
+    dataset, copied = open_dataset(path), out / path.resolve().name
+    if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
+        raise DrakeTeleopError(
+            "is in the dataset, which is never changed", where=str(out), remedy="give another --out"
+        )
+    make_folder(out)
+    with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
+        streams = _streams(dataset, description)
+        work = _work_folder(out, dataset, [str(load), known, streams])
+        shared = _shared(dataset, streams, known, stage("load"))
+        task = Task(dataset, streams, shared)
+        rows = _judge_all(task, work, jobs, stage("episodes"))
+        columns = [_read_columns(work / f"{k}.npy") for k in range(len(rows))]
+        write_copy(dataset, copied, columns)
+        write_text(out / "description.yaml", yaml_text(streams))
+        shared.identification.save(out / "identification.json")
+        summary = plain(_summary(dataset, copied, shared, rows))
+        report = render("drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary)
+        write_text(out / "report.html", report)
+        shutil.rmtree(work)
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        _print(summary, out)
+    return summary
+
+
+def _streams(dataset: Dataset, description: Path | None) -> dict[str, Any]:
+    """Return the streams of the description, without file names."""
+    if description is None:
+        return _drafted(dataset)
+    data = read_yaml(description)
+    if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
+        raise DrakeTeleopError(
+            "has no wrench", where=str(description), remedy="see docs/logs.md for an example"
+        )
+    for name in _STREAMS:
+        if isinstance(data.get(name), dict):
+            data[name].pop("file", None)
+    _described(data, dataset.episodes[0], dataset.fps)  # report errors before the work
+    return data
+
+
+def _described(streams: dict[str, Any], episode: Episode, fps: float) -> Description:
+    data = copy.deepcopy(streams)
+    for name in _STREAMS:
+        if name in data:
+            time = {"rate": fps} if np.isfinite(fps) else {"column": "timestamp"}
+            data[name] = {"file": episode.file, "time": time} | data[name]
+    try:
+        return Description.model_validate(data)
+    except ValueError as error:
+        first = str(error).splitlines()
+        raise DrakeTeleopError(
+            " ".join(first[1:3]).strip() or first[0],
+            where="description",
+            remedy="see docs/robot-learning.md for an example",
+        ) from error
+
+
+def _drafted(dataset: Dataset) -> dict[str, Any]:
+    """Return the draft that most of the first, middle and last episode agree on."""
+    count = len(dataset.episodes)
+    chosen = sorted({0, count // 2, count - 1})[:_DRAFTS]
+    drafts = [_draft(dataset, dataset.episodes[k]) for k in chosen]
+    texts = Counter(json.dumps(draft, sort_keys=True) for draft in drafts)
+    text, votes = texts.most_common(1)[0]
+    streams = dict(json.loads(text)) if votes > 1 or count == 1 else drafts[0]
+    return _with_fitting_signs(dataset, streams, [dataset.episodes[k] for k in chosen])
+
+
+def _with_fitting_signs(
+    dataset: Dataset, streams: dict[str, Any], episodes: Sequence[Episode]
+) -> dict[str, Any]:
+    """Return the streams with the quaternion order and the sign with which a load fits best."""
+    form = streams.get("pose", {}).get("orientation", {}).get("form", "")
+    found = []
+    for order in ("quaternion_xyzw", "quaternion_wxyz") if "quaternion" in form else (form,):
+        tried = copy.deepcopy(streams)
+        if "quaternion" in form:
+            tried["pose"]["orientation"]["form"] = order
+        loads = []
+        for episode in episodes:
+            with suppress(DrakeTeleopError):
+                log, _ = _episode_log(dataset, tried, episode)
+                loads.append(own_load(EpisodeSignals(log, _DRAFT_SPACING)))
+        if loads:
+            spread = float(np.median([x.spread.sum() for x in loads]))
+            mass = float(np.median([x.phi[0] for x in loads if x.phi is not None]))
+            found.append((spread, order, mass, tried))
+    if not found:
+        return streams
+    _, _, mass, streams = min(found, key=lambda x: x[:2])
+    if mass < 0.0:
+        streams["wrench"]["sign"] = -streams["wrench"].get("sign", 1)
+    return streams
+
+
+def _draft(dataset: Dataset, episode: Episode) -> dict[str, Any]:
+    table = dataset.table(episode)
+    draft = draft_description(table, episode.file.parent)
+    streams = _without_files(draft, dataset.fps)
+    if "FILL IN" in str(streams) or "wrench" not in streams or not {"pose", "imu"} & set(streams):
+        raise DrakeTeleopError(
+            "wrench, time and motion are not all recognized by the names of its columns"
+            f" ({', '.join(list(table.columns)[:12])} ...)",
+            where=f"{episode.file.name}: {episode.name}",
+            remedy="give a --description, see docs/robot-learning.md",
+        )
+    for _ in range(_CORRECTIONS):
+        described = _described(streams, episode, dataset.fps)
+        try:
+            found = check_conventions(described, str(episode.file), {episode.file: table}).findings
+        except DrakeTeleopError:
+            break
+        fields = next((x for x in found if x.fields and "time" not in str(x.fields)), None)
+        if fields is None:
+            break
+        draft = draft.corrected(fields)
+        streams = _without_files(draft, dataset.fps)
+    return streams
+
+
+def _without_files(draft: Draft, fps: float) -> dict[str, Any]:
+    streams = {name: dict(x) for name, x in draft.streams.items()}
+    for stream in streams.values():
+        stream.pop("file", None)
+        if stream.get("time", {}).get("column") == "FILL IN" and np.isfinite(fps):
+            stream["time"] = {"rate": fps}
+    return streams
+
+
+def _episode_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tuple[Log, Array]:
+    """Return the log of an episode, and the times (N,) of its rows on the log's clock [s]."""
+    table, described = dataset.table(episode), _described(streams, episode, dataset.fps)
+    source = f"{episode.file.name}: {episode.name}"
+    tables = {episode.file: table}
+    log = read_description(described, source, tables=tables, differentiate=False)
+    if log.posed is None and log.R_WS is None:
+        raise DrakeTeleopError(
+            "has no orientation", where=source, remedy="describe a pose with an orientation"
+        )
+    assert described.wrench is not None
+    clock = read_clock(described.wrench.time, table, described.wrench.columns, source)
+    at = np.interp(np.arange(clock.total), clock.rows, clock.t - clock.t[0])
+    return log, at
+
+
+def _work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
+    """Return the folder of results of this command, with those of an interrupted one."""
+    files = sorted({episode.file for episode in dataset.episodes})
+    states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+    key = hashlib.sha256(repr((settings, states)).encode()).hexdigest()
+    work = out / _WORK
+    if work.is_dir() and (work / "key").is_file() and (work / "key").read_text() != key:
+        shutil.rmtree(work)
+    make_folder(work)
+    write_text(work / "key", key)
+    return work
+
+
+def _shared(
+    dataset: Dataset, streams: dict[str, Any], known: Identification | None, progress: Any
+) -> SharedLoad:
+    step = -(-len(dataset.episodes) // _MAX_CALIBRATION)
+    logs, errors = [], []
+    for k, episode in enumerate(dataset.episodes[::step]):
+        try:
+            logs.append(_episode_log(dataset, streams, episode)[0])
+        except DrakeTeleopError as error:
+            errors.append(error)
+        progress(0.5 * (k + 1) * step / len(dataset.episodes))
+    if not logs:
+        raise errors[0]
+    shared = shared_load(logs, known)
+    progress(1.0)
+    return shared
+
+
+def _judge_all(task: Task, work: Path, jobs: int, progress: Any) -> list[dict[str, Any]]:
+    from joblib import Parallel, delayed
+
+    count = len(task.dataset.episodes)
+    left = [k for k in range(count) if not (work / f"{k}.json").is_file()]
+    progress(1.0 - len(left) / count)
+    done = Parallel(n_jobs=jobs, return_as="generator_unordered")(
+        delayed(partial(_judge, task, work))(k) for k in left
+    )
+    for number, _ in enumerate(done, start=count - len(left) + 1):
+        progress(number / count, f"{number} of {count}")
+    return [json.loads((work / f"{k}.json").read_text(encoding="utf-8")) for k in range(count)]
+
+
+def _judge(task: Task, work: Path, number: int) -> None:
+    """Write columns and row of one episode; the row last, which marks it as complete."""
+    episode = task.dataset.episodes[number]
+    try:
+        with one_blas_thread():
+            row, columns = _verdict(task, episode)
+    except DrakeTeleopError as error:
+        rows = task.dataset.table(episode).rows
+        columns = Columns(np.full((rows, 6), np.nan), np.zeros(rows, bool))
+        row = {"verdict": ["unusable"], "messages": [str(error)], "frames": rows}
+    with whole_file(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
+        np.save(file, np.column_stack(columns))
+    write_json(work / f"{number}.json", plain({"episode": episode.name} | row))
+
+
+def _read_columns(path: Path) -> Columns:
+    values = np.load(path, allow_pickle=False)
+    return Columns(values[:, :6], values[:, 6] > 0.5)
+
+
+def _verdict(task: Task, episode: Episode) -> tuple[dict[str, Any], Columns]:
+    """Return figures and new columns of an episode; named faults are corrected in the columns."""
+    shared = task.shared
+    log, at = _episode_log(task.dataset, task.streams, episode)
+    signals = EpisodeSignals(log, shared.spacing)
+    predict = signals.predictor(shared.phi)
+    found = find_hypothesis(predict, signals.regress, shared.lag, shared.typical)
+    residual = unexplained(found, predict, signals.regress)
+    faults: list[Finding] = saturated_channels(log.wrench)
+    faults += name_faults(found, shared.lag, shared.phi, 1.0 / log.dt)
+    offsets = np.tile(found.offsets, (len(residual), 1))
+    step = offset_step(residual, found.spread)
+    if step is not None:
+        k, before, after = step
+        offsets[:k], offsets[k:] = before, after
+        change = ", ".join(f"{x:.3g}" for x in after - before)
+        text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
+        faults.append(Finding("tared", text, float(log.t[k])))
+    spread = calm_half(residual - offsets, 0.1 * shared.typical)[0] - np.log(shared.typical)
+    spread -= np.log(found.gain).repeat(3)
+    if not faults and spread.mean() > _UNDETERMINED:
+        text = "no single fault explains the wrench: it is in contact most of the time, or the load"
+        faults.append(Finding("unexplained", f"{text} changes", None))
+    contact, touched = _without_load(shared, signals, found, residual - offsets)
+    rows = np.array([np.interp(at, log.t, x) for x in contact.T]).T
+    nearest = np.clip(np.round((at - log.t[0]) / log.dt).astype(int), 0, len(log) - 1)
+    free = contact[~touched]
+    row = {
+        "verdict": list(dict.fromkeys(x.name for x in faults)) or ["ok"],
+        "messages": [x.message for x in faults],
+        "values": {x.name: x.value for x in faults},
+        "frames": len(at),
+        "rate_hz": 1.0 / log.dt,
+        "lag_frames": found.lag,
+        "offsets": found.offsets,
+        "in_contact": float(touched[nearest].mean()),
+        "free_rms": np.sqrt(np.mean(free**2, axis=0)) if len(free) else None,
+        "notes": list(log.notes),
+    }
+    return row, Columns(rows.astype(np.float32), touched[nearest])
+
+
+def _without_load(
+    shared: SharedLoad, signals: EpisodeSignals, found: Hypothesis, residual: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return contact wrench and flags of contact; the offsets are the mean of the free frames."""
+    for _ in range(3):
+        contact = found.correct(residual)
+        detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)
+        touched = detector.detect(*contact_samples(signals, found.lag, contact))
+        free = ~widened(touched, _FREE_MARGIN)
+        if free.sum() < _FEWEST_FREE:
+            break
+        residual = residual - residual[free].mean(axis=0)
+    return contact, touched
+
+
+def _summary(
+    dataset: Dataset, copied: Path, shared: SharedLoad, rows: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    names = Counter(name for row in rows for name in row["verdict"])
+    return {
+        "dataset": str(dataset.path),
+        "kind": dataset.kind,
+        "copy": str(copied),
+        "episodes": list(rows),
+        "frames": sum(row["frames"] for row in rows),
+        "ok": names["ok"],
+        "faults": dict(sorted((k, n) for k, n in names.items() if k != "ok")),
+        "lag_frames": shared.lag,
+        "noise": shared.typical / CALM_WIDTH,
+        "spline_frames": shared.spacing,
+        "contact_threshold": shared.threshold,
+        **load_figures(shared.identification),
+    }
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+
+    show = partial(Console(soft_wrap=True).print, highlight=False, markup=False)
+    count = len(summary["episodes"])
+    show(f"{count} episodes, {summary['frames']} frames, load {summary['mass']:.4g} kg")
+    show(f"{summary['ok']} of {count} episodes are ok")
+    for row in summary["episodes"]:
+        for message in row["messages"]:
+            show(f"  {row['episode']}: {message}")
+    show(f"copy with contact wrenches: {summary['copy']}; report: {out / 'report.html'}")

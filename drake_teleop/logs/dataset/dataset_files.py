@@ -1,0 +1,303 @@
+"""Files of robot-learning datasets: episodes of LeRobot, robomimic, Zarr and folders of tables.
+
+The copy has two more columns; its other tables have the same values, and other files are links.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
+from drake_teleop.common.files import make_folder, whole_file, write_table
+from drake_teleop.common.numeric import Array
+from drake_teleop.logs.read.array_files import library, read_hdf5, read_zarr
+from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.csv_text import read_csv
+from drake_teleop.logs.read.table_files import expanded_columns, read_table
+from drake_teleop.logs.read.tables import Table
+
+CONTACT_WRENCH, IN_CONTACT = "observation.contact_wrench", "observation.in_contact"
+_TABLES = (".csv", ".tsv", ".parquet")
+_JSON_OF_ZARR = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+
+class Episode(NamedTuple):
+    """Rows of one episode in a file; `group` is that of an HDF5 file."""
+
+    name: str
+    file: Path
+    first: int
+    rows: int
+    group: str = ""
+
+
+class Columns(NamedTuple):
+    """New columns of an episode: contact wrench (N, 6) and flags (N,) of contact."""
+
+    contact_wrench: Array
+    in_contact: NDArray[np.bool_]
+
+
+class Dataset(NamedTuple):
+    """Dataset of one kind: "lerobot", "hdf5", "zarr" or "tables"; `fps` is nan if unknown."""
+
+    path: Path
+    kind: str
+    episodes: list[Episode]
+    fps: float
+
+    def table(self, episode: Episode) -> Table:
+        """Return the columns of an episode."""
+        if self.kind == "tables":
+            return read_table(episode.file)
+        rows = slice(episode.first, episode.first + episode.rows)
+        with wrap_read_errors(episode.file, "check that it is complete"):
+            if self.kind == "hdf5":
+                return Table(episode.file, _expanded(read_hdf5(episode.file, group=episode.group)))
+            if self.kind == "zarr":
+                arrays = read_zarr(episode.file / "data", rows=rows)
+                return Table(episode.file, _expanded(arrays))
+            import polars as pl
+
+            frame = pl.scan_parquet(episode.file).slice(episode.first, episode.rows)
+            return Table(episode.file, expanded_columns(frame))
+
+
+def _expanded(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    parts = {
+        f"{name}[{k}]": x.reshape(len(x), -1)[:, k]
+        for name, x in arrays.items()
+        for k in range(int(np.prod(x.shape[1:])) if 1 < x.ndim <= 3 else 0)
+    }
+    return parts | dict(arrays)
+
+
+def open_dataset(path: Path) -> Dataset:
+    """Return the episodes of a dataset.
+
+    Raises:
+        DrakeTeleopError: for a folder or file that is no dataset.
+    """
+    if not path.exists():
+        raise DrakeTeleopError("no such file or folder", where=str(path), remedy="check the path")
+    with wrap_read_errors(path, "check that the dataset is complete"):
+        if (path / "meta" / "info.json").is_file():
+            found = _open_lerobot(path)
+        elif path.suffix.lower() in (".hdf5", ".h5"):
+            found = _open_hdf5(path)
+        elif path.suffix.lower() == ".zarr":
+            found = _open_zarr(path)
+        else:
+            files = sorted(p for p in path.glob("**/*") if p.suffix.lower() in _TABLES)
+            episodes = [Episode(str(p.relative_to(path)), p, 0, 0) for p in files]
+            found = Dataset(path, "tables", episodes, float("nan"))
+    if not found.episodes:
+        raise DrakeTeleopError(
+            "contains no episodes",
+            where=str(path),
+            remedy="give a LeRobot folder, a robomimic .hdf5, a .zarr, or a folder of .csv or"
+            " .parquet files, one for each episode",
+        )
+    return found
+
+
+def _open_lerobot(path: Path) -> Dataset:
+    import polars as pl
+
+    info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+    episodes = []
+    for file in sorted((path / "data").glob("**/*.parquet")):
+        index = pl.read_parquet(file, columns=["episode_index"])["episode_index"].to_numpy()
+        starts = np.flatnonzero(np.diff(index, prepend=-1))
+        for first, last in zip(starts, [*starts[1:], len(index)], strict=True):
+            name = f"episode {int(index[first])}"
+            episodes.append(Episode(name, file, int(first), int(last - first)))
+    return Dataset(path, "lerobot", episodes, float(info.get("fps", "nan")))
+
+
+def _open_hdf5(path: Path) -> Dataset:
+    names: list[str] = []
+    settings: dict[str, Any] = {}
+    with library("h5py", path).File(path, "r") as file:
+        if "data" in file:
+            data = file["data"]
+            names = sorted(data, key=lambda name: (len(name), name))
+            settings = json.loads(data.attrs.get("env_args", "{}"))
+        episodes = [Episode(name, path, 0, 0, f"data/{name}") for name in names]
+    fps = settings.get("env_kwargs", {}).get("control_freq", "nan")
+    return Dataset(path, "hdf5", episodes, float(fps))
+
+
+def _open_zarr(path: Path) -> Dataset:
+    ends = np.asarray(read_zarr(path / "meta")["episode_ends"], int)
+    starts = [0, *ends[:-1]]
+    episodes = [
+        Episode(f"episode {k}", path, int(a), int(b - a))
+        for k, (a, b) in enumerate(zip(starts, ends, strict=True))
+    ]
+    return Dataset(path, "zarr", episodes, float("nan"))
+
+
+def write_copy(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
+    """Write the dataset with the columns of each episode to `out`; the dataset stays unchanged."""
+    if dataset.kind == "hdf5":
+        _write_hdf5(dataset, out, columns)
+        return
+    written = {e.file for e in dataset.episodes} if dataset.kind != "zarr" else set()
+    if dataset.kind == "lerobot":
+        written |= {dataset.path / "meta" / name for name in ("info.json", "stats.json")}
+    for file in sorted(p for p in dataset.path.glob("**/*") if p.is_file()):
+        if file not in written:
+            copied = dataset.kind == "zarr" and file.name in _JSON_OF_ZARR
+            _link(file, out / file.relative_to(dataset.path), copied=copied)
+    if dataset.kind == "zarr":
+        _write_zarr(out, columns)
+        return
+    for path, part in _by_file(dataset.episodes, columns):
+        target = out / path.relative_to(dataset.path)
+        make_folder(target.parent)
+        if path.suffix.lower() == ".parquet":
+            _write_parquet(path, target, part)
+        else:
+            _write_csv(path, target, part)
+    if dataset.kind == "lerobot":
+        _write_meta(dataset.path / "meta", out / "meta", columns)
+
+
+def _by_file(
+    episodes: Sequence[Episode], columns: Sequence[Columns]
+) -> Iterator[tuple[Path, Columns]]:
+    files = list(dict.fromkeys(episode.file for episode in episodes))
+    for file in files:
+        yield file, _joined([c for e, c in zip(episodes, columns, strict=True) if e.file == file])
+
+
+def _joined(columns: Sequence[Columns]) -> Columns:
+    return Columns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+
+
+def _link(file: Path, target: Path, *, copied: bool) -> None:
+    make_folder(target.parent)
+    with whole_file(target) as temporary:
+        temporary.unlink(missing_ok=True)
+        try:
+            if copied:
+                raise OSError
+            os.link(file.resolve(), temporary)
+        except OSError:  # another file system
+            shutil.copyfile(file, temporary)
+
+
+def _write_parquet(path: Path, target: Path, new: Columns) -> None:
+    import polars as pl
+
+    frame = pl.read_parquet(path)
+    wrench = pl.Series(CONTACT_WRENCH, new.contact_wrench.astype(np.float32).tolist())
+    frame = frame.with_columns(
+        wrench.cast(pl.List(pl.Float32)), pl.Series(IN_CONTACT, new.in_contact)
+    )
+    kept = {k: v for k, v in pl.read_parquet_metadata(path).items() if k != "ARROW:schema"}
+    if "huggingface" in kept:
+        kept["huggingface"] = _with_features(kept["huggingface"])
+    write_table(target, frame, metadata=kept)
+
+
+def _with_features(text: str) -> str:
+    data = json.loads(text)
+    features = data.get("info", {}).get("features", {})
+    lists = [x for x in features.values() if isinstance(x, dict) and "feature" in x]
+    like: dict[str, Any] = copy.deepcopy(lists[0]) if lists else {"_type": "List"}
+    features[CONTACT_WRENCH] = like | {
+        "feature": {"dtype": "float32", "_type": "Value"},
+        "length": -1,
+    }
+    features[IN_CONTACT] = {"dtype": "bool", "_type": "Value"}
+    return json.dumps(data)
+
+
+def _write_csv(path: Path, target: Path, new: Columns) -> None:
+    """Append cells to each line, so that all other text remains."""
+    frame, first = read_csv(path, True)
+    lines = path.read_bytes().splitlines(keepends=True)
+    rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
+    head = first - 2
+    if len(rows) != len(frame) or len(frame) != len(new.in_contact) or head < 0:
+        raise DrakeTeleopError(
+            "its lines are not the rows of a table with names",
+            where=str(path),
+            remedy="convert it to Parquet",
+        )
+    separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
+    names = [f"{CONTACT_WRENCH}.{name}" for name in WRENCH] + [IN_CONTACT]
+    cells = np.column_stack([new.contact_wrench, new.in_contact])
+    texts = {head: names} | {
+        k: [f"{x:.6g}" for x in row] for k, row in zip(rows, cells, strict=True)
+    }
+    for k, values in texts.items():
+        text = lines[k].rstrip(b"\r\n")
+        added = separator + separator.join(value.encode() for value in values)
+        lines[k] = text + added + lines[k][len(text) :]
+    with whole_file(target) as temporary:
+        temporary.write_bytes(b"".join(lines))
+
+
+def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
+    h5py = library("h5py", dataset.path)
+    make_folder(out.parent)
+    with whole_file(out) as temporary:
+        shutil.copyfile(dataset.path, temporary)
+        with h5py.File(temporary, "r+") as file:
+            for episode, new in zip(dataset.episodes, columns, strict=True):
+                group = file[episode.group]
+                group = group.get("obs", group)
+                for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
+                    if name in group:
+                        del group[name]
+                    group[name] = values.astype(np.float32 if values.ndim == 2 else bool)
+
+
+def _write_zarr(out: Path, columns: Sequence[Columns]) -> None:
+    zarr = library("zarr", out)
+    group, new = zarr.open_group(out / "data", mode="r+"), _joined(columns)
+    for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
+        array = values.astype(np.float32 if values.ndim == 2 else bool)
+        group.create_array(name, data=array, overwrite=True)
+    if (out / ".zmetadata").is_file():
+        zarr.consolidate_metadata(out, zarr_format=2)
+
+
+def _write_meta(source: Path, target: Path, columns: Sequence[Columns]) -> None:
+    info = json.loads((source / "info.json").read_text(encoding="utf-8"))
+    info["features"][CONTACT_WRENCH] = {"dtype": "float32", "shape": [6], "names": list(WRENCH)}
+    info["features"][IN_CONTACT] = {"dtype": "bool", "shape": [1], "names": None}
+    make_folder(target)
+    _write_json(target / "info.json", info)
+    if not (source / "stats.json").is_file():
+        return
+    stats, new = json.loads((source / "stats.json").read_text(encoding="utf-8")), _joined(columns)
+    with_quantiles = any("q50" in x for x in stats.values())
+    for name, values in (
+        (CONTACT_WRENCH, new.contact_wrench),
+        (IN_CONTACT, new.in_contact[:, None]),
+    ):
+        x = values.astype(float)
+        parts = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
+        if with_quantiles:
+            parts |= {key: np.quantile(x, q, axis=0) for key, q in _QUANTILES.items()}
+        stats[name] = {key: y.tolist() for key, y in parts.items()} | {"count": [len(x)]}
+    _write_json(target / "stats.json", stats)
+
+
+def _write_json(path: Path, data: Any) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")

@@ -1,0 +1,118 @@
+"""Names and descriptions of the faults of an episode's wrench."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drake_teleop.common.numeric import Array
+from drake_teleop.logs.dataset.episode_verdict import Hypothesis
+from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.description import UNITS
+
+_FORCE_UNITS = ("mN", "kN", "daN", "gf", "kgf", "ozf", "lbf")
+_TORQUE_UNITS = (
+    "mN m",
+    "kN m",
+    "daN m",
+    "N cm",
+    "gf cm",
+    "kgf cm",
+    "kgf m",
+    "ozf in",
+    "lbf in",
+    "lbf ft",
+)
+_UNIT_TOLERANCE, _SMALLEST_GAIN = 0.04, 0.06
+_SMALLEST_TURN_DEG = 4.0
+_SMALLEST_LAG = 0.6  # frames
+_FEWEST_SATURATED = 4
+
+
+class Finding(NamedTuple):
+    """Named fault with its description and figures."""
+
+    name: str
+    message: str
+    value: Any
+
+
+def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> list[Finding]:
+    """Return the deviations of a hypothesis from the usual description by name.
+
+    `known` (10,) is the known load.
+    """
+    if x.phi is not None:
+        mass = float(x.phi[0])
+        text = f"the load is another one: {mass:.3g} kg instead of {known[0]:.3g} kg"
+        return [Finding("tool changed", text, x.phi.tolist())]
+    found = []
+    if x.kind == "base":
+        found.append(Finding("frame", "the wrench is in the axes of the base", "base"))
+    if x.kind == "weight removed":
+        text = "the robot has already removed the load's weight from the wrench"
+        found.append(Finding("weight removed", text, None))
+    found += _turn_findings(
+        x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force"
+    )
+    if not np.allclose(x.force, x.torque):
+        found += _turn_findings(x.torque, "the torque")
+    found += _unit_findings(x.gain)
+    late = x.lag - usual_lag
+    if abs(late) >= _SMALLEST_LAG:
+        side = "behind" if late > 0 else "ahead of"
+        text = f"the motion is {abs(late):.1f} frames ({abs(late) / fps:.3f} s) {side} the wrench"
+        found.append(Finding("lag", f"{text}, compared with the other episodes", late))
+    return found
+
+
+def _turn_findings(M: Array, what: str) -> list[Finding]:
+    from scipy.spatial.transform import Rotation
+
+    single = np.flatnonzero(np.diag(M) < 0)
+    if np.allclose(np.abs(M), np.eye(3)) and len(single) == 1:
+        text = f"axis {'xyz'[single[0]]} of {what} is reversed"
+        return [Finding("sign", text, np.diag(M).tolist())]
+    found = []
+    if np.linalg.det(M) < 0:
+        found.append(Finding("sign", f"{what} is negated", -1))
+        M = -M
+    turn = Rotation.from_matrix(M).as_rotvec(degrees=True)
+    angle = float(np.linalg.norm(turn))
+    if angle > _SMALLEST_TURN_DEG:
+        axis = ", ".join(f"{a:.2g}" for a in turn / angle)
+        text = f"{what} is turned by {angle:.3g} deg about [{axis}] of S"
+        found.append(Finding("frame", text, M.tolist()))
+    return found
+
+
+def _unit_findings(gain: Array) -> list[Finding]:
+    found = []
+    units = (("force", "N", _FORCE_UNITS), ("torque", "N m", _TORQUE_UNITS))
+    for factor, (what, si, names) in zip(gain, units, strict=True):
+        if abs(factor - 1.0) < _SMALLEST_GAIN:
+            continue
+        unit = min(names, key=lambda name: abs(np.log(factor * UNITS[name])))
+        near = abs(factor * UNITS[unit] - 1.0) < _UNIT_TOLERANCE
+        text = f"the {what} is {factor:.4g} times that in {si}"
+        found.append(Finding("unit", text + (f": its unit is {unit}" if near else ""), factor))
+    return found
+
+
+def saturated_channels(wrench: Array) -> list[Finding]:
+    """Return a finding for channels of a wrench (N, 6) that stay at an end of their range."""
+    names = []
+    for name, x in zip(WRENCH, wrench.T, strict=True):
+        if x.min() == x.max():
+            return [Finding("dead channel", f"{name} is {x[0]:.4g} in all frames", name)]
+        starts = np.flatnonzero(np.diff(x, prepend=np.nan))
+        lengths, values = np.diff(starts, append=len(x)), x[starts]
+        ends = (values == x.max()) | (values == x.min())
+        longest = int(lengths[ends].max())
+        if longest >= max(_FEWEST_SATURATED, 2 * int(lengths[~ends].max(initial=0))):
+            names.append(f"{name} for {longest} frames")
+    if not names:
+        return []
+    text = f"channels stay at the end of their range: {', '.join(names)}"
+    return [Finding("saturated", text, names)]

@@ -1,0 +1,336 @@
+"""Faults of an episode's wrench, found by comparison with the wrench of a known load.
+
+A hypothesis is a reading G M p(t + lag) + offsets, with the load's wrench p, a rotation or
+mirroring M and a factor G of forces and of torques. The simplest hypothesis is chosen unless
+another one reduces the spread of the residual decisively. The spread is that of the calmer half of
+the frames, so that contact has no influence.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.numeric import Array
+
+STEPS = 8
+"""Steps of the lag per frame."""
+MAX_LAG_FRAMES = 8
+KINDS = ("sensor", "weight removed", "base")
+"""Wrenches of the load: in S; without its weight; in the axes of the base."""
+CALM_WIDTH = 0.674
+"""Half width of the calmer half of normal numbers, in standard deviations."""
+_SIGNED_PERMUTATIONS = np.array(
+    [
+        np.array(signs)[:, None] * np.eye(3)[list(order)]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1.0, -1.0), repeat=3)
+    ]
+)
+_FORCE, _TORQUE = slice(0, 3), slice(3, 6)
+_KEPT_SHARE, _ITERATIONS = 0.6, 4
+_COST, _COST_FRAMES = 0.25, 40.0  # required reduction of the log spread, for each deviation
+_PARTS = 4
+_FLOOR_SHARE = 0.3
+_INLIER, _STEP_DEVIATIONS = 5.0, 5.0
+_FEWEST_STEP_FRAMES, _STEP_SHARE, _TRIED_STEPS = 12, 0.12, 20
+_NOISE_MARGIN = 1.5
+
+Predict = Callable[[str, float], tuple[Array, Array]]
+"""Function of a kind and a lag [frames]: reading in the axes of S, and the load's wrench (N, 6)."""
+Regress = Callable[[float], Array]
+"""Function of a lag [frames] that returns the regressor V (N, 6, 10)."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Explanation of an episode's wrench.
+
+    Attributes:
+        kind: one of `KINDS`.
+        lag: delay of the motion behind the wrench [frames].
+        force, torque: (3, 3) rotation or mirroring of the load's force and torque.
+        gain: (2,) factors of force and torque.
+        phi: (10,) of another load; None for the known one.
+        spread: (6,) logarithms of the half widths of the residual.
+        offsets: (6,) sensor offsets [N, N m].
+        cost: sum of `spread` and of the costs of all deviations.
+    """
+
+    kind: str
+    lag: float
+    force: Array
+    torque: Array
+    gain: Array
+    phi: Array | None = None
+    spread: Array = field(default_factory=lambda: np.zeros(6))
+    offsets: Array = field(default_factory=lambda: np.zeros(6))
+    cost: float = np.inf
+
+    def apply(self, load_wrench: Array) -> Array:
+        """Return the reading (N, 6) without offsets for a wrench (N, 6) of the load."""
+        f, tau = load_wrench[:, :3], load_wrench[:, 3:]
+        return np.hstack([self.gain[0] * f @ self.force.T, self.gain[1] * tau @ self.torque.T])
+
+    def correct(self, wrench: Array) -> Array:
+        """Return readings (N, 6) without offsets in SI units, with the described axes."""
+        f, tau = wrench[:, :3] @ self.force, wrench[:, 3:] @ self.torque
+        return np.hstack([f / self.gain[0], tau / self.gain[1]])
+
+
+def as_described(lag: float) -> Hypothesis:
+    """Return the hypothesis without a fault."""
+    return Hypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
+
+
+def calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
+    """Return log half widths (6,) of the narrowest half of residuals (N, 6), and its centres."""
+    ordered = np.sort(residual, axis=0)
+    half = len(ordered) // 2
+    widths = ordered[half:] - ordered[: len(ordered) - half]
+    start, channels = np.argmin(widths, axis=0), np.arange(residual.shape[1])
+    centres = 0.5 * (ordered[start, channels] + ordered[start + half, channels])
+    return np.log(np.maximum(0.5 * widths[start, channels], floor)), centres
+
+
+def find_hypothesis(
+    predict: Predict, regress: Regress, usual_lag: float, typical: Array
+) -> Hypothesis:
+    """Return the simplest hypothesis that explains the wrench of an episode.
+
+    Args:
+        usual_lag: lag of the other episodes [frames].
+        typical: (6,) half widths of the residual of other episodes [N, N m].
+    """
+    search = Search(predict, regress, usual_lag, _FLOOR_SHARE * typical)
+    usual = search.judged(as_described(usual_lag))
+    if usual.spread.sum() - np.log(typical).sum() < search.price:
+        return usual
+    found = [usual]
+    for kind in KINDS:
+        lags = {usual_lag, search.best_lag(replace(usual, kind=kind)), search.free_lag(kind)}
+        for lag in lags:
+            found += search.hypotheses(kind, lag)
+            found += [search.other_load(lag)] if kind == "sensor" else []
+    best = min(found, key=lambda x: x.cost)
+    if best.phi is None:
+        found.append(search.judged(replace(best, lag=search.best_lag(best))))
+    return min(found, key=lambda x: x.cost)
+
+
+def unexplained(x: Hypothesis, predict: Predict, regress: Regress) -> Array:
+    """Return the part (N, 6) of the reading that is not from the load, with offsets."""
+    wrench, load_wrench = predict(x.kind, x.lag)
+    if x.phi is not None:
+        return np.asarray(wrench - regress(x.lag) @ x.phi)
+    return wrench - x.apply(load_wrench)
+
+
+class Search:
+    """Hypotheses for one episode; arguments as for `find_hypothesis`, `floor` (6,) of spreads."""
+
+    def __init__(self, predict: Predict, regress: Regress, usual_lag: float, floor: Array) -> None:
+        self.predict, self.regress = predict, regress
+        self.usual_lag, self.floor = usual_lag, floor
+        self.frames = len(predict("sensor", usual_lag)[0])
+        self.price = _COST + _COST_FRAMES / self.frames
+
+    def residual(self, x: Hypothesis) -> Array:
+        return unexplained(x, self.predict, self.regress)
+
+    def judged(self, x: Hypothesis) -> Hypothesis:
+        spread, offsets = calm_half(self.residual(x), self.floor)
+        cost = float(spread.sum()) + self.price * _deviations(x, self.usual_lag)
+        return replace(x, spread=spread, offsets=offsets, cost=cost)
+
+    def kept(self, x: Hypothesis) -> NDArray[np.bool_]:
+        return _best_rows((self.residual(x) - x.offsets) / np.exp(x.spread))
+
+    def hypotheses(self, kind: str, lag: float) -> Iterator[Hypothesis]:
+        both, one = self.predict(kind, lag), np.ones(2)
+        force, torque = (self.best_permutation(*both, channels) for channels in (_FORCE, _TORQUE))
+        plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
+        yield self.judged(plain)
+        yield self.judged(replace(plain, force=-np.eye(3), torque=-np.eye(3)))
+        for M, T in ((force, force), (torque, torque), (force, torque)):
+            yield self.judged(replace(plain, force=M, torque=T))
+        for det in (1.0, -1.0):
+            start = self.concentrate(plain, det=det, scale=True)
+            yield start
+            yield self.concentrate(replace(start, gain=one), det=det, scale=False)
+            for M in (np.eye(3), -np.eye(3), _nearest_permutation(start.force)):
+                yield self.concentrate(replace(start, force=M, torque=M), det=0.0, scale=True)
+
+    def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
+        """Return the signed permutation with the least spread of three channels."""
+        w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
+        pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
+        spread = calm_half(pairs.reshape(len(w), -1), np.repeat(floor, 6))[0].reshape(3, 3, 2)
+        costs = [
+            sum(spread[i, j, int(M[i, j] < 0)] for i, j in zip(*np.nonzero(M), strict=True))
+            for M in _SIGNED_PERMUTATIONS
+        ]
+        return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmin(costs))])
+
+    def starts(self) -> Iterator[NDArray[np.bool_]]:
+        """Yield flags (N,) of all frames and of parts, of which one may be without contact."""
+        at = np.arange(self.frames) * _PARTS // self.frames
+        yield at >= 0
+        for part in range(_PARTS):
+            yield at == part
+
+    def concentrate(self, x: Hypothesis, *, det: float, scale: bool) -> Hypothesis:
+        """Return the hypothesis with rotation and factors fitted to the best rows.
+
+        The determinant of the fitted rotation is `det`; 0 keeps the rotation.
+        """
+        found = [self.concentrated(x, rows, det, scale) for rows in self.starts()]
+        return min(found, key=lambda x: x.cost)
+
+    def concentrated(
+        self, x: Hypothesis, rows: NDArray[np.bool_], det: float, scale: bool
+    ) -> Hypothesis:
+        both = self.predict(x.kind, x.lag)
+        for _ in range(_ITERATIONS):
+            w, q = (y[rows] - y[rows].mean(axis=0) for y in both)
+            if scale:
+                ratio = [
+                    np.linalg.norm(w[:, c]) / (np.linalg.norm(q[:, c]) + 1e-12)
+                    for c in (_FORCE, _TORQUE)
+                ]
+                x = replace(x, gain=np.maximum(ratio, 1e-9))
+            if det:
+                M = _rotation(w, q, x.gain, det)
+                x = replace(x, force=M, torque=M)
+            if scale:
+                x = replace(x, gain=_gains(w, q, x))
+            x = self.judged(x)
+            rows = self.kept(x)
+        return x
+
+    def other_load(self, lag: float) -> Hypothesis:
+        """Return the hypothesis of another load, fitted to the best rows."""
+        wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
+        found = [self.fitted_load(wrench, V, lag, rows) for rows in self.starts()]
+        return min(found, key=lambda x: x.cost)
+
+    def fitted_load(
+        self, wrench: Array, V: Array, lag: float, rows: NDArray[np.bool_]
+    ) -> Hypothesis:
+        x = as_described(lag)
+        weights = np.exp(-calm_half(wrench, self.floor)[0])
+        for _ in range(_ITERATIONS):
+            w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
+            A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
+            size = np.linalg.norm(A, axis=0) + 1e-12
+            phi = np.linalg.lstsq(A / size, w, rcond=1e-3)[0] / size
+            x = self.judged(replace(x, phi=phi))
+            rows, weights = self.kept(x), np.exp(-x.spread)
+        return x
+
+    def best_lag(self, x: Hypothesis) -> float:
+        """Return the lag with the least spread of a hypothesis."""
+        lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
+        for step in (0.5, 1.0 / STEPS):
+            lags = lag + np.arange(-reach, reach + 0.5 * step, step)
+            costs = [self.judged(replace(x, lag=float(y))).spread.sum() for y in lags]
+            lag, reach = float(lags[int(np.argmin(costs))]), 0.5
+        return lag
+
+    def free_lag(self, kind: str) -> float:
+        """Return the lag with which a linear map of the load's wrench fits best."""
+        lags = self.usual_lag + np.arange(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 0.1, 0.25)
+        lag, rows = self.usual_lag, np.ones(self.frames, bool)
+        for _ in range(2):
+            costs = [self.linear_residual(kind, float(x), rows)[1] for x in lags]
+            lag = float(lags[int(np.argmin(costs))])
+            rows = _best_rows(self.linear_residual(kind, lag, rows)[0])
+        return lag
+
+    def linear_residual(
+        self, kind: str, lag: float, rows: NDArray[np.bool_]
+    ) -> tuple[Array, float]:
+        w, p = self.predict(kind, lag)
+        p = np.column_stack([p / (np.linalg.norm(p[rows], axis=0) + 1e-9), np.ones(len(p))])
+        P, W = p[rows], w[rows]
+        gram = P.T @ P + 1e-9 * np.eye(7)
+        residual = w - p @ np.linalg.solve(gram, P.T @ W)
+        return residual, float(np.log(residual[rows].var(axis=0) + self.floor**2).sum())
+
+
+def _best_rows(residual: Array) -> NDArray[np.bool_]:
+    distance = (residual**2).sum(axis=1)
+    return np.asarray(distance <= np.quantile(distance, _KEPT_SHARE))
+
+
+def _rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
+    """Return the M (3, 3) with a determinant that minimises |w - gain M p|, both scaled."""
+    H = np.zeros((3, 3))
+    for channels, factor in zip((_FORCE, _TORQUE), gain, strict=True):
+        size = factor * np.linalg.norm(p[:, channels]) + 1e-12
+        H += w[:, channels].T @ p[:, channels] * factor / size**2
+    U, _, Vt = np.linalg.svd(H)
+    return np.asarray(U @ np.diag([1.0, 1.0, det * np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+
+
+def _gains(w: Array, p: Array, x: Hypothesis) -> Array:
+    gains = []
+    for channels, M in ((_FORCE, x.force), (_TORQUE, x.torque)):
+        q = p[:, channels] @ M.T
+        gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
+    return np.maximum(gains, 1e-9)
+
+
+def _nearest_permutation(M: Array) -> Array:
+    return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmax((_SIGNED_PERMUTATIONS * M).sum((1, 2))))])
+
+
+def _deviations(x: Hypothesis, usual_lag: float) -> float:
+    """Return the number of deviations from the usual description, weighted by their freedom."""
+    count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
+    if x.phi is not None:
+        return count + 4.0
+    count += _turn_deviations(x.force) + float(not np.allclose(x.force, x.torque))
+    scaled = x.gain != 1.0
+    return count + float(scaled[0]) + float(scaled[1])
+
+
+def _turn_deviations(M: Array) -> float:
+    if np.allclose(np.abs(M), np.eye(3)):
+        return 0.0 if M.trace() > 2.9 else 1.0
+    return 1.5 if np.allclose(np.abs(M).max(axis=0), 1.0) else 2.5
+
+
+def offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
+    """Return the frame at which the offsets of a residual (N, 6) jump, and both offsets, or None.
+
+    Frames fit to one of two constant offsets, without a transition; contact begins gradually.
+    """
+    n = len(residual)
+    # Offsets that change in the middle enlarge the spread, but no differences of frames.
+    noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (np.sqrt(2.0) * CALM_WIDTH)
+    deviation = np.minimum(np.exp(spread) / CALM_WIDTH, _NOISE_MARGIN * noise)
+    fewest = max(_FEWEST_STEP_FRAMES, int(_STEP_SHARE * n))
+
+    def inliers(part: Array) -> tuple[NDArray[np.bool_], Array]:
+        centre = calm_half(part, np.zeros(6))[1]
+        return (np.abs(part - centre) <= _INLIER * deviation).all(axis=1), centre
+
+    whole = inliers(residual)[0].sum()
+    best: tuple[int, int, Array, Array] | None = None
+    jumps = np.linalg.norm(np.diff(residual, axis=0) / deviation, axis=1)
+    for k in 1 + np.argsort(-jumps)[:_TRIED_STEPS]:
+        if not fewest <= k <= n - fewest:
+            continue
+        (first, before), (second, after) = inliers(residual[:k]), inliers(residual[k:])
+        gain = int(first.sum() + second.sum() - whole)
+        sharp = first[-2:].all() and second[:2].all()
+        full = min(first.mean(), second.mean()) > 0.4
+        large = (np.abs(after - before) > _STEP_DEVIATIONS * deviation).any()
+        if sharp and full and large and gain >= fewest // 2 and (best is None or gain > best[0]):
+            best = gain, int(k), before, after
+    return None if best is None else best[1:]

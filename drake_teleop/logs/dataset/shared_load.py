@@ -1,0 +1,194 @@
+"""Load that most episodes of a dataset share, with offsets, lag and noise of the episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.load.batch.consistent import consistent_least_squares
+from drake_teleop.load.contact.detection import RARE
+from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
+from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.logs.contact import Samples
+from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
+from drake_teleop.logs.dataset.episode_verdict import (
+    CALM_WIDTH,
+    STEPS,
+    Hypothesis,
+    Search,
+    as_described,
+    unexplained,
+)
+from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.read.canonical import Log
+
+_SPACINGS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # knot distances [frames]
+_LARGEST_SPACING_S = 0.25
+_SMALLEST_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
+_LARGEST_EXCESS, _MEMBER_EXCESS = 6.0, 2.0  # log spread beyond that of an episode's own load
+_LAG_STEP, _MAX_LAG = 0.5, 3.0  # frames
+_FREE_DEVIATIONS, _FREE_MARGIN = 5.0, 2  # of a frame without contact; frames around contact
+_MARGIN = 1.1  # over the largest level of free frames
+
+
+@dataclass(frozen=True)
+class SharedLoad:
+    """Load of a dataset and what its episodes have in common.
+
+    Attributes:
+        phi: (10,) load that is removed.
+        spacing: knot distance of the splines [frames].
+        lag: usual delay of the motion behind the wrench [frames].
+        typical: (6,) usual half widths of the residual [N, N m].
+        floor, threshold: of the contact detection.
+    """
+
+    identification: Identification
+    phi: Array
+    spacing: float
+    lag: float
+    typical: Array
+    floor: NoiseFloor
+    threshold: float
+
+
+def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
+    """Return the load of a dataset from some of its episodes, or the given load.
+
+    Episodes with another load or wrong axes, and contact, have no influence if they are few.
+
+    Raises:
+        DrakeTeleopError: if no load of positive mass explains the episodes.
+    """
+    spacing = _best_spacing(logs)
+    episodes = [EpisodeSignals(log, spacing) for log in logs]
+    own = [own_load(signals) for signals in episodes]
+    if load is None:
+        candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
+        if not candidates:
+            raise DrakeTeleopError(
+                "the fitted mass is negative in all episodes",
+                where="dataset",
+                remedy="set wrench.sign: -1 in a --description",
+            )
+        phi = min(
+            candidates, key=lambda phi: _excess(episodes, own, phi).clip(max=_LARGEST_EXCESS).sum()
+        )
+        for _ in range(2):
+            members = _excess(episodes, own, phi) < _MEMBER_EXCESS
+            members = members if members.any() else np.ones(len(own), bool)
+            load = _pooled(episodes, own, members, phi)
+            phi = load.phi
+    assert load is not None
+    # Uncertain inertias are nearer to the truth than those of a point mass.
+    determined = np.isfinite(load.standard_deviations).all()
+    phi = load.phi if determined else usable_phi(load)[0]
+    members = _excess(episodes, own, phi) < _MEMBER_EXCESS
+    chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
+    usual = [_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
+    lag = round(float(np.median([x.lag for x in usual])) * STEPS) / STEPS
+    typical = np.exp(np.median([x.spread for x in usual], axis=0))
+    free = [_free_samples(episodes[k], x, phi, typical) for k, x in zip(chosen, usual, strict=True)]
+    pooled = Samples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
+    floor = fit_noise_floor(*pooled, finite_covariance(phi, load.covariance, tared=True), fade=0.0)
+    threshold = max(RARE, _MARGIN * float(floor.reached[0]))
+    return SharedLoad(load, phi, spacing, lag, typical, floor, threshold)
+
+
+def _best_spacing(logs: Sequence[Log]) -> float:
+    frame = float(np.median([log.dt for log in logs]))
+    choices = [h for h in _SPACINGS if h == _SPACINGS[0] or h * frame <= _LARGEST_SPACING_S]
+    some = logs[:: max(1, len(logs) // 6)]
+
+    def cost(spacing: float) -> float:
+        return float(
+            np.median([own_load(EpisodeSignals(log, spacing)).spread.sum() for log in some])
+        )
+
+    return min(choices, key=cost)
+
+
+def own_load(signals: EpisodeSignals) -> Hypothesis:
+    """Return the load that explains an episode best, and its lag."""
+    search = Search(signals.predictor(np.zeros(10)), signals.regress, 0.0, _SMALLEST_WIDTH)
+    lags = np.arange(-_MAX_LAG, _MAX_LAG + 0.1, _LAG_STEP)
+    return min((search.other_load(float(lag)) for lag in lags), key=lambda x: x.spread.sum())
+
+
+def _excess(episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array) -> Array:
+    """Return by how much each episode's spread exceeds that with its own load."""
+    usual = [_at_best_lag(s, phi, x.lag).spread.sum() for s, x in zip(episodes, own, strict=True)]
+    return np.array(usual) - [x.spread.sum() for x in own]
+
+
+def _at_best_lag(signals: EpisodeSignals, phi: Array, near: float) -> Hypothesis:
+    search = Search(signals.predictor(phi), signals.regress, near, _SMALLEST_WIDTH)
+    lags = near + np.arange(-STEPS, STEPS + 1) / STEPS
+    return min(
+        (search.judged(as_described(float(lag))) for lag in lags), key=lambda x: x.spread.sum()
+    )
+
+
+def _pooled(
+    episodes: Sequence[EpisodeSignals],
+    own: Sequence[Hypothesis],
+    members: NDArray[np.bool_],
+    phi: Array,
+) -> Identification:
+    """Return the load fitted to the calm frames of the member episodes, with own offsets."""
+    gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
+    offsets = []
+    for k in (int(row) for row in np.flatnonzero(members)):
+        x = _at_best_lag(episodes[k], phi, own[k].lag)
+        r = unexplained(x, episodes[k].predictor(phi), episodes[k].regress)
+        sigma = np.exp(x.spread) / CALM_WIDTH
+        rows = (np.abs(r - x.offsets) < _FREE_DEVIATIONS * sigma).all(axis=1)
+        V, w = episodes[k].regress(x.lag)[rows], episodes[k].log.wrench[rows]
+        A = ((V - V.mean(axis=0)) / sigma[:, None]).reshape(-1, 10)
+        b = ((w - w.mean(axis=0)) / sigma).ravel()
+        gram, right = gram + A.T @ A, right + A.T @ b
+        squares += ((r[rows] - r[rows].mean(axis=0)) ** 2).sum(axis=0)
+        samples += int(rows.sum())
+        offsets.append(x.offsets)
+    noise = np.sqrt(squares / max(samples, 1))
+    size = np.sqrt(np.diag(gram)) + 1e-300
+    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-10, hermitian=True)
+    inverse /= np.outer(size, size)
+    fitted = inverse @ right
+    whole = np.zeros((16, 16))
+    whole[:6, :6], whole[6:, 6:] = np.diag(samples / noise**2), gram
+    if fitted[0] > 0.0:
+        theta = np.concatenate([np.zeros(6), fitted])
+        fitted = consistent_least_squares(whole, whole @ theta, theta)[6:]
+    covariance = np.zeros((16, 16))
+    covariance[:6, :6], covariance[6:, 6:] = np.diag(noise**2 / samples), inverse
+    return Identification(
+        phi=fitted,
+        offsets=np.median(offsets, axis=0),
+        covariance=covariance,
+        identifiable=worth_stating(np.sqrt(np.diag(covariance)), fitted),
+        condition_number=float(np.linalg.cond(gram / np.outer(size, size))),
+        delay_s=0.0,
+        residual_rms=noise,
+        method="least squares of the calm frames of a dataset",
+        samples=samples,
+    )
+
+
+def _free_samples(signals: EpisodeSignals, x: Hypothesis, phi: Array, typical: Array) -> Samples:
+    residual = unexplained(x, signals.predictor(phi), signals.regress) - x.offsets
+    far = (np.abs(residual) > _FREE_DEVIATIONS * typical / CALM_WIDTH).any(axis=1)
+    near = np.convolve(far, np.ones(2 * _FREE_MARGIN + 1), "same") > 0.5
+    return contact_samples(signals, x.lag, residual).at(~near)
+
+
+def contact_samples(signals: EpisodeSignals, lag: float, contact: Array) -> Samples:
+    """Return the input of the contact detector for a contact wrench (N, 6)."""
+    at = signals.delayed(lag)
+    return Samples(contact, at.s, at.omega, at.alpha, at.s + at.gravity)

@@ -1,0 +1,276 @@
+"""Robot-learning datasets: verdicts of episodes, copies with contact wrenches, resumption."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.logs.dataset import dataset as command
+from drake_teleop.logs.dataset.dataset import dataset_command
+from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
+from drake_teleop.logs.dataset.episode_verdict import (
+    find_hypothesis,
+    offset_step,
+    unexplained,
+)
+from drake_teleop.logs.dataset.sample_dataset import (
+    NOISE,
+    PHI,
+    SampleEpisode,
+    sample_episode,
+    write_sample_dataset,
+)
+from drake_teleop.logs.pose_motion.poses import Posed, Poses
+from drake_teleop.logs.read.canonical import Log
+
+GRAVITY_W = np.array([0.0, 0.0, -9.80665])
+QUARTER_Z = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+
+
+def log_of(x: SampleEpisode) -> Log:
+    poses, none = Poses(x.t, x.position, x.quaternion).continued(), np.zeros((len(x.t), 3))
+    return Log(x.t, x.wrench, none, none, none, posed=Posed(poses, GRAVITY_W))
+
+
+def verdict(x: SampleEpisode) -> set[str]:
+    fps = 1.0 / (x.t[1] - x.t[0])
+    signals = EpisodeSignals(log_of(x), max(2.0, 0.12 * fps))
+    predict = signals.predictor(PHI)
+    found = find_hypothesis(predict, signals.regress, 0.0, 0.8 * NOISE)
+    names = {f.name for f in name_faults(found, 0.0, PHI, fps) + saturated_channels(x.wrench)}
+    step = offset_step(unexplained(found, predict, signals.regress), found.spread)
+    return names | ({"tared"} if step is not None else set())
+
+
+def mapped(M: Any, force: float = 1.0, torque: float = 1.0) -> Callable[..., SampleEpisode]:
+    def fault(x: SampleEpisode) -> SampleEpisode:
+        f, tau = x.wrench[:, :3] @ np.transpose(M), x.wrench[:, 3:] @ np.transpose(M)
+        return x._replace(wrench=np.hstack([force * f, torque * tau]))
+
+    return fault
+
+
+def tared(x: SampleEpisode) -> SampleEpisode:
+    quiet = [k for k in range(40, len(x.t) - 40) if not x.contact_wrench[k - 5 : k + 5].any()]
+    k = min(quiet, key=lambda row: abs(row - len(x.t) // 2))
+    wrench = x.wrench.copy()
+    wrench[k:] -= wrench[k]
+    return x._replace(wrench=wrench)
+
+
+def clipped(x: SampleEpisode) -> SampleEpisode:
+    limit = np.quantile(x.wrench, 0.9, axis=0)
+    return x._replace(wrench=np.minimum(x.wrench, limit))
+
+
+FAULTS = {
+    "turned": ({"frame"}, mapped(QUARTER_Z)),
+    "turned by 30 deg": ({"frame"}, mapped(Rotation.from_rotvec([0.2, 0.3, 0.38]).as_matrix())),
+    "negated": ({"sign"}, mapped(-np.eye(3))),
+    "turned and negated": ({"frame", "sign"}, mapped(-QUARTER_Z)),
+    "one axis": ({"sign"}, mapped(np.diag([1, -1, 1]))),
+    "lbf": ({"unit"}, mapped(np.eye(3), 1 / 4.4482, 1 / 0.112985)),
+    "N mm": ({"unit"}, mapped(np.eye(3), 1, 1000)),
+    "late": ({"lag"}, lambda x: x._replace(wrench=np.roll(x.wrench, -2, axis=0))),
+    "tared": ({"tared"}, tared),
+    "saturated": ({"saturated"}, clipped),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_planted_fault_is_named(name: str) -> None:
+    names, fault = FAULTS[name]
+    assert verdict(fault(sample_episode(101))) == names
+
+
+def test_another_tool_is_named() -> None:
+    other = phi_from_mass_com_inertia(0.6, np.array([0.0, 0.01, 0.04]), 1e-3 * np.eye(3))
+    assert verdict(sample_episode(101, phi=other)) == {"tool changed"}
+
+
+@pytest.mark.parametrize("fps", [10.0, 15.0, 30.0, 50.0])
+def test_clean_episodes_have_no_finding(fps: float) -> None:
+    assert [verdict(sample_episode(k, fps=fps)) for k in range(3)] == [set()] * 3
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 50), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0.35, 3.0))
+def test_any_large_rotation_of_the_wrench_is_found(
+    number: int, axis: tuple[float, float, float], angle: float
+) -> None:
+    axis = np.array(axis) + 1e-3
+    R = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    x = mapped(R)(sample_episode(number, contacts=1))
+    signals = EpisodeSignals(log_of(x), 3.6)
+    found = find_hypothesis(signals.predictor(PHI), signals.regress, 0.0, 0.8 * NOISE)
+    assert np.degrees(Rotation.from_matrix(found.force @ R.T).magnitude()) < 3.0
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Path) -> None:
+    source = tmp_path / "demo"
+    faults = {2: mapped(-QUARTER_Z)}
+    episodes = write_sample_dataset(source, episodes=4, faults=faults)
+    (source / "videos").mkdir()
+    (source / "videos" / "a.mp4").write_bytes(b"film")
+    before = files_of(source)
+    summary = dataset_command(source, tmp_path / "out", identify=True, quiet=True)
+    assert [row["verdict"] for row in summary["episodes"]] == [
+        *(["ok"], ["ok"], ["sign", "frame"], ["ok"])
+    ]
+    assert summary["mass"] == pytest.approx(PHI[0], rel=5e-3)
+    assert files_of(source) == before
+    data = "data/chunk-000/file-000.parquet"
+    old, new = (pl.read_parquet(folder / data) for folder in (source, tmp_path / "out" / "demo"))
+    assert new.drop("observation.contact_wrench", "observation.in_contact").equals(old)
+    contact = np.array(new["observation.contact_wrench"].to_list())
+    truth = np.vstack([x.contact_wrench for x in episodes])
+    free = ~truth.any(axis=1)
+    assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * NOISE).all()
+    touched, true = (
+        new["observation.in_contact"].to_numpy(),
+        np.hstack([x.in_contact for x in episodes]),
+    )
+    assert 2 * (touched & true).sum() / (touched.sum() + true.sum()) > 0.9
+    copied = files_of(tmp_path / "out" / "demo")
+    changed = {data, "meta/info.json", "meta/stats.json"}
+    assert {name for name in before if copied[name] != before[name]} == changed
+    stats = json.loads(copied["meta/stats.json"])["observation.contact_wrench"]
+    np.testing.assert_allclose(stats["mean"], contact.mean(axis=0), atol=1e-6)
+    info = json.loads(copied["meta/info.json"])["features"]
+    assert info["observation.contact_wrench"]["shape"] == [6]
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_a_killed_run_continues_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "demo"
+    write_sample_dataset(source, episodes=3)
+    dataset_command(source, tmp_path / "whole", identify=True, quiet=True)
+    judged, left = [], command._judge
+
+    def judge(task: Any, work: Path, number: int) -> None:
+        if len(judged) == 2:
+            raise KeyboardInterrupt
+        judged.append(number)
+        left(task, work, number)
+
+    monkeypatch.setattr(command, "_judge", judge)
+    out = tmp_path / "killed"
+    with pytest.raises(KeyboardInterrupt):
+        dataset_command(source, out, identify=True, quiet=True)
+    assert not (out / "summary.json").exists()
+    judged.clear()
+    dataset_command(source, out, identify=True, quiet=True)
+    assert judged == [2]
+    whole, resumed = files_of(tmp_path / "whole"), files_of(out)
+    for files in (whole, resumed):
+        files.pop("summary.json"), files.pop("report.html")  # contain the name of the folder
+    assert whole == resumed
+
+
+STATE = {
+    "wrench": {"force": {"columns": ["f[0]", "f[1]", "f[2]"]}, "torque": {"columns": ["tau"]}},
+    "pose": {
+        "orientation": {"columns": ["quat"], "form": "quaternion_wxyz"},
+        "position": {"columns": ["pos"]},
+    },
+}
+
+
+def arrays(x: SampleEpisode) -> dict[str, Any]:
+    return {"f": x.wrench[:, :3], "tau": x.wrench[:, 3:], "quat": x.quaternion, "pos": x.position}
+
+
+def described(folder: Path, prefix: str, **time: Any) -> Path:
+    text = json.dumps(STATE)
+    for name in ("f[0]", "f[1]", "f[2]", "tau", "quat", "pos"):
+        text = text.replace(f'"{name}"', f'"{prefix}{name}"')
+    data = json.loads(text)
+    for stream in data.values():
+        stream |= {"time": time} if time else {}
+    (folder / "columns.yaml").write_text(json.dumps(data))
+    return folder / "columns.yaml"
+
+
+def test_robomimic_file_gets_observations(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "demo.hdf5"
+    with h5py.File(path, "w") as file:
+        file.create_group("data").attrs["env_args"] = '{"env_kwargs": {"control_freq": 30}}'
+        for k in range(3):
+            for name, values in arrays(sample_episode(k)).items():
+                file[f"data/demo_{k}/obs/{name}"] = values
+    before = path.read_bytes()
+    options: dict[str, Any] = {"identify": True, "quiet": True}
+    options["description"] = described(tmp_path, "obs.")
+    summary = dataset_command(path, tmp_path / "out", **options)
+    assert summary["ok"] == 3 and path.read_bytes() == before
+    with h5py.File(tmp_path / "out" / "demo.hdf5") as file:
+        assert file["data/demo_2/obs/contact_wrench"].shape == (180, 6)
+        np.testing.assert_array_equal(file["data/demo_1/obs/pos"], sample_episode(1).position)
+
+
+def test_zarr_gets_arrays(tmp_path: Path) -> None:
+    zarr = pytest.importorskip("zarr")
+    path = tmp_path / "demo.zarr"
+    episodes = [sample_episode(k) for k in range(3)]
+    root = zarr.open_group(path, mode="w")
+    for name in arrays(episodes[0]):
+        whole = np.vstack([arrays(x)[name] for x in episodes])
+        root.create_array(f"data/{name}", data=whole)
+    root.create_array("meta/episode_ends", data=np.array([180, 360, 540]))
+    before = files_of(path)
+    description = described(tmp_path, "", rate=30)
+    options: dict[str, Any] = {"identify": True, "quiet": True, "description": description}
+    assert dataset_command(path, tmp_path / "out", **options)["ok"] == 3
+    assert files_of(path) == before
+    copied = zarr.open_group(tmp_path / "out" / "demo.zarr", mode="r")
+    assert copied["data/contact_wrench"].shape == (540, 6)
+    assert copied["data/in_contact"].dtype == bool
+
+
+def test_csv_episodes_keep_their_text(tmp_path: Path) -> None:
+    source = tmp_path / "demo"
+    source.mkdir()
+    names = [*("fx", "fy", "fz", "tx", "ty", "tz"), *("x", "y", "z", "qw", "qx", "qy", "qz")]
+    for k in range(3):
+        x = sample_episode(k)
+        table = np.hstack([x.t[:, None], x.wrench, x.position, x.quaternion])
+        pl.DataFrame(table, schema=["t", *names]).write_csv(source / f"{k}.csv", float_precision=6)
+    summary = dataset_command(source, tmp_path / "out", identify=True, quiet=True)
+    assert [row["verdict"] for row in summary["episodes"]] == [["ok"]] * 3
+    for k in range(3):
+        old = (source / f"{k}.csv").read_text().splitlines()
+        new = (tmp_path / "out" / "demo" / f"{k}.csv").read_text().splitlines()
+        assert len(new) == len(old)
+        assert all(b.startswith(f"{a},") for a, b in zip(old, new, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({}, "one of --load and --identify"),
+        ({"identify": True, "load": Path("load.json")}, "one of --load and --identify"),
+        ({"identify": True}, "contains no episodes"),
+    ],
+)
+def test_invalid_input_is_one_error(tmp_path: Path, options: dict[str, Any], words: str) -> None:
+    with pytest.raises(DrakeTeleopError, match=words):
+        dataset_command(tmp_path, tmp_path.with_name("out"), quiet=True, **options)
