@@ -77,6 +77,7 @@ def package(tmp_path, monkeypatch):
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
@@ -259,6 +260,7 @@ Path(f"{me} has ended").touch()
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_two_parallel_first_runs_store_the_right_code(tmp_path):
     """With numba's own cache, `double(1.5)` is 2 from then on."""

@@ -67,6 +67,7 @@ CASES = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind", "place", "length", "index", "size", "at", "hand"), CASES)
 def test_a_fault_is_faded_and_named(name, kind, place, length, index, size, at, hand, request):

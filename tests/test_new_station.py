@@ -43,6 +43,7 @@ def runs(monkeypatch):
     return calls
 
 
+@pytest.mark.long
 def test_station_is_written_and_run(tmp_path, runs, capsys):
     new_command(tmp_path / "mine", ARM, "sensor", device="omega_6", sensor="ati_gamma_imu")
     path = tmp_path / "mine" / "station.yaml"
@@ -78,6 +79,7 @@ def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch)
     assert runs == [(Path("out/mine/station.yaml"), Path("out/mine/first_run"), {"quiet": False})]
 
 
+@pytest.mark.long
 def test_place_is_in_front_with_a_reachable_cube():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
     found = find_place(arm)
@@ -91,6 +93,7 @@ def test_place_is_in_front_with_a_reachable_cube():
         find_place(stiff)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("device", ["phantom_premium_15", "geomagic_touch", "omega_6", "falcon"])
 def test_rates_match_the_device(tmp_path, runs, device):
     """`analyze` requires common sampling instants."""
@@ -225,6 +228,7 @@ def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
     assert equal > 390
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["arm.sdf #2", "arm: v2", "*arm", "a\nb", "010", "%41", "\udcff"])
 def test_station_with_an_odd_name_refers_to_its_arm(name, tmp_path, runs):
     path, text = tmp_path / f"{name}.sdf", ARM.read_text()

@@ -191,6 +191,7 @@ def test_table_contains_saturation_and_reason_of_failure(quick, capsys):
     assert "written to" in said
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_pose_out_of_reach_is_reported_with_its_time(quick):
     summary, _ = quick(

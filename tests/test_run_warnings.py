@@ -307,6 +307,7 @@ DRAWER = """<sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="drawer">
 </model></sdf>"""
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("damping", "chatters"), [(0.2, True), (3.0, False)])
 def test_chatter_on_a_spring_loaded_drawer_is_reported(tmp_path, damping, chatters):

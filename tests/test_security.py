@@ -40,6 +40,9 @@ EXPLAINED = {
     # Of NumPy's formats those without objects.
     ("lab/identified_load.py", "np.load"), ("lab/identified_load.py", "allow_pickle"),
     ("logs/read/table_files.py", "np.load"), ("logs/read/table_files.py", "allow_pickle"),
+    # Results of episodes in the output folder, for a run that continues; processes of our own.
+    ("logs/dataset/dataset.py", "np.load"), ("logs/dataset/dataset.py", "allow_pickle"),
+    ("logs/dataset/dataset.py", "joblib"),
     # One of two names that the code contains.
     ("logs/read/array_files.py", "import_module"),
     # Processes that this one starts: what they say to each other goes through pipes.
@@ -96,6 +99,11 @@ WRITING = {
     ("lab/new_station/__init__.py", ".write_text"),
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
+    # By `whole_file` into the output folder, and a data set that the package generates.
+    ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
+    ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_text"),
+    ("logs/dataset/dataset_files.py", ".write_bytes"),
+    ("logs/dataset/sample_dataset.py", ".write_text"),
     # A mark of one byte more.
     ("lab/studies/store.py", 'open("ab'),
     ("robots/changes.py", "json.dump"),  # to the process that asked

@@ -62,6 +62,7 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     return replace(scenario, **changes)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("touched", "at_once"),

@@ -53,6 +53,7 @@ def solved(M, b, n):
     vectors.solve(M, b, n)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 3, 6])
 def test_cholesky_and_solve_equal_numpy_and_read_the_lower_half(n):

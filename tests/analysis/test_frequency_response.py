@@ -52,6 +52,7 @@ def assert_agrees(
     assert response.coherence(output, input_).min() > 0.95
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_station_with_displayed_tool_agrees_with_linearisation():
     response, predicted = measured(station(sigma=1.0, coulomb=0.0))
@@ -65,6 +66,7 @@ def test_station_with_displayed_tool_agrees_with_linearisation():
     assert frd(1j * response.omega[3]) == pytest.approx(felt[3])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_friction_without_displayed_tool_changes_only_the_device():
     response, predicted = measured(station(sigma=0.0, coulomb=1.0))

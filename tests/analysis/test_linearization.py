@@ -135,6 +135,7 @@ def difference(H, other):
     return np.abs(H / other - 1).max(axis=0)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 @pytest.mark.parametrize("servo", [{}, DEADBEAT], ids=["servo", "ideal servo"])
@@ -151,6 +152,7 @@ def test_one_direction_equals_the_analytical_model(servo, sigma):
     assert (difference(H, exact_two_port(scenario, OMEGA)) < 1e-6).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
@@ -166,6 +168,7 @@ def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
     assert (difference(H, sampled_two_port(axis, sampling, OMEGA)) < 0.01).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
@@ -193,6 +196,7 @@ def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
     assert (difference(H, paper) < 0.01).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_sideways_force_rotates_the_tool():
     """The tool's centre of mass moves 0.61 times as much as So, or as the tip."""
@@ -211,6 +215,7 @@ def test_sideways_force_rotates_the_tool():
     assert np.abs(H[:, 0, 0] / paper[:, 0, 0] - 1).max() < 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_sideways_tip_compliance_includes_the_hands_wrist():
     """A force at the tip is a torque at the hand; the tool turns: 130 times softer."""
@@ -237,6 +242,7 @@ def leaf(scenario: Scenario) -> Scenario:
     return replace(scenario, sheet_spring=sheet)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_displayed_stiffness_is_that_of_leaf_and_bodies_in_series():
     scenario = leaf(LoadScenario("free_motion_force"))
@@ -278,6 +284,7 @@ def vertical_mode(system: Linearization) -> complex:
     return np.log(z[np.argmax(np.abs(seen * push) * lasting)]) / PERIOD
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_multipliers_predict_a_slow_decay():
     scenario = frictionless(LoadScenario("ideal_sensor"))

@@ -78,6 +78,7 @@ def test_cells_agree_with_eigenvalues(drawn) -> None:
         assert grows(axis, sampling, **cell) == (found.unstable[i, j] > 0), cell
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_stability_changes_within_1_percent_of_the_boundary(drawn) -> None:
     """Along the parameter other than delay, at whole periods of delay."""

@@ -128,6 +128,7 @@ def test_loop_is_felt_impedance_over_that_of_hand_and_device():
     np.testing.assert_allclose(station_loop(axis)(s), L, rtol=1e-12)
 
 
+@pytest.mark.long
 @given(devices, st.floats(0.01, 20.0))
 def test_delay_margin_in_contact_equals_closed_form(device, ratio):
     m, b, k = device
@@ -214,6 +215,7 @@ def growth(m, b, k, mu, K, delay, *, longest=60.0, step=2.5e-4):
     return _growth(m, b, k, mu, K, max(round(delay / step), 1), int(longest / step), step)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_simulations_2_ms_from_the_margin_decay_or_grow():
     """Three grips on five walls, and the edges of the windows of free motion."""

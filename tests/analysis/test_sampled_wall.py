@@ -251,6 +251,7 @@ def test_sampled_poles_predict_growth_of_a_simulation():
         assert rate == pytest.approx(np.log(np.abs(poles).max()), rel=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_grid_of_parameters_equals_single_values():
     b, B = np.linspace(0.1, 5, 100)[:, None], np.linspace(0, 2, 100)

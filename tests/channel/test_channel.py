@@ -159,6 +159,7 @@ def test_invalid_channel_is_rejected(changes, message, load_estimate):
         MakeTeleopStation(replace(Scenario(), **changes), load_estimate=load_estimate)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
     monkeypatch, load_estimate

@@ -87,6 +87,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_the_flag_of_contact_travels_with_the_packets(method):
     found = run(method, None)
@@ -96,6 +97,7 @@ def test_the_flag_of_contact_travels_with_the_packets(method):
     np.testing.assert_array_equal(told[late:], touched[: STEPS - late])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("fault", FAULTS)

@@ -69,6 +69,7 @@ def test_torque_at_the_tool_works_only_along_rotation():
     assert np.isnan(accounts[:, MOTOR]).all()
 
 
+@pytest.mark.long
 def test_load_work_equals_potential_and_kinetic_energy():
     """Half of T + U by mass, m c and inertia about So is displayed."""
     t, scenario = np.arange(400) * 1e-3, replace(SCENARIO, force_scaling__sigma=0.5)

@@ -54,6 +54,7 @@ STRIKE = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_contact_at_the_scenarios_step_agrees_with_a_tight_run():
     """RK2 at the sensor's 125 us against error-controlled RK3 at half of that, which is as good as

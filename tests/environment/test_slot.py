@@ -115,6 +115,7 @@ def distance_to(corners: np.ndarray, point: np.ndarray) -> float:
     return float(np.linalg.norm(point - nearest, axis=1).min())
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @given(
     yaw=st.floats(-3.1, 3.1),

@@ -269,6 +269,7 @@ def test_separation_of_tool_and_unmodelled_shapes():
     assert found == [FAR, TOUCHING, TOUCHING, WATCHED]  # from 0.45 - 0.1 - 0.002 - 0.02
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
     """mu m g in steady sliding; the summary has the distance."""

@@ -69,6 +69,7 @@ def MakeEstimator(initial=None, **config):
     )
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["rls", "rtls"])
 def test_block_equals_the_estimator_of_logs(method):

@@ -97,6 +97,7 @@ def test_trajectory_depends_on_the_seed_only(slave, short):
     assert not np.allclose(other.rho, again.rho, atol=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_executed_motion_respects_the_limits(slave):
     found = identify_load(LoadScenario("identification"))
@@ -160,6 +161,7 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
         estimate_into(estimator, remembered, table, reading, samples[k])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["accelerometer", "fused", "encoders"])
 def test_predicted_and_observed_scatter_agree(slave, short, source):
@@ -208,6 +210,7 @@ def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
     assert np.all(fused < accelerometer)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_check_finds_a_violation_of_each_limit(slave, short):
     """Each limit in turn is a little below its use by the same motion."""
@@ -321,6 +324,7 @@ def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_identification_refuses_an_unsuitable_trajectory(short):
     scenario = LoadScenario("identification")

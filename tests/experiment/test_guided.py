@@ -72,6 +72,7 @@ class Person:
         assert self.procedure.phase == "interval"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person = Person(tmp_path)

@@ -181,6 +181,7 @@ def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):
     assert read_drive(tmp_path).changes[-1][0] == 5
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("size_bytes", [60_000, 400_000])
 def test_full_disk_stops_the_drive_with_an_error(scenario, load, clock, tmp_path, size_bytes):

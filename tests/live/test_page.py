@@ -62,6 +62,7 @@ def test_keys_move_the_hand_at_the_same_simulated_speed_in_slow_motion(page):
         assert speed_by_key(page, slow) == pytest.approx(0.12, rel=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_machine_that_is_too_slow_offers_slow_motion_with_one_click(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target")

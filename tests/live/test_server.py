@@ -87,6 +87,7 @@ def test_socket_requires_the_origin_of_our_page(live):
             until(page, lambda frame: False)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_port_in_use_is_one_error_line(live, scenario, load, monkeypatch):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
@@ -98,6 +99,7 @@ def test_port_in_use_is_one_error_line(live, scenario, load, monkeypatch):
     assert isinstance(scenario, Scenario)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_one_port_listens_also_when_the_scene_changes(scenario, load, monkeypatch):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
@@ -143,6 +145,7 @@ def hostile(host: str, token: str) -> Iterator[bytes]:
     yield b""
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_hostile_clients_cannot_end_or_delay_a_drive(scenario, load, monkeypatch, capfd):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
@@ -175,6 +178,7 @@ def test_hostile_clients_cannot_end_or_delay_a_drive(scenario, load, monkeypatch
     }
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_drive_ends_while_a_scene_identifies_its_load(scenario, load, monkeypatch):
     """The identification checks for the end in its progress function."""

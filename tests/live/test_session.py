@@ -63,6 +63,7 @@ def driven(scenario, load, tmp_path_factory):
     return folder, SimulationResult.read_parquet(folder / "log.parquet")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_recorded_drive_repeats_for_any_slices(driven, scenario, load):
     folder, log = driven
@@ -91,6 +92,7 @@ def test_signals_are_continuous_when_inputs_change(driven, scenario):
     assert np.ptp(log["pose_command"][210:230], axis=0).max() > 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_new_network_and_method_continue_the_state(scenario, load):
     """In contact, to another channel and back; the rendered wrench cross-fades."""
@@ -240,6 +242,7 @@ def test_released_hand_only_dissipates(driven):
     assert np.linalg.norm(log["hand_wrench_E"][:239, :3], axis=1).max() > 0.5
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeypatch):
     folder, _ = driven
@@ -262,6 +265,7 @@ def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeyp
         assert "error: " in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_unclosed_drive_loses_two_seconds_of_log_and_no_input(scenario, load, tmp_path):
     """The files are those of a killed process."""

@@ -54,6 +54,7 @@ def knocks(wrench, seed=0):
     return wrench, hit
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("noise", [Noise(), Noise(WRENCH_NOISE, s=0.1, omega=0.01, alpha=1.0)])
 def test_exact_without_noise(method, noise):
@@ -230,6 +231,7 @@ def test_stated_deviations_hold_with_errors_in_variables():
     assert 0.4 < errors.mean() < 1.3
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_stated_deviations_are_not_too_large_where_noise_couples_the_channels():
     """Of angular accelerations for the most part: in force and torque at once."""
@@ -308,6 +310,7 @@ def test_the_covariance_by_gains_is_what_each_of_them_does(method, offsets):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_intervals_hold_with_gains_as_wrong_as_stated(method):
     rng, within, length = np.random.default_rng(4), [], np.repeat([1.0, ARM], 3)
@@ -353,6 +356,7 @@ def static_poses():
     return 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @settings(max_examples=10, deadline=None)

@@ -54,6 +54,7 @@ def test_the_motion_of_the_benchmark_is_that_of_a_body(bench):
     assert np.linalg.norm(s - 9.81 * up, axis=1).max() < 10.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_free_motion_is_no_change(bench, tool):
     for seed in SEEDS:

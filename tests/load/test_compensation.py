@@ -25,6 +25,7 @@ def named(*values):
     return dict(zip(NAMES, values, strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @given(vectors(6, 100.0), motions(), loads(), loads(), scales, scales, scales)
 def test_the_law_as_the_paper_draws_it(F, motion, gripper, thing, sigma_gr, sigma_obj, gamma):

@@ -69,6 +69,7 @@ def swing(samples: int, seed: int, largest: float = 5.0):
 # The noise floor
 
 
+@pytest.mark.long
 @given(motions(), vectors(3, 20.0), arrays(np.float64, (16, 16), elements=st.floats(-0.1, 0.1)))
 def test_the_floor_is_the_sum_of_its_parts(motion, a, root):
     growth = np.arange(12.0).reshape(6, 2) * 0.01
@@ -97,6 +98,7 @@ def test_a_held_acceleration_fades():
     np.testing.assert_allclose(sigma**2, NOISE**2 + held[:, None], rtol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_planted_floor_is_found(seed):
@@ -229,6 +231,7 @@ def test_sums_notice_a_weak_contact_sooner_at_equal_false_alarms():
 # The detector
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @given(st.sampled_from(STATISTICS), st.integers(0, 100))
 @settings(max_examples=20)

@@ -30,6 +30,7 @@ def test_the_motion_is_that_of_a_body(benchmark):
     assert 2.0 < np.abs(alpha).max() < 60.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["JR3", "UTIAS High"])
 def test_total_least_squares_and_instruments_take_out_the_bias(benchmark, level):

@@ -68,6 +68,7 @@ def turntable(samples=400):
 # ---- coverage
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", study.COLOURS)
 def test_intervals_hold_in_noise_of_any_colour(colour):

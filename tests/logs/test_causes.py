@@ -60,6 +60,7 @@ def is_right(found: IdentifiedLog) -> bool:
     return bool(load.identifiable[6] and not (wrong & load.identifiable).any())
 
 
+@pytest.mark.long
 def test_torque_that_is_ten_times_too_large(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "02_onrobot_counts"))
     assert names(found) == ["torque factor"]
@@ -69,12 +70,14 @@ def test_torque_that_is_ten_times_too_large(tmp_path: Path) -> None:
     assert names(counts) == [] and is_right(counts)
 
 
+@pytest.mark.long
 def test_tilted_base(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "03_base_tilt3"))
     assert names(found) == ["gravity direction"] and is_right(found)
     assert found.causes[0].values["gravity"] == pytest.approx([0.513, 0.0, -9.797], abs=0.02)
 
 
+@pytest.mark.long
 def test_load_that_is_grasped_in_the_middle(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "04_grasp_midway"))
     assert names(found) == ["load change"] and is_right(found)
@@ -86,6 +89,7 @@ def test_load_that_is_grasped_in_the_middle(tmp_path: Path) -> None:
     assert com == pytest.approx([0.010, -0.015, 0.095], abs=3e-4)
 
 
+@pytest.mark.long
 def test_bare_flange_has_offsets_and_no_load(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "05_nothing_attached"))
     assert names(found) == ["no load"]
@@ -94,12 +98,14 @@ def test_bare_flange_has_offsets_and_no_load(tmp_path: Path) -> None:
     assert (np.abs(error) < 4.0 * found.identification.standard_deviations[:6]).all()
 
 
+@pytest.mark.long
 def test_sensor_that_warms_up(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "09_warmup_drift"))
     assert names(found) == ["drift"]
     assert found.identification.mass == pytest.approx(1.37, abs=0.003)
 
 
+@pytest.mark.long
 def test_contact_in_most_of_the_record(tmp_path: Path) -> None:
     found = identify_log(described(tmp_path, "11_wiping"))
     assert names(found) == ["contact"] and is_right(found)
@@ -107,6 +113,7 @@ def test_contact_in_most_of_the_record(tmp_path: Path) -> None:
     assert found.causes[0].stop_s == pytest.approx(37.5, abs=0.1)
 
 
+@pytest.mark.long
 def test_weight_that_the_robot_has_removed() -> None:
     found = identify_log(CASES / "14_weight_removed_30hz.csv")
     assert names(found) == ["weight removed"]

@@ -238,6 +238,7 @@ def test_identify_refuses_a_worthless_result_and_says_why(
         identify_command(written(tmp_path, columns), tmp_path / "out", quiet=True)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     path = written(tmp_path, good())

@@ -53,6 +53,7 @@ def test_a_check_that_fails_is_no_error_of_the_log(tables, error, monkeypatch):
     assert identify_log(folder / "free.yaml").identification.mass == pytest.approx(0.95, abs=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("change", [0.0, 1e-9])
 @pytest.mark.parametrize("value", [3.5, -1e4, 0.0])
 @pytest.mark.slow

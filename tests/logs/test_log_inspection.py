@@ -66,6 +66,7 @@ def test_nothing_is_suspected_in_a_good_log(tmp_path: Path, streams: dict[str, b
     assert findings(tmp_path, good(), **streams) == {}
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "name", "says", "streams"),
@@ -208,6 +209,7 @@ def as_written(form: str, c: Columns) -> tuple[dict[str, np.ndarray], str]:
     return {"%time": (1e9 * (1.6e9 + c["t"])).astype(np.int64)} | columns, ","
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "sign"),

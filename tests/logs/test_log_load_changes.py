@@ -74,6 +74,7 @@ def test_ntnu_records_have_one_load(
     assert identify_log(describe_record(tmp_path, ntnu, record), cutoff_hz=cutoff_hz).loads == ()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("record", ["1-baseline", "2-vibrations"])
 def test_online_on_ntnu_records(ntnu: Path, tmp_path: Path, record: str) -> None:
     """Unfiltered; known from the poses of another day, with 2 % of model errors.
@@ -127,6 +128,7 @@ def test_ur5_pushes_are_no_load(ur5: Path, tmp_path: Path) -> None:
     assert identify_log(path).loads == ()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_utias_records_have_one_load(utias: Path) -> None:
     """Ten tools from 9 g to 1 kg, stop and go, with the noise that their makers call high."""

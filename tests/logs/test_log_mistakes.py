@@ -161,6 +161,7 @@ MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]]
 ]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "motion", "name", "line"), [m[1:] for m in MISTAKES], ids=[m[0] for m in MISTAKES]

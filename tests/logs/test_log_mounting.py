@@ -156,6 +156,7 @@ def test_lag_is_searched_within_one_second(lag: float, is_found: bool) -> None:
     assert (found.lag_s == pytest.approx(lag, abs=1e-3)) == is_found
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_deviations_equal_the_scatter_of_repeated_records() -> None:
     truth = [(random_rotation(seed), np.array([0.05, -0.03, 0.08])) for seed in range(16)]
@@ -381,6 +382,7 @@ def test_gaps_are_excluded_from_the_mounting() -> None:
 # Real records
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("record", "residual", "delay_s"),

@@ -167,6 +167,7 @@ def test_long_log_read_in_parts_gives_the_same_load(whole, folder, tmp_path, mon
     )
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_wrong_pose_frame_is_reported_with_the_lines_that_fix_it(folder):
     path = described(folder, "tcp")
@@ -185,6 +186,7 @@ def test_wrong_pose_frame_is_reported_with_the_lines_that_fix_it(folder):
     assert np.abs(deviations(found)).max() < 4.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_reported_frame_is_relative_to_S_not_to_the_description(folder, tmp_path):
     """The description has half of the shift; the report has the full shift."""

@@ -34,6 +34,7 @@ def record(path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.pictures
 @pytest.mark.slow
 def test_the_page_stands_alone_and_has_the_numbers_of_the_summary(tmp_path: Path) -> None:
@@ -119,6 +120,7 @@ def test_the_spectrum_has_the_power_of_the_signal() -> None:
     assert rate[np.argmax(density)] == pytest.approx(50, abs=0.3)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_robust_fit_says_what_it_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

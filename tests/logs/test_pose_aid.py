@@ -121,6 +121,7 @@ def test_imu_with_other_axes_is_rejected():
     assert compare_imu(splines, other, GRAVITY_W) is None
 
 
+@pytest.mark.long
 @pytest.mark.slow  # two loads from files of 20 s
 def test_identify_uses_both_but_only_the_imu_if_the_pose_frame_is_wrong(tmp_path):
     kinds = Kind(seed=4), Kind(seed=4, p_SoPo_S=(0.0, 0.0, 0.1))

@@ -316,6 +316,7 @@ def renamed(frame: pl.DataFrame, names: dict[str, str]) -> pl.DataFrame:
     return frame.select([pl.col(old).alias(new) for old, new in names.items()])
 
 
+@pytest.mark.long
 def test_two_tables_give_one_draft_with_the_sign_of_the_data(tmp_path: Path) -> None:
     """A trajectory of TUM has a position tx ty tz, which is no torque."""
     frame = table(sign=-1.0)
@@ -340,6 +341,7 @@ def test_two_tables_give_one_draft_with_the_sign_of_the_data(tmp_path: Path) -> 
     assert found.mass == pytest.approx(PHI[0], abs=5e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("names", "axes", "guessed", "unit"),
     [

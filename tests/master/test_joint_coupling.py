@@ -63,6 +63,7 @@ def run(scenario):
     return simulate(station, scenario.simulation, progress=False)
 
 
+@pytest.mark.long
 def test_each_slave_joint_follows_its_leader_joint(scenario):
     move = Sine(duration=1.0, ramp=0.02, frequency=4.0, translation=[0.03, 0.02, 0.03],
                 rotation=[0.2, -0.1, 0.3])  # fmt: skip

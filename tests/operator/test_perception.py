@@ -38,6 +38,7 @@ def noticed(mass: float, steady: float, push: float, amplitude: float = 0.0, han
     return felt[:, NOTICED] > 0.0
 
 
+@pytest.mark.long
 @settings(max_examples=30, deadline=None)
 @given(steady=st.floats(0.0, 8.0))
 def test_push_is_detected_above_the_just_noticeable_difference(steady):

@@ -64,6 +64,7 @@ def test_reaching_ends_in_the_target(reach):
     assert np.isnan(measures["detection_time_s"]) and measures["contact_force_overshoot_N"] == 0.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_smaller_target_takes_longer():
     """Fitts' law: motor noise requires corrections."""
@@ -125,6 +126,7 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     assert took == duration if duration else peak == pytest.approx(2.0, rel=1e-6)
 
 
+@pytest.mark.long
 def test_run_depends_only_on_the_seed(reach):
     again, _ = run("reach")
     other, _ = run("reach", simulation__seed=5)
@@ -132,6 +134,7 @@ def test_run_depends_only_on_the_seed(reach):
     assert not np.array_equal(other["hand_wrench_E"], reach[0]["hand_wrench_E"])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_vision_has_the_delay_of_the_network():
     """One movement reaches a large target; the operator sees it after both delays."""
@@ -142,6 +145,7 @@ def test_vision_has_the_delay_of_the_network():
     assert far - near == pytest.approx(2 * 0.15, abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("there", "back"), [(0.03, 0.22), (0.22, 0.03)])
 def test_unequal_delays_add_to_one_round_trip(there, back):
@@ -182,6 +186,7 @@ def test_rendered_weight_raises_threshold_and_slows_approach(touch):
     assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_search_finds_the_slot_after_an_aim_error():
     """The chamfers are 4 mm wide; a larger aim error lands beside them."""
@@ -193,6 +198,7 @@ def test_search_finds_the_slot_after_an_aim_error():
     assert measures["detection_time_s"] < 0.5
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_operator_gives_up_without_contact():
     result, measures = run("touch", force_scaling__gamma=0.0, sheet_spring=None)
@@ -201,6 +207,7 @@ def test_operator_gives_up_without_contact():
     assert result["task_state"][-1, DONE] <= 0.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_set_force_is_held():
     """Without device friction, which hides 1 N at the tool."""
@@ -219,6 +226,7 @@ def test_press_is_given_up_after_timeout():
     assert result["task_state"][-1, DONE] == -1.0
 
 
+@pytest.mark.long
 def test_papers_contact_is_detected_without_false_detection():
     """Fig. 8 without inertia: the touch of 50 ms is detected, the fast motion before is not."""
     scenario = LoadScenario("contact_transition")

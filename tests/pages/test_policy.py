@@ -35,6 +35,7 @@ def test_policy_allows_connections_only_to_the_given_server():
     assert "http" not in policy("<script>x</script>") and "'self'" not in policy("")
 
 
+@pytest.mark.long
 def test_replays_and_reports_have_a_policy(tmp_path):
     film = Film("x", np.arange(2.0), 1.0)
     film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)

@@ -122,6 +122,7 @@ def test_rotation_about_one_axis_leaves_other_inertias_unknown(tmp_path: Path) -
     assert "about y" not in at.advice
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_no_parameter_is_known_after_a_change_of_load(tmp_path: Path) -> None:
     both = np.concatenate([recorded(3.0, [0, 1, 2]), recorded(3.0, [0, 1, 2], phi=1.5 * PHI)])
@@ -288,6 +289,7 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
     assert (np.abs(error) < sizes_of(TOLERANCE, PHI)).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
 def test_calibration_with_a_ur_and_a_rotated_and_shifted_sensor(tmp_path: Path) -> None:

@@ -60,6 +60,7 @@ def test_push_is_flagged_while_it_lasts() -> None:
     assert (flags[1025:1250] == Flag.IN_CONTACT).all()
 
 
+@pytest.mark.long
 def test_noise_floor_of_a_free_log_detects_small_contacts(tmp_path: Path) -> None:
     """With gains wrong by 5 % the threshold is a third of that of the watch."""
     gains, free = np.array([1.05, 1.0, 0.95, 1.0, 1.05, 1.0]), tmp_path / "free.parquet"

@@ -92,6 +92,7 @@ def test_the_filtered_noise_has_the_variance_of_white_noise_through_the_filter()
     assert result["specific_force_S"].std(axis=0).max() < 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_channels_are_independent_and_other_seeds_give_other_noise():
     config = dataclasses.replace(QUIET, force_noise=0.25, torque_noise=0.01)
@@ -112,6 +113,7 @@ def test_the_converter_quantises_before_the_filter():
     assert result["measured_wrench_S"][-1, 2] != pytest.approx(-3.13 * 9.81, abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_saturated_sample_is_clipped_and_flagged():
     result = at_rest(dataclasses.replace(QUIET, force_range=[200.0, 200.0, 25.0]))
@@ -120,6 +122,7 @@ def test_a_saturated_sample_is_clipped_and_flagged():
     assert (at_rest(QUIET)["saturated"] == 0.0).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_angular_velocity_comes_from_the_encoders_with_their_resolution():
     rough = at_rest(dataclasses.replace(QUIET, encoder_resolution=1e-3))

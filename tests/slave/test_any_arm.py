@@ -65,6 +65,7 @@ def scenario(folder):
     return LoadScenario(folder / "station.yaml")
 
 
+@pytest.mark.long
 def test_wrench_is_reaction_of_sensor_weld(scenario):
     scenario = replace(scenario, wrist_sensor__ideal=True)
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))

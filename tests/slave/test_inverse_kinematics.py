@@ -60,6 +60,7 @@ def test_lengths_are_those_of_the_model(plant):
     np.testing.assert_allclose(np.diff(heights), lengths, atol=1e-15)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_all_eight_branches_meet_random_poses(arm):
     rng = np.random.default_rng(0)

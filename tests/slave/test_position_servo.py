@@ -48,6 +48,7 @@ def follow(arm, interface, command, steps):
     return np.array(states), np.array(torques)
 
 
+@pytest.mark.long
 def test_lag_is_lookahead_plus_dead_time_plus_half_a_period(arm):
     speed = np.array([0.2, -0.1, 0.15, 0.1, -0.2, 0.3])
     states, _ = follow(arm, UR, lambda t: HOME + speed * t, 2400)

@@ -48,6 +48,7 @@ def positions_after_step(samples, hz, wall=None):
     return slave.plant.GetPositions(context, slave.instance)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     # The second pushes the tool, which is 3 mm in it, with 60 N.
     ("wall", "share"),

@@ -395,6 +395,7 @@ run_study(Study(factors=[Factor("a.b", values=[1.0, 2.0])]), out / "out", work, 
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_processes_end_with_a_study_that_is_killed(tmp_path):
     script = tmp_path / "orphans.py"
@@ -486,6 +487,7 @@ def test_an_adaptive_design_finds_the_best_point(searched):
     assert len(rows.select("a.x", "a.w").unique()) == 40
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_adaptive_design_continues_after_any_stop(tmp_path, searched):
     calls = []

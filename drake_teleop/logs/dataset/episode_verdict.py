@@ -114,7 +114,7 @@ def find_hypothesis(
     for kind in KINDS:
         lags = {usual_lag, search.best_lag(replace(usual, kind=kind)), search.free_lag(kind)}
         for lag in lags:
-            found += search.hypotheses(kind, lag)
+            found += search._hypotheses(kind, lag)
             found += [search.other_load(lag)] if kind == "sensor" else []
     best = min(found, key=lambda x: x.cost)
     if best.phi is None:
@@ -139,18 +139,19 @@ class Search:
         self.frames = len(predict("sensor", usual_lag)[0])
         self.price = _COST + _COST_FRAMES / self.frames
 
-    def residual(self, x: Hypothesis) -> Array:
+    def _residual(self, x: Hypothesis) -> Array:
         return unexplained(x, self.predict, self.regress)
 
     def judged(self, x: Hypothesis) -> Hypothesis:
-        spread, offsets = calm_half(self.residual(x), self.floor)
+        """Return the hypothesis with its spread, offsets and cost."""
+        spread, offsets = calm_half(self._residual(x), self.floor)
         cost = float(spread.sum()) + self.price * _deviations(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
-    def kept(self, x: Hypothesis) -> NDArray[np.bool_]:
-        return _best_rows((self.residual(x) - x.offsets) / np.exp(x.spread))
+    def _kept(self, x: Hypothesis) -> NDArray[np.bool_]:
+        return _best_rows((self._residual(x) - x.offsets) / np.exp(x.spread))
 
-    def hypotheses(self, kind: str, lag: float) -> Iterator[Hypothesis]:
+    def _hypotheses(self, kind: str, lag: float) -> Iterator[Hypothesis]:
         both, one = self.predict(kind, lag), np.ones(2)
         force, torque = (self.best_permutation(*both, channels) for channels in (_FORCE, _TORQUE))
         plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
@@ -188,10 +189,10 @@ class Search:
 
         The determinant of the fitted rotation is `det`; 0 keeps the rotation.
         """
-        found = [self.concentrated(x, rows, det, scale) for rows in self.starts()]
+        found = [self._concentrated(x, rows, det, scale) for rows in self.starts()]
         return min(found, key=lambda x: x.cost)
 
-    def concentrated(
+    def _concentrated(
         self, x: Hypothesis, rows: NDArray[np.bool_], det: float, scale: bool
     ) -> Hypothesis:
         both = self.predict(x.kind, x.lag)
@@ -209,16 +210,16 @@ class Search:
             if scale:
                 x = replace(x, gain=_gains(w, q, x))
             x = self.judged(x)
-            rows = self.kept(x)
+            rows = self._kept(x)
         return x
 
     def other_load(self, lag: float) -> Hypothesis:
         """Return the hypothesis of another load, fitted to the best rows."""
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
-        found = [self.fitted_load(wrench, V, lag, rows) for rows in self.starts()]
+        found = [self._fitted_load(wrench, V, lag, rows) for rows in self.starts()]
         return min(found, key=lambda x: x.cost)
 
-    def fitted_load(
+    def _fitted_load(
         self, wrench: Array, V: Array, lag: float, rows: NDArray[np.bool_]
     ) -> Hypothesis:
         x = as_described(lag)
@@ -229,7 +230,7 @@ class Search:
             size = np.linalg.norm(A, axis=0) + 1e-12
             phi = np.linalg.lstsq(A / size, w, rcond=1e-3)[0] / size
             x = self.judged(replace(x, phi=phi))
-            rows, weights = self.kept(x), np.exp(-x.spread)
+            rows, weights = self._kept(x), np.exp(-x.spread)
         return x
 
     def best_lag(self, x: Hypothesis) -> float:
@@ -246,12 +247,12 @@ class Search:
         lags = self.usual_lag + np.arange(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 0.1, 0.25)
         lag, rows = self.usual_lag, np.ones(self.frames, bool)
         for _ in range(2):
-            costs = [self.linear_residual(kind, float(x), rows)[1] for x in lags]
+            costs = [self._linear_residual(kind, float(x), rows)[1] for x in lags]
             lag = float(lags[int(np.argmin(costs))])
-            rows = _best_rows(self.linear_residual(kind, lag, rows)[0])
+            rows = _best_rows(self._linear_residual(kind, lag, rows)[0])
         return lag
 
-    def linear_residual(
+    def _linear_residual(
         self, kind: str, lag: float, rows: NDArray[np.bool_]
     ) -> tuple[Array, float]:
         w, p = self.predict(kind, lag)
