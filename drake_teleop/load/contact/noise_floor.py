@@ -169,8 +169,9 @@ def checked_motion(**arrays: ArrayLike) -> list[Array]:
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] with variances limited to `natural_scale`^2.
+    """Return the covariance (16, 16) of [offsets; phi] with bounded standard deviations.
 
+    The bound is `natural_scale`.
     `tared` means that offsets are from the same record: their variance is 0.
     """
     P, natural = covariance.copy(), natural_scale(phi)

@@ -109,7 +109,7 @@ def AddWristSensor(
         period: sampling period [s]; a multiple of a discrete plant's time step, by default equal
             to it, or 1 ms for a continuous plant.
         model_instance: source of `joint_position`; all joints of the plant by default.
-        name: name of the block; its noise source is `name`_noise.
+        name: name of the block; its noise source is named "<name>_noise".
 
     Raises:
         DrakeTeleopError: if the plant is not finalized, not in this builder or has no such weld, if
