@@ -69,9 +69,10 @@ def start_picture(plan: Plan, title: str) -> Figure:
 
 def _caption(plan: Plan) -> str:
     gap = 1e3 * (plan.lowest[2] - wall_of(plan).position[2])
+    plane = round(plan.plane, 2) + 0.0  # not -0
     return (
-        f"tool (orange) {gap:.0f} mm above the wall; base plane at {plan.plane:.2f} m; axes of S:"
-        " x red, y green, z blue; meshes as convex hulls"
+        f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m; axes of S: x red,"
+        " y green, z blue; meshes as convex hulls"
     )
 
 
