@@ -181,7 +181,7 @@ def run(case: Case) -> dict[str, Any]:
             result = identify_log(path)
         except DrakeTeleopError as error:
             return row | {"outcome": "error", "message": str(error).replace(folder, "")}
-        except Exception:
+        except Exception:  # a crash is a result of the benchmark, with its traceback
             return row | {"outcome": "error", "message": traceback.format_exc(limit=-3)}
         cpu = time.process_time() - start
     causes = tuple(getattr(result, "causes", ()))

@@ -99,7 +99,7 @@ WRITING = {
     ("lab/new_station/__init__.py", ".write_text"),
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
-    # By `whole_file` into the output folder, and a data set that the package generates.
+    # Files in the output folder, by `whole_file`; and a dataset that the package generates.
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
     ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_text"),
     ("logs/dataset/dataset_files.py", ".write_bytes"),

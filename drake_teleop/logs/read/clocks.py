@@ -35,8 +35,8 @@ MIN_GAP_STEPS = 4.0
 MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
 """Range of plausible rates [Hz]; other rates indicate a wrong unit."""
 _MAX_STEP_RATIO = 4.0
-# Of an episode: largest distance of its start from that of the first, largest of its first steps,
-# and least number of rows.
+# Limits of an episode, in median steps: distance of its start from that of the first episode, and
+# each of its first steps. Least number of its rows.
 _MAX_START_STEPS, _MAX_FIRST_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
 _WINDOW = 50
 
