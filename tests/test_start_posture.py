@@ -8,18 +8,21 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.new_station.place import find_place
+from drake_teleop.lab.new_station.place import _strong_ones, find_place
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
+    Postures,
     degrees_of_freedom,
     elbow_up,
     joint_margins,
     postures_at,
     random_postures,
+    suitable,
 )
 from drake_teleop.lab.new_station.text import wall_of
 from drake_teleop.station.environment.solids import Wall
-from drake_teleop.station.slave.arm import pose_into
+from drake_teleop.station.slave.arm import holding_torque, pose_into
+from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.posture_shapes import PostureShapes, start_overlaps
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -194,3 +197,38 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     assert not any(
         {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.near()
     )
+
+
+@pytest.mark.parametrize("low", [-0.01, 0.02])
+def test_joints_of_a_mobile_base_may_be_at_the_base_plane(low: float) -> None:
+    """Joints that no posture raises belong to the base; another joint below the plane counts."""
+    count = 60
+    origins = np.full((count, 4, 3), 0.5)
+    origins[:, :2, 2] = low
+    origins[:20, 3, 2] = -0.1
+    p_WS = np.tile([0.6, 0.0, 0.4], (count, 1))
+    p_WS[:, 0] += np.linspace(0.0, 0.2, count)
+    origins[:, 0, :2] = 0.0
+    R_WS = np.tile(np.diag([1.0, -1.0, -1.0]), (count, 1, 1))
+    axes = np.tile([0.0, 0.0, 1.0], (count, 4, 1))
+    kept, region = suitable(Postures(np.zeros((count, 4)), origins, axes, R_WS, p_WS), 0.0, 0.1)
+    assert region.raised.tolist() == [False, False, True, True]
+    assert region.removed[2] == ("a joint is below the base plane", 20)
+    assert (kept.origins[:, 3, 2] > 0.0).all() and len(kept.q) > 0
+
+
+@pytest.mark.parametrize("share", [0.5, 1.5])
+def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None:
+    """Unless none can be held; then the error of the station names joint and torque."""
+    arm = NominalSlave(Slave()).arm
+    q = np.random.default_rng(3).uniform(arm.lower, arm.upper, (40, arm.num_joints))
+    torque = np.abs([holding_torque(arm, each) for each in q])
+    limit = np.quantile(torque, 0.8, axis=0) if share < 1.0 else 0.1 * torque.min(axis=0)
+    weak = replace(arm, effort_limit=limit)
+    kept = _strong_ones(weak, postures_at(arm, q)).q
+    if share > 1.0:
+        assert len(kept) == len(q)
+    else:
+        expected = q[(torque < 0.9 * limit).all(axis=1)]
+        assert 0 < len(expected) < len(q)
+        np.testing.assert_array_equal(kept, expected)
