@@ -84,6 +84,7 @@ _REMOVED_DEPTH_M, _REMOVED_FORCE_N, _REMOVED_MIN_DEPTH_M = 3e-3, 1.0, 1e-3
 _UNMET_DEPTH_M, _UNMET_IMPULSE_NS = 0.3e-3, 0.03
 _FORWARD_LEVEL = 0.5  # of the master's reserve
 _DRAIN_RATE = 50.0  # 1/s
+_RELEASE_M = 0.02
 _RECOVERY_S = 0.02
 _HAND_ACCELERATION = 5.0  # m/s^2
 _DRAG_SPEED = 0.02  # m/s
@@ -101,6 +102,7 @@ _WALL_STIFFNESS, _WALL_DEPTH, _UNMET_IMPULSE = _places.number(), _places.number(
 # Modelled friction at the motion of the hand and of the slave; measured minus modelled friction.
 _FRICTION_AT_HAND, _FRICTION_AT_SLAVE = _places.vector(6), _places.vector(6)
 _FRICTION_REST, _MAX_FRICTION = _places.vector(6), _places.vector(2)
+_RETREAT = _places.number()  # of the hand out of the wall since its last rest
 _LAST_SLAVE_POSE, _SLAVE_STEP = _places.vector(7), _places.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
 _WORK_ON_HAND, _WITHHELD_SHARE = _places.vector(2), _places.vector(2)
@@ -273,7 +275,13 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     if size > 0.0:
         change = k * penetration + damper * (hand_speed - speed)
         force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTION_N)
-    force_ratio = min(max(force, 0.0) / max(size, 1e-12), 1.0)
+    # A hand that was let go moves out of a soft wall without end, so its force fades.
+    retreat = max(memory[_RETREAT] + work_along(normal, dx), 0.0)
+    if abs(hand_speed) < _DRAG_SPEED:
+        retreat *= 1.0 - min(T / _REST_S, 1.0)
+    memory[_RETREAT] = retreat
+    force *= max(1.0 - retreat / _RELEASE_M, 0.0)
+    force_ratio = min(force / max(size, 1e-12), 1.0)
     _find_slave_step(received, memory)
     for g in range(2):
         _add_friction(g, T, size, force_ratio, received, dx, p, memory, wrench)

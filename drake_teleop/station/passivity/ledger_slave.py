@@ -53,7 +53,7 @@ from drake_teleop.station.passivity.packet import (
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
 MARGIN = 0.03  #: share of the slave's reserve that is never used
 SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold in contact
-_MIN_KEPT_RESERVE = 0.1
+_MIN_KEPT_RESERVE = 0.05
 _STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
 _CAPACITY = 4.0  # over the reserve
 _FILTER_S = 3e-3
