@@ -39,11 +39,11 @@ from drake_teleop.lab.comparison.compare_passivity import station_base
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm, true_load
-from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
 from drake_teleop.station.master.data_sheets import Master, figures_of
+from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.operator.operator import GRIPS, MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.oscillation import fast_part
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
@@ -205,7 +205,9 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
     """Return the scenario of a cell without passivity method, and its times."""
     slave, channel = slave_of(drawn.arm), channel_of(drawn.network)
     times = times_of(drawn, sum(mean_delay(line) for line in channel.lines()))
-    base = replace(station_base("contact_transition", seed), slave=slave)
+    base = replace(
+        station_base("contact_transition", seed), slave=slave, wrist_sensor__ideal=True
+    )
     nominal = NominalSlave(slave)
     tip = nominal.start_tip - [0.0, 0.0, GAP]
     beside = np.array([math.cos(drawn.azimuth), math.sin(drawn.azimuth)])
@@ -262,14 +264,13 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
 
 def simulated(scenario: Scenario, times: Times) -> SimulationResult:
     """Run a cell; the hand lets go, so that the device is alone."""
-    free = replace(scenario, environment=[], channel=Channel(), passivity=PassivityConfig())
-    estimate = identified_load(free, False).estimate
-    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
     advance(simulator, 1e-3 * round(1e3 * (SETTLE + times.let_go)))
     master = station.GetSubsystemByName("master_side")
     master.GetSubsystemByName("operator")._impedance[:] = 0.0
+    master.GetSubsystemByName("master_device")._numbers[HAND_MASS] = 0.0
     advance(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
     return read_log(simulator, SETTLE)
 
