@@ -116,6 +116,9 @@ class _Function:
         for kind in ("int", "double"):
             if names := [each for each, of in self._locals.items() if of == kind]:
                 self._line(f"{kind} {', '.join(names)};")
+        for kind in parameters.values():
+            if not isinstance(kind, str) and isinstance(kind[0], str):
+                self._line(f"(void){kind[0]};")  # it may be unused
         self.text = "\n".join([*self._lines, *body, "}\n"])
 
     def _parameters(self, parameters: dict[str, Any]) -> list[str]:
