@@ -97,6 +97,7 @@ WRITING = {
     ("robots/table.py", ".write_csv"),
     # Under another name, until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
+    ("robots/controller/export.py", ".write_bytes"),  # by `whole_file`
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
     # Files in the output folder, by `whole_file`; and a dataset that the package generates.
