@@ -413,7 +413,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 _EXPORT_FORMATS = (
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
 )
-_CONTROLLER_FORMATS = ("c99",)
+_CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
 
 
 @cli.command()
