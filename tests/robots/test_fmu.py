@@ -79,9 +79,15 @@ def test_another_step_size_is_an_error(units, version):
 def test_each_function_of_the_standard_is_exported(units, version, tmp_path):
     fmpy = pytest.importorskip("fmpy")
     header = Path(fmpy.__file__).parent / "c-code" / f"{version}Functions.h"
-    text = header.read_text().partition("Functions for FMI2 for Model Exchange")
-    text = text[0] + text[2].partition("Functions for FMI2 for Co-Simulation")[2]
-    required = set(re.findall(rf"{version}\w+TYPE\s+({version}\w+);", text))
+    required = set(re.findall(rf"{version}\w+TYPE\s+({version}\w+);", header.read_text()))
+    if version == "fmi2":  # those of model exchange may be absent
+        required -= set(
+            re.findall(
+                r"fmi2\w*(?:Event|Discrete|Continuous|Derivatives)\w*|fmi2SetTime|fmi2CompletedIntegratorStep",
+                header.read_text(),
+            )
+        )
+        required |= {"fmi2GetRealOutputDerivatives", "fmi2SetRealInputDerivatives"}
     assert len(required) > 30
     with zipfile.ZipFile(units / f"wrench_compensator_{version}.fmu") as archive:
         archive.extractall(tmp_path)
