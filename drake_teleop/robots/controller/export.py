@@ -13,9 +13,14 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.controller.c99 import Files, Target, c99_files
 from drake_teleop.robots.controller.fmu import fmu_files
+from drake_teleop.robots.controller.ros2_filter import ros2_filter_files
 from drake_teleop.robots.export import in_sensor_frame, refuse_removed_weight
 
-FORMATS: dict[str, Callable[[Target], Files]] = {"c99": c99_files, "fmu": fmu_files}
+FORMATS: dict[str, Callable[[Target], Files]] = {
+    "c99": c99_files,
+    "fmu": fmu_files,
+    "ros2_filter": ros2_filter_files,
+}
 """Functions that return the files of a format."""
 
 
