@@ -143,7 +143,7 @@ def rendered(name: str, **values: Any) -> str:
         return [plain(each) for each in value] if isinstance(value, (list, tuple)) else value
 
     values = {key: plain(value) for key, value in ({"version": __version__} | values).items()}
-    return render(PACKAGE, f"templates/{name}.j2", **values)
+    return render(PACKAGE, f"templates/{name}.j2", **values) + "\n"
 
 
 def _test_vector(target: Target) -> str:
