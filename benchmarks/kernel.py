@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import runpy
 import shutil
 import subprocess
@@ -44,12 +45,14 @@ TARGET = Target(LOAD, DT, 30.0, np.repeat([170.0, 9.0], 3), -1, [])
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
 WASM = runpy.run_path(str(HERE.parent / "docs" / "_ext" / "kernel_page.py"))
 NODE = """
-const fs = require("fs"), [wasm, input, output, ...scales] = process.argv.slice(2);
+const fs = require("fs"), [wasm, input, output, ...rest] = process.argv.slice(2);
+const numbers = rest.map(Number);
 const rows = new Float64Array(fs.readFileSync(input).buffer), count = rows.length / 18;
 WebAssembly.instantiate(fs.readFileSync(wasm)).then(({ instance: { exports } }) => {
   const at = (name, n) => new Float64Array(exports.memory.buffer, exports[name].value, n);
   const reading = at("reading", 18), result = at("result", 12), out = new Float64Array(13 * count);
-  exports.start(...scales.map(Number));
+  at("load", 16).set(numbers.slice(0, 16));
+  exports.start(...numbers.slice(16));
   const start = process.hrtime.bigint();
   for (let k = 0; k < count; ++k) {
     reading.set(rows.subarray(18 * k, 18 * k + 18));
@@ -119,9 +122,10 @@ def in_node(folder: Path) -> tuple[Array, float, int]:
     module = WASM["compiled"](TARGET)
     (folder / "kernel.wasm").write_bytes(module)
     (folder / "replay.js").write_text(NODE)
-    scales = [repr(value) for value in (DT, *SCALES.values())]
+    tangent = math.tan(math.pi * 30.0 * DT)
+    numbers = [repr(float(x)) for x in (*PHI, *OFFSETS, DT, tangent, *SCALES.values())]
     files = [str(folder / name) for name in ("replay.js", "kernel.wasm", "in", "out")]
-    said = subprocess.run(["node", *files, *scales], check=True, capture_output=True, text=True)
+    said = subprocess.run(["node", *files, *numbers], check=True, capture_output=True, text=True)
     return np.fromfile(folder / "out").reshape(-1, 13), float(said.stdout), len(module)
 
 
