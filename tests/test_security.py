@@ -94,7 +94,7 @@ WRITING = {
     # A line for each change of a drive's inputs, which is to outlive the process.
     ("live/record.py", 'open("x'),
     # To memory, and then into the file with the wrenches that have come before.
-    ("robots/table.py", ".write_csv"),
+    ("robots/lines.py", ".write_csv"),
     # Under another name, until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
     # Figures, where --json says.

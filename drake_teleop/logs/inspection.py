@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, runs
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
-from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.processing import check_log
+from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import seconds, shortest_gap
@@ -58,9 +58,6 @@ def inspect_command(
 
     Returns:
         the summary.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be read.
     """
     summary: dict[str, Any] = {
         "log": str(log),
@@ -351,8 +348,7 @@ def _labels(columns: Sequence[str], table: Table) -> list[str]:
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
+    return int(np.diff(runs(flags)).max(initial=0))
 
 
 def _saturated(x: Array, same: NDArray[np.bool_]) -> int:

@@ -28,7 +28,6 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.cause_lines import implausible_mass_message
 from drake_teleop.logs.causes.cause import EVENTS, Cause, Stretch
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
@@ -46,11 +45,16 @@ from drake_teleop.logs.contact import (
     robust_offsets,
     samples_of,
 )
-from drake_teleop.logs.explained_log import explain_log, explained_load, named_frame, removed_note
+from drake_teleop.logs.explained_log import (
+    explain_log,
+    explained_load,
+    implausible_mass_message,
+    named_frame,
+    removed_note,
+)
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
-from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
+from drake_teleop.logs.read.alignment import delay_of, low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
 _GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
@@ -266,9 +270,6 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     Args:
         path: canonical table or log description.
         checks: result of `check_file` for this log, if known.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be read.
     """
     checks = check_file(path) if checks is None else checks
     try:

@@ -13,10 +13,10 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import quaternions, rotation_matrices
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
-from drake_teleop.logs.read.rotations import quaternions, rotation_matrices
 from drake_teleop.robots.compensator import CLOCK_DRIFT, JUMP_S, STALE_S
 from drake_teleop.robots.delay_tracking import DelayTracker
 from drake_teleop.robots.export import rotation_rpy
@@ -46,9 +46,6 @@ class Parts:
     Attributes:
         motion_stream: stream of the motion: poses if available, else an IMU.
         two_clocks: whether wrench and motion have different clocks.
-
-    Raises:
-        DrakeTeleopError: if no source delivers motion.
     """
 
     live = True

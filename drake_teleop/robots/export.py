@@ -77,10 +77,6 @@ def export(
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame F of the export,
             as in a URDF; None: F is S.
         sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
-
-    Raises:
-        DrakeTeleopError: for an unknown format, an inconsistent load, or, if the format is in the
-            sensor's frame, a `sensor_pose` or a wrench without the load's weight.
     """
     if to not in FORMATS:
         raise DrakeTeleopError(

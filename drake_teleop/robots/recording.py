@@ -15,10 +15,10 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_table, write_text
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.compensator import JUMP_S
 from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, Reading

@@ -94,9 +94,6 @@ class Detector:
     Args:
         free: log of free motion of the load, at the rate of the stream.
         delay: delay of the log, see `eliminate_log`.
-
-    Raises:
-        DrakeTeleopError: for an unreadable log, another rate, too little motion, or no low-pass.
     """
 
     def __init__(

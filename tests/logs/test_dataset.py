@@ -19,8 +19,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
 from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
-from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
+    EpisodeSignals,
     find_hypothesis,
     offset_step,
     unexplained,

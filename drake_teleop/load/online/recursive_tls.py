@@ -1,7 +1,7 @@
 """Recursive total least squares: load and offsets for noise of wrench and motion, Eq. (T18).
 
 The estimate minimises lambda, the squared residuals over their expected value (Kubus, Kroeger,
-Wahl, IROS 2008). As in `batch.moments`, row c of the regressor [E V] is T_c z, with the wrench F
+Wahl, IROS 2008). As in `moments`, row c of the regressor [E V] is T_c z, with the wrench F
 last:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, checked
-from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.load.moments import coefficients
 from drake_teleop.load.online.recursive import (
     PRIOR_STD,
     SETTLED,

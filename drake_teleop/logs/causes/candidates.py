@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import signed_permutations
 from drake_teleop.load.identification import natural_scale
-from drake_teleop.logs.causes.changes import add_step
-from drake_teleop.logs.causes.contacts import contact_spans
+from drake_teleop.logs.causes.changes import add_step, contact_spans
 from drake_teleop.logs.causes.instants import FORCES, ONE, G, R, S
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.state import State
@@ -269,8 +269,6 @@ def similar_factors(state: State) -> list[State]:
 
 
 def _axes(state: State) -> Iterator[Candidate]:
-    from itertools import permutations, product
-
     y = state.data.only(state.rows.used).y[:, state.model.columns]
     sums = y.T @ y
     sums = sums - np.outer(sums[:, ONE], sums[ONE]) / sums[0, 0]
@@ -287,17 +285,14 @@ def _axes(state: State) -> Iterator[Candidate]:
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
     best: tuple[float, Array] = (np.inf, np.eye(3))
     plain = total
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            Q = np.zeros((3, 3))
-            Q[range(3), order] = signs
-            right = np.einsum("dc,cdp->p", Q, cross)
-            found = inverse @ right
-            left = total - float(right @ found) if found[0] > 0.0 else total
-            if (np.eye(3) == Q).all():
-                plain = left
-            elif left < best[0]:
-                best = (left, Q)
+    for Q in signed_permutations():
+        right = np.einsum("dc,cdp->p", Q, cross)
+        found = inverse @ right
+        left = total - float(right @ found) if found[0] > 0.0 else total
+        if (np.eye(3) == Q).all():
+            plain = left
+        elif left < best[0]:
+            best = (left, Q)
     if best[0] < _HALVED * plain:
         larger = state.extended(replace(state.model, axes=best[1]), np.zeros(state.model.size))
         if larger.x[6] > 0.0:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, parabola_minimum
 
 ORDER = 4
 """Order of the autoregressive noise."""
@@ -256,7 +256,4 @@ def free_delay(data: Instants) -> float:
     best = int(np.argmin(costs))
     if best in (0, len(shifts) - 1):
         return 0.0
-    left, middle, right = costs[best - 1 : best + 2]
-    bend = left - 2.0 * middle + right
-    move = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
-    return float(shifts[best] + _DELAY_STEP_S * np.clip(move, -1.0, 1.0))
+    return float(shifts[best] + _DELAY_STEP_S * parabola_minimum(*costs[best - 1 : best + 2]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.load.moments import coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA,
     FORCES,

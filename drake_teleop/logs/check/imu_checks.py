@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import permutations, product
 
 import numpy as np
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import rotation_matrices, signed_permutations
+from drake_teleop.logs.check.against_load import GOOD_SHARE, MIN_IMPROVEMENT, VALID_SHARE
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Edit,
@@ -16,13 +17,11 @@ from drake_teleop.logs.check.corrections import (
     pose_edits,
     try_edit,
 )
-from drake_teleop.logs.check.load_fit import GOOD_SHARE, MIN_IMPROVEMENT, VALID_SHARE
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description, Imu
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
-from drake_teleop.logs.read.rotations import rotation_matrices
 
 DEGREE_RATIOS = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
@@ -99,7 +98,7 @@ def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | Non
     if not given > _MIN_MISFIT:
         return None
     best, P = min(
-        ((_gravity_misfit(few, P, gravity), P) for P in _signed_permutations()),
+        ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations()),
         key=lambda entry: entry[0],
     )
     if _MIN_RATIO * best > given:
@@ -129,7 +128,7 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     )
     size = float(np.linalg.norm(given_alpha) * np.linalg.norm(derived_alpha)) + 1e-300
     alike = given_alpha.T @ derived_alpha / size
-    best = max(_signed_permutations(), key=lambda P: float(np.sum(alike * P)))
+    best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
     if np.sum(alike * best) < _MIN_CORRELATION or np.trace(alike) > _MAX_OWN_SHARE * np.sum(
         alike * best
     ):
@@ -141,14 +140,6 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
         f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or take it"
         " out",
     )
-
-
-def _signed_permutations() -> list[Array]:
-    return [
-        np.eye(3)[list(order)] * np.array(signs)[:, None]
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.logs.contact import Samples
-from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
     CALM_WIDTH,
     STEPS,
+    EpisodeSignals,
     Hypothesis,
     Search,
     as_described,
@@ -62,9 +62,6 @@ def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     """Return the load of a dataset from some of its episodes, or the given load.
 
     Episodes with another load or wrong axes, and contact, have no influence if they are few.
-
-    Raises:
-        DrakeTeleopError: if no load of positive mass explains the episodes.
     """
     spacing = _best_spacing(logs)
     episodes = [EpisodeSignals(log, spacing) for log in logs]

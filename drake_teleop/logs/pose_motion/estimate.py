@@ -11,30 +11,32 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, checked, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
 from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
     Spectra,
     Window,
+    at_rate,
     averaged_splines,
     choose_spacing,
+    clock_rate,
     delay_deviation,
     fit_levels,
     fit_linear_model,
     guess_spacing,
 )
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     LEVER,
     LOAD,
     PARAMETERS,
     TURN,
+    ReadOff,
     RigidFit,
     State,
     fit_rigid,
+    read_off,
 )
 from drake_teleop.logs.pose_motion.spectra import (
     MAX_FREQUENCY_HZ,
@@ -174,9 +176,6 @@ def estimate_from_poses(
         gain: standard deviation of the sensor gains, such as 0.01.
         lost: (N,) True for excluded samples.
         imu: IMU data of S, used if they lower the cost.
-
-    Raises:
-        DrakeTeleopError: for wrong shapes, or if fewer than 100 instants remain.
     """
     with one_blas_thread():
         found = _find_motion(
@@ -235,9 +234,6 @@ def motion_of_load(
     """Return the motion from poses of S with which an identified load fits a wrench best.
 
     `load` (6, 16) is from `load_coefficients`; other arguments as for `estimate_from_poses`.
-
-    Raises:
-        DrakeTeleopError: for wrong shapes, or if fewer than 32 instants remain.
     """
     with one_blas_thread():
         found = _find_motion(

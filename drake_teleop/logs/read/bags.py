@@ -80,11 +80,7 @@ def is_bag(path: Path) -> bool:
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """Return the topics of a bag, sorted by name.
-
-    Raises:
-        DrakeTeleopError: if it cannot be read.
-    """
+    """Return the topics of a bag, sorted by name."""
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
@@ -96,11 +92,7 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
-    """Return the messages of a topic as a table, for TF of one child frame.
-
-    Raises:
-        DrakeTeleopError: if bag, topic or child frame are missing, or the child frame is ambiguous.
-    """
+    """Return the messages of a topic as a table, for TF of one child frame."""
     with _open_bag(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
         if not connections:
@@ -130,11 +122,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """Return the table of a stream of a description: its file, or its topic of a bag.
-
-    Raises:
-        DrakeTeleopError: for an unreadable file, or a bag without a topic.
-    """
+    """Return the table of a stream of a description: its file, or its topic of a bag."""
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):

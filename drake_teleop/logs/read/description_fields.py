@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, field_validator
 
-from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
+from drake_teleop.common.rotations import nearest_rotation, rotation_error
 
 ROTATION_TOLERANCE = 0.01
 """Largest deviation of entries of R^T R from the identity."""
