@@ -20,8 +20,8 @@ from drake_teleop.lab.excitation.excite import criteria_of, excite
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.recursive_tls import METHODS

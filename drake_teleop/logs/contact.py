@@ -9,15 +9,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, narrowest_half, runs
-from drake_teleop.load.contact.detection import RARE, ContactDetector, statistics, wrench_axis
-from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, statistic_index
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.contact.detection import (
+    RARE,
+    ContactDetector,
+    fit_noise_floor,
+    statistics,
+    wrench_axis,
+)
+from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, Samples, statistic_index
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
@@ -38,26 +43,6 @@ _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.
 _MAX_CONTACT_SHARE, _MAX_NOISE_RATIO = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
 _CONTACT_SHARE_OF_SHIFT = 0.2
-
-
-class Samples(NamedTuple):
-    """Input of the contact detector, low-passed.
-
-    Attributes:
-        contact: (N, 6) contact wrench F_c [N, N m].
-        s, omega, alpha: (N, 3) specific force, angular velocity and acceleration of S [SI].
-        acceleration: (N, 3) acceleration without gravity [m/s^2].
-    """
-
-    contact: Array
-    s: Array
-    omega: Array
-    alpha: Array
-    acceleration: Array
-
-    def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
-        """Return the samples in `rows`."""
-        return Samples(*(x[rows] for x in self))
 
 
 @dataclass(frozen=True)

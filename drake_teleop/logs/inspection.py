@@ -33,15 +33,11 @@ MIN_REPEATED_SHARE = 0.05
 MIN_REPEATED_BLOCK = 5
 _MAX_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
+_CANONICAL = {"f_x", "tau_x"}
+_CANONICAL = {"f_x", "tau_x"}
 _QUANTITIES = (
-    "force",
-    "torque",
-    "specific_force",
-    "angular_velocity",
-    "angular_acceleration",
-    "orientation",
-    "position",
-    "gravity",
+    *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
+    *("orientation", "position", "gravity"),
 )
 
 
@@ -59,21 +55,12 @@ def inspect_command(
     Returns:
         the summary.
     """
-    summary: dict[str, Any] = {
-        "log": str(log),
-        "kind": "description",
-        "topics": {},
-        "streams": {},
-        "findings": [],
-        "fit": None,
-        "mounting": None,
-        "delay_s": None,
-        "draft": None,
-    }
+    summary: dict[str, Any] = {"log": str(log), "kind": "description", "topics": {}, "streams": {}}
+    summary |= {"findings": [], "fit": None, "mounting": None, "delay_s": None, "draft": None}
     make_folder(out)
     if not others and log.suffix.lower() in (".yaml", ".yml"):
         _inspect(load_description(log), str(log), {}, summary)
-    elif not others and not is_bag(log) and _is_canonical(table := read_table(log)):
+    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _CANONICAL:
         summary["kind"] = "canonical"
         _inspect(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
@@ -85,10 +72,6 @@ def inspect_command(
     if not quiet:
         _print(summary)
     return summary
-
-
-def _is_canonical(table: Table) -> bool:
-    return "f_x" in table.columns and "tau_x" in table.columns
 
 
 def _describe_canonical(log: Path, table: Table) -> Description:

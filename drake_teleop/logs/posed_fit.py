@@ -66,7 +66,8 @@ def fit_posed(
     found, source = motion_and_load(log, delay)
     finding = None if log.free else pose_finding(found, log)
     if log.posed.imu is not None:
-        if not found.imu_agrees or (finding is not None and not _is_sensor_rotated(found)):
+        rotated = found.frame.turned and not found.frame.shifted
+        if not found.imu_agrees or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
@@ -83,10 +84,6 @@ def fit_posed(
             finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
-
-
-def _is_sensor_rotated(found: PoseEstimate) -> bool:
-    return found.frame.turned and not found.frame.shifted
 
 
 def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:

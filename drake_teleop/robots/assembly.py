@@ -19,7 +19,6 @@ from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
 from drake_teleop.robots.compensator import CLOCK_DRIFT, JUMP_S, STALE_S
 from drake_teleop.robots.delay_tracking import DelayTracker
-from drake_teleop.robots.export import rotation_rpy
 from drake_teleop.robots.streams import (
     IMU,
     JOINTS,
@@ -210,7 +209,8 @@ def _axis(A: Array) -> Array:
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
     """Return the pose (7,), [w x y z, position], of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
-    return np.concatenate([quaternions(rotation_rpy(numbers[3:])[None])[0], numbers[:3]])
+    R = rotation_matrices(np.radians([numbers[3:]]), "euler", "xyz")
+    return np.concatenate([quaternions(R)[0], numbers[:3]])
 
 
 class _ClockOffset:

@@ -14,9 +14,8 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.contact.detection import RARE, ContactDetector, flag_update
+from drake_teleop.load.contact.detection import RARE, ContactDetector, fit_noise_floor, flag_update
 from drake_teleop.load.contact.noise_floor import finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.watched import (

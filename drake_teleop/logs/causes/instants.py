@@ -147,7 +147,8 @@ def instants(
     y[:, FORCES] = wrench.reshape(rows, size, 6).mean(axis=1)
     y[1:-1, RATES] = (y[2:, FORCES] - y[:-2, FORCES]) / (2.0 * size * dt)
     positions = _write_motion(y, t, size, motion, gravity_W)
-    y[:, TIME] = _legendre(np.linspace(-1.0, 1.0, rows))
+    x = np.linspace(-1.0, 1.0, rows)
+    y[:, TIME] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)  # Legendre
     used = np.ones(rows, bool)
     used[[0, -1]] = False
     if lost is not None:
@@ -222,10 +223,6 @@ def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     if len(motion) == 5:
         parts.append((R_SW[:, :, :, None] * motion[4][:, None, None, :]).reshape(-1, 27))
     return np.hstack(parts)
-
-
-def _legendre(x: Array) -> Array:
-    return np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
 
 
 def free_delay(data: Instants) -> float:

@@ -264,10 +264,16 @@ class State:
     @cached_property
     def smooth_gain(self) -> tuple[float, int]:
         """Gain of twice the log likelihood by generic smooth signals, and their number."""
-        columns = self.data.y[:, self._smooth()]
-        if self.data.positions:
-            columns = np.hstack([columns, self.data.y[:, RP] @ _springs().T])
-        columns = np.hstack([columns, self._segments()])
+        y = self.data.y
+        part = np.linspace(0.0, _SEGMENTS, len(y), endpoint=False).astype(int)
+        columns = np.hstack(
+            [
+                y[:, : PRODUCTS.stop],
+                y[:, R] if self.data.gravity_W is not None else y[:, :0],
+                y[:, RP] @ _springs().T if self.data.positions else y[:, :0],
+                part[:, None] == np.arange(1.0, _SEGMENTS),
+            ]
+        )
         e = self.rows.y @ self.fit.residual.T
         whole, filters = self.rows.whole, self.fit.filters
         gain, freedom = 0.0, 0
@@ -278,14 +284,6 @@ class State:
             solved, rank = gain_of(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
         return gain, freedom
-
-    def _smooth(self) -> list[int]:
-        used = list(range(PRODUCTS.stop))
-        return used + list(range(R.start, R.stop)) if self.data.gravity_W is not None else used
-
-    def _segments(self) -> Array:
-        part = np.linspace(0.0, _SEGMENTS, len(self.data.t), endpoint=False).astype(int)
-        return np.asarray(part[:, None] == np.arange(1, _SEGMENTS), float)
 
     def score(self, model: Model) -> float:
         """Return the first-order gain of twice the log likelihood by fitting a larger model."""

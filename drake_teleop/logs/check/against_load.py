@@ -69,7 +69,7 @@ class LoadFit:
 
 def load_fit(log: Log) -> LoadFit:
     """Fit a load and constant offsets to a log, low-passed at 15 Hz."""
-    cutoff = _cutoff(log)
+    cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_passed(log, cutoff).only(measured(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
@@ -99,10 +99,6 @@ def unexplained_share(wrench: Array, residual: Array) -> float:
     scale = _scale(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
-
-
-def _cutoff(log: Log) -> float | None:
-    return None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
 
 
 def _scale(wrench: Array) -> Array:

@@ -158,7 +158,8 @@ class Search:
             start = self.concentrate(plain, det=det, scale=True)
             yield start
             yield self.concentrate(replace(start, gain=one), det=det, scale=False)
-            for M in (np.eye(3), -np.eye(3), _nearest_permutation(start.force)):
+            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force).sum()))
+            for M in (np.eye(3), -np.eye(3), nearest):
                 yield self.concentrate(replace(start, force=M, torque=M), det=0.0, scale=True)
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
@@ -279,10 +280,6 @@ def _gains(w: Array, p: Array, x: Hypothesis) -> Array:
         q = p[:, channels] @ M.T
         gains.append(float((w[:, channels] * q).sum() / ((q * q).sum() + 1e-12)))
     return np.maximum(gains, 1e-9)
-
-
-def _nearest_permutation(M: Array) -> Array:
-    return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmax((_SIGNED_PERMUTATIONS * M).sum((1, 2))))])
 
 
 def _deviations(x: Hypothesis, usual_lag: float) -> float:

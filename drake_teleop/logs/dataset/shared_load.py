@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
-from drake_teleop.load.contact.detection import RARE
-from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.contact.detection import RARE, fit_noise_floor
+from drake_teleop.load.contact.noise_floor import NoiseFloor, Samples, finite_covariance
 from drake_teleop.load.identification import Identification, worth_stating
-from drake_teleop.logs.contact import Samples
 from drake_teleop.logs.dataset.episode_verdict import (
     CALM_WIDTH,
     STEPS,

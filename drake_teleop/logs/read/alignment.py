@@ -241,7 +241,9 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     reach = min(SEARCH_RANGE, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    inside = np.flatnonzero(inside & _away_from_gaps(log, cutoff, reach))
+    gap = ~measured(log, cutoff)
+    gap = widened(gap, math.ceil(reach / log.dt)) if gap.any() else gap
+    inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_DELAY_SAMPLES:
         return None
     stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES)
@@ -272,11 +274,6 @@ def delay_of(
         )
     found = estimate_delay(log, cutoff_hz, phi)
     return (0.0, "undetermined") if found is None else (found, "estimated")
-
-
-def _away_from_gaps(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:
-    gap = ~measured(log, cutoff)
-    return ~widened(gap, math.ceil(reach / log.dt)) if gap.any() else ~gap
 
 
 def _refine_shift(cost: Callable[[float], float], best: float, step: float) -> float:

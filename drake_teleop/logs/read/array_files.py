@@ -85,14 +85,7 @@ def library(name: str, path: Path) -> Any:
 
 _HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = 128, 14, 15, 2, 1 << 11, 20
 _NUMERIC_CLASSES = range(6, 16)  # numeric classes
-_TYPES = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
+_TYPES = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
     12: "i8",
     13: "u8",

@@ -39,25 +39,14 @@ _TOO_LARGE, _CUT_REMEDY = (
     "its uncompressed size is too large",
     "cut it, or write the topics one by one",
 )
-_GROUP_NAMES = {
-    "force": "force",
-    "torque": "torque",
-    "linear_acceleration": "linear_acceleration",
-    "angular_velocity": "angular_velocity",
-    "orientation": "orientation",
-    "rotation": "orientation",
-    "position": "position",
-    "translation": "position",
-}
+_GROUPS = ("force", "torque", "linear_acceleration", "angular_velocity", "orientation", "position")
+_GROUP_NAMES = {name: name for name in _GROUPS}
+_GROUP_NAMES |= {"rotation": "orientation", "translation": "position"}
 _STREAM_TYPES = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
     "pose": (
-        "PoseStamped",
-        "PoseWithCovarianceStamped",
-        "TransformStamped",
-        "Odometry",
-        "Pose",
+        *("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry", "Pose"),
         "TFMessage",
     ),
 }
@@ -105,7 +94,8 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         pairs = (
             (received, part)
             for connection, received, raw in reader.messages(connections)
-            for part in _split_transforms(reader.deserialize(raw, connection.msgtype))
+            for message in [reader.deserialize(raw, connection.msgtype)]
+            for part in getattr(message, "transforms", [message])
         )
         blocks = _read_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
@@ -226,10 +216,6 @@ def _limit_memory() -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def _split_transforms(message: Any) -> list[Any]:
-    return getattr(message, "transforms", [message])
 
 
 def _read_blocks(
