@@ -103,7 +103,6 @@ WRITING = {
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
     ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_text"),
     ("logs/dataset/dataset_files.py", ".write_bytes"),
-    ("logs/dataset/sample_dataset.py", ".write_text"),
     # A mark of one byte more.
     ("lab/studies/store.py", 'open("ab'),
     ("robots/changes.py", "json.dump"),  # to the process that asked

@@ -150,6 +150,14 @@ def coefficients() -> Array:
     return T
 
 
+def centripetal_matrix(r: Array) -> Array:
+    """Return C (..., 3, 6): C z[13:19] is the acceleration omega x (omega x r) of r (..., 3)."""
+    x, y, z = np.moveaxis(r, -1, 0)
+    o = np.zeros_like(x)
+    rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
     """Return the Gram matrix (16, 16), sum of W_cd T_c Z T_d^T, and the right-hand side (16,).
 

@@ -207,13 +207,11 @@ def _stream(
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest(~good)
     if not good.all():
         first = table.line(int(np.argmin(good)))
-        findings.append(
-            Finding(
-                "nan",
-                f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
-                f" the longest block {figures['nan_longest']} rows; cut or repair them",
-            )
+        text = (
+            f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
+            f" the longest block {figures['nan_longest']} rows; cut or repair them"
         )
+        findings.append(Finding("nan", text))
     same = np.zeros(len(values), bool)
     same[1:] = (values[1:] == values[:-1]).all(axis=1)
     figures["repeated_rows"] = int(same.sum())
@@ -234,13 +232,11 @@ def _stream(
             "saturated": saturated,
         }
         if saturated:
-            findings.append(
-                Finding(
-                    "saturation",
-                    f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
-                    f" {finite.max():.4g}) for {saturated} samples; cut them or move slower",
-                )
+            text = (
+                f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
+                f" {finite.max():.4g}) for {saturated} samples; cut them or move slower"
             )
+            findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
     return figures, findings, rows if table.kept is None else table.kept[rows]
 
@@ -302,23 +298,19 @@ def _clock(
     findings = []
     if gaps:
         where = float(t[int(np.argmax(steps))] - t[0])
-        findings.append(
-            Finding(
-                "gap",
-                f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
-                " missing or the clock jumped; the motion there is not used",
-            )
+        text = (
+            f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
+            " missing or the clock jumped; the motion there is not used"
         )
+        findings.append(Finding("gap", text))
     if back:
         row = table.line(np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1])
-        findings.append(
-            Finding(
-                "clock jump",
-                f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
-                " rows with equal stamps are omitted or spread evenly; a log with decreasing"
-                " stamps is refused: cut it there, or give time.rate",
-            )
+        text = (
+            f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
+            " rows with equal stamps are omitted or spread evenly; a log with decreasing"
+            " stamps is refused: cut it there, or give time.rate"
         )
+        findings.append(Finding("clock jump", text))
     return findings, usable
 
 

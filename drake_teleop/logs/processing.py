@@ -377,21 +377,15 @@ def eliminate_log(
         raise DrakeTeleopError("contains poses at rest, which have no contact", where=source)
     if found.log.static:
         return found
-    detection = detect_contact(
-        samples_of(found.log, found.contact, cutoff_hz),
-        found.log.dt,
-        cutoff_hz,
-        finite_covariance(found.phi, identification.covariance, tared=tare),
-        identification.residual_rms,
-        edge=found.edge,
-        free=None
-        if free_motion is None
-        else (
-            samples_of(free_motion.log, free_motion.contact, cutoff_hz).at(~free_motion.edge),
-            free_motion.log.dt,
-        ),
-        statistic=statistic,
-    )
+    samples = samples_of(found.log, found.contact, cutoff_hz)
+    reference = None
+    if free_motion is not None:
+        free_samples = samples_of(free_motion.log, free_motion.contact, cutoff_hz)
+        reference = free_samples.at(~free_motion.edge), free_motion.log.dt
+    covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
+    options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
+    usual = identification.residual_rms
+    detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
     if free_motion is not None and tare and detection is not None:
         notes = offset_shift_note(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)

@@ -266,20 +266,16 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     side = "behind" if delay > 0 else "ahead of"
     if abs(delay) > MIN_CLOCK_ERROR_S:
         offset = description.wrench.time.offset + delay
-        return [
-            Finding(
-                "clock",
-                f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong;"
-                f" set wrench.time.offset: {offset:.3f} (or shift the others the other way)",
-            )
-        ]
-    return [
-        Finding(
-            "lag",
-            f"the motion is {abs(delay) * 1e3:.1f} ms {side} the wrench; identify takes this out;"
-            f" to say so in the description, add {delay:.4f} to wrench.time.offset",
+        text = (
+            f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong;"
+            f" set wrench.time.offset: {offset:.3f} (or shift the others the other way)"
         )
-    ]
+        return [Finding("clock", text)]
+    text = (
+        f"the motion is {abs(delay) * 1e3:.1f} ms {side} the wrench; identify takes this out;"
+        f" to say so in the description, add {delay:.4f} to wrench.time.offset"
+    )
+    return [Finding("lag", text)]
 
 
 def drift_finding(description: Description, data: LogData) -> tuple[list[Finding], Description]:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.uncertainty import ARM, gain_effects
-from drake_teleop.load.moments import coefficients
+from drake_teleop.load.moments import centripetal_matrix, coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH, Levels
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
@@ -88,15 +88,10 @@ def motion_map(R: Array, r: Array) -> Array:
     M[1:7, SIGNALS:] = np.eye(6)
     M[7:10, 1:4] = M[7:10, 4:7] = R.T
     M[7:10, 7:10] = -R.T @ cross_matrix(r)
-    M[7:10, 10:16] = R.T @ _centripetal(r)
+    M[7:10, 10:16] = R.T @ centripetal_matrix(r)
     M[10:13, 7:10] = R.T
     M[13:19, 10:16] = _rotated_products(R)
     return M
-
-
-def _centripetal(r: Array) -> Array:
-    x, y, z = r
-    return np.array([[0.0, -x, -x, y, z, 0.0], [-y, 0.0, -y, x, 0.0, z], [-z, -z, 0.0, 0.0, x, y]])
 
 
 _PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

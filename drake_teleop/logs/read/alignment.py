@@ -137,10 +137,11 @@ def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[
     """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS (N, 3, 3)."""
     _, first, second = smooth_derivatives(R_WS, dt, bandwidth_hz)
     R_SW = np.swapaxes(R_WS, 1, 2)
-    return _skew_part(R_SW @ first), _skew_part(R_SW @ second)
+    return skew_parts(R_SW @ first), skew_parts(R_SW @ second)
 
 
-def _skew_part(A: Array) -> Array:
+def skew_parts(A: Array) -> Array:
+    """Return the vectors (N, 3) whose cross matrices are the skew parts of A (N, 3, 3)."""
     return 0.5 * np.stack(
         [A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], axis=1
     )
