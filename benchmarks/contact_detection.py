@@ -39,9 +39,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import statistics
+from drake_teleop.load.contact.detection import fit_noise_floor, statistics
 from drake_teleop.load.contact.noise_floor import STATISTICS, NoiseFloor, finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 

@@ -24,9 +24,9 @@ import numpy as np
 from instrumental import RecursiveInstrumentalVariables
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import PARAMETERS
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor

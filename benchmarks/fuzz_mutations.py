@@ -26,7 +26,7 @@ import yaml
 from scipy.io import savemat
 
 from drake_teleop.common.parquet_sizes import check_parquet_content
-from drake_teleop.logs.read.mat_file import read_mat
+from drake_teleop.logs.read.array_files import read_mat
 
 Mutation = Callable[[random.Random, bytes, bytes], bytes]
 

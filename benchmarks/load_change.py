@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import Identification, identified_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.change import (
     OFFSET_DRIFT,
     STATES,

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.regressor import non_contact_wrench
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "utias_workshop_tools"

@@ -40,9 +40,9 @@ from drake_teleop.logs.dataset.dataset_files import (
     write_copy,
 )
 from drake_teleop.logs.dataset.episode_faults import Finding, name_faults, saturated_channels
-from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
     CALM_WIDTH,
+    EpisodeSignals,
     Hypothesis,
     calm_half,
     find_hypothesis,
@@ -97,9 +97,6 @@ def dataset_command(
         identify: identify the load from the episodes instead.
         description: log description whose `file` is omitted or one of the episodes.
         jobs: number of processes as in joblib.
-
-    Raises:
-        DrakeTeleopError: for an unusable dataset, load or description.
     """
     if (load is None) != identify:
         raise DrakeTeleopError(

@@ -21,6 +21,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import EULER_AXES
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
@@ -43,7 +44,6 @@ from drake_teleop.logs.read.description_fields import (
     Torque,
     Weight,
 )
-from drake_teleop.logs.read.rotations import EULER_AXES
 
 NO_YAML = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
@@ -357,11 +357,7 @@ def json_schema() -> str:
 
 
 def load_description(path: str | Path) -> Description:
-    """Read a log description; its paths are relative to its folder.
-
-    Raises:
-        DrakeTeleopError: naming file and field.
-    """
+    """Read a log description; its paths are relative to its folder."""
     path = Path(path)
     if not os.path.exists(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
