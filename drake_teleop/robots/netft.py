@@ -54,11 +54,7 @@ def unpack_record(packet: bytes) -> Record | None:
 
 
 class NetFtSource:
-    """Source at netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m.
-
-    Raises:
-        DrakeTeleopError: if the address is invalid, or netftapi2.xml of the NetBox cannot be read.
-    """
+    """Source at netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m."""
 
     streams: tuple[str, ...] = (WRENCH,)
 

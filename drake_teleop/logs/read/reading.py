@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, number
+from drake_teleop.common.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
@@ -22,7 +23,13 @@ from drake_teleop.logs.read.alignment import (
     spacing,
     uniform_times,
 )
-from drake_teleop.logs.read.auto_frames import describe_mounting, describe_pose_frame
+from drake_teleop.logs.read.auto_frames import (
+    describe_gravity,
+    describe_mounting,
+    describe_pose_frame,
+    restore_weight,
+    weight_wrench,
+)
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, gaps, read_clock
@@ -35,8 +42,6 @@ from drake_teleop.logs.read.description import (
     Wrench,
     load_description,
 )
-from drake_teleop.logs.read.gravity import describe_gravity, restore_weight, weight_wrench
-from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.read.streams import (
     MAX_VALUES,
     MINIMUM_SAMPLES,
