@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shown import type_in
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.compiled import njit
@@ -34,13 +35,14 @@ def status(arguments: list[str]) -> int:
     return end.value.code
 
 
-def exported(folder: Path, *more: str) -> Path:
-    load = folder / "load.json"
-    kernel.LOAD.save(load)
-    out = folder / "out"
-    arguments = ["export", str(load), "--to", "c99", "--rate", "500", "--out", str(out), *more]
-    assert status(arguments) == 0
-    return out
+@pytest.fixture
+def exported(tmp_path, monkeypatch) -> Path:
+    """The folder that the command of docs/controller.md writes."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out" / "load").mkdir(parents=True)
+    kernel.LOAD.save(tmp_path / "out" / "load" / "identification.json")
+    type_in("docs/controller.md", "drake-teleop export")
+    return tmp_path / "out" / "c99"
 
 
 def run_test(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -50,25 +52,24 @@ def run_test(folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @needs_cc
-def test_shipped_test_passes_and_finds_a_changed_sign(tmp_path):
-    out = exported(tmp_path)
-    assert run_test(out).returncode == 0
-    source = out / "wrench_compensator.c"
+def test_shipped_test_passes_and_finds_a_changed_sign(exported):
+    assert run_test(exported).returncode == 0
+    source = exported / "wrench_compensator.c"
     text = source.read_text()
     assert "- (y * low_pass[4])" in text
     source.write_text(text.replace("- (y * low_pass[4])", "+ (y * low_pass[4])"))
-    found = run_test(out)
+    found = run_test(exported)
     assert found.returncode == 1 and "of 1000 readings differ" in found.stdout
 
 
 @needs_cc
-def test_the_vector_contains_each_flag(tmp_path):
-    text = (exported(tmp_path) / "test_vector.h").read_text()
+def test_the_vector_contains_each_flag(exported):
+    text = (exported / "test_vector.h").read_text()
     flags = text[text.index("test_flags") :].partition("{")[2].partition("}")[0].split(", ")
     assert len(flags) == 1000
     expected = {0, Flag.SATURATED, Flag.NOT_FINITE, Flag.OUT_OF_RANGE, Flag.CLIPPED}
     assert set(map(int, flags)) == expected
-    header = (tmp_path / "out" / "wrench_compensator.h").read_text()
+    header = (exported / "wrench_compensator.h").read_text()
     for flag in expected - {0}:
         assert f"WRENCH_COMPENSATOR_{flag.name} = {int(flag)}" in header
 
