@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -153,7 +154,7 @@ class Compensator:
         self.good_count = 0
 
     @property
-    def settings(self) -> dict[str, Array | float]:
+    def settings(self) -> dict[str, Any]:
         """Values of `wrench_compensator_settings` of the exported C code, by name."""
         low_pass = self._low_pass if len(self._low_pass) else np.zeros(7)
         return {

@@ -88,7 +88,7 @@ class Target(NamedTuple):
     sign: int
     notes: list[str]
 
-    def settings(self, largest: Array | None = None, **scales: float) -> str:
+    def settings(self, largest: Array | None = None, **scales: Any) -> str:
         """Return a C initializer of `wrench_compensator_settings`."""
         loop = self.loop(largest, **scales)
         values = {
@@ -100,7 +100,7 @@ class Target(NamedTuple):
         }
         return "".join(f"    {_literal(values[name])}, /* {name} */\n" for name in _SETTINGS)
 
-    def loop(self, largest: Array | None = None, **scales: float) -> Compensator:
+    def loop(self, largest: Array | None = None, **scales: Any) -> Compensator:
         """Return a compensator for this load."""
         largest = self.largest if largest is None else largest
         return Compensator(self.found, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
@@ -131,7 +131,7 @@ def kernel_files(target: Target) -> Files:
 
 def template(name: str) -> str:
     """Return a shipped file."""
-    return resources.files(PACKAGE).joinpath("templates", name).read_text(encoding="utf-8")
+    return resources.files(PACKAGE).joinpath(f"templates/{name}").read_text(encoding="utf-8")
 
 
 def rendered(name: str, **values: Any) -> str:

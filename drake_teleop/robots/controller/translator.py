@@ -272,8 +272,8 @@ class _Function:
         if not isinstance(a, _Scalar) and not isinstance(b, _Scalar):
             return calculate(a, b)
         kinds = {_kind(a), _kind(b)}
-        allowed = {ast.Mod: {"int"}, ast.Div: {"double"}}.get(type(op), kinds)
-        if kinds != allowed:
+        needed = {"%": {"int"}, "/": {"double"}}.get(sign, kinds)
+        if kinds != needed:
             raise self._unsupported(node, f"with {' and '.join(sorted(kinds))}")
         kind = "int" if isinstance(op, ast.cmpop) or kinds == {"int"} else "double"
         return _Scalar(f"({_text(a)} {sign} {_text(b)})", kind)
