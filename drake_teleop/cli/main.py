@@ -449,7 +449,7 @@ def export(
     sign: str,
     **loop: Any,
 ) -> None:
-    """Convert a load into the format of a robot, a model or a controller.
+    """Write a load for a robot, model or controller.
 
     Prints the load of an identification.json in the format, units and frame of a robot, a
     compensation or a model. c99 writes the compensation itself into --out, as code of a controller
