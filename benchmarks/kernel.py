@@ -80,8 +80,9 @@ def readings(count: int, seed: int = 0) -> Array:
     rows = np.hstack([wrench, *motion, down])
     for value in (np.nan, np.inf, 1e7, 401.0):
         rows[rng.integers(0, count, count // 2000), rng.integers(0, 6, count // 2000)] = value
-    for first in rng.integers(0, count, count // 5000):
-        rows[first : first + rng.integers(1, 100), 7] = np.nan
+    # Series about as long as the time after which the low-pass restarts, 51 readings.
+    for k, first in enumerate(rng.integers(0, count, count // 1000)):
+        rows[first : first + 49 + k % 4, 7] = np.nan
     return rows
 
 
