@@ -146,7 +146,12 @@ def every_operation(x, n, y):
             y[i] -= -a[i % 2] / b[0]
         else:
             y[i] = abs(b[1]) * (2.0 - 0.5)
-    y[:1] = 3.0
+    first, second = y[1], y[2]
+    first, second = second, first
+    pair = (first, second)
+    first = 0.0
+    y[1], y[2] = pair
+    y[:1] = 3.0 + first
     return len(y) + n
 
 
@@ -179,7 +184,13 @@ def test_each_supported_operation_has_the_result_of_python(tmp_path):
         assert by_c.tolist() == by_python.tolist()
 
 
-@pytest.mark.parametrize("function", [with_while, with_integer_division])
+@njit(cache=False)
+def with_new_parameter(n):
+    n = 2
+    return n
+
+
+@pytest.mark.parametrize("function", [with_while, with_integer_division, with_new_parameter])
 def test_syntax_that_is_not_supported_is_named(function):
     with pytest.raises(NotImplementedError, match=rf"^{function.__name__}: .*cannot be translated"):
         Translator().add(function, n="int")

@@ -49,10 +49,10 @@ _OPERATORS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
 
 
 class _Scalar:
-    """C expression; `array`: of which parameter it is an element; `variable`: it cannot change."""
+    """C expression; `array`: of which parameter it is an element; `constant`: no later write."""
 
-    def __init__(self, text: str, kind: str, array: str = "", variable: bool = False) -> None:
-        self.text, self.kind, self.array, self.variable = text, kind, array, variable
+    def __init__(self, text: str, kind: str, array: str = "", constant: bool = False) -> None:
+        self.text, self.kind, self.array, self.constant = text, kind, array, constant
 
 
 class _Array:
@@ -103,7 +103,7 @@ class _Function:
         if names != list(parameters):
             raise TypeError(f"{name}: give the types of {names}, not of {list(parameters)}")
         self._values: dict[str, Any] = {
-            each: _Scalar(each, kind, variable=True)
+            each: _Scalar(each, kind, constant=True)
             if isinstance(kind, str)
             else _Array(each, kind, each)
             for each, kind in parameters.items()
@@ -184,14 +184,13 @@ class _Function:
             raise self._unsupported(call, "as the range of a loop")
         *start, stop = [_text(self._value(argument)) for argument in call.args]
         self._locals[name] = "int"
-        self._values[name] = _Scalar(name, "int", variable=True)
+        self._values[name] = _Scalar(name, "int")
         first = start[0] if start else "0"
         self._block(node.body, f"for ({name} = {first}; {name} < {stop}; ++{name})")
 
     def _assign(self, target: ast.expr, value: Any) -> None:
         if isinstance(target, ast.Tuple):
-            if any(isinstance(each, ast.Subscript) for each in target.elts):
-                value = self._stored(value)  # all are calculated before the first is written
+            value = self._stored(value)  # all are calculated before the first is written
             for each, part in zip(target.elts, value, strict=True):
                 self._assign(each, part)
         elif isinstance(target, ast.Subscript):
@@ -205,9 +204,11 @@ class _Function:
                 raise self._unsupported(target, "in a branch or loop as a tuple or array")
             self._values[target.id] = self._stored(value)
         else:
+            if isinstance(self._values.get(target.id), _Scalar) and target.id not in self._locals:
+                raise self._unsupported(target, "as a parameter with a new value")
             if self._locals.setdefault(target.id, _kind(value)) != _kind(value):
                 raise self._unsupported(target, "with two types")
-            self._values[target.id] = _Scalar(target.id, _kind(value), variable=True)
+            self._values[target.id] = _Scalar(target.id, _kind(value))
             self._line(f"{target.id} = {_bare(_text(value))};")
 
     def _write(self, place: Any, value: Any) -> None:
@@ -220,14 +221,14 @@ class _Function:
         self._line(f"for ({k} = 0; {k} < {place.shape[0]}; ++{k}) {place.text}[{k}] = {source};")
 
     def _stored(self, value: Any) -> Any:
-        """Return a value whose expressions are stored in local variables."""
+        """Return a value that no later write changes: its expressions are stored in variables."""
         if isinstance(value, tuple):
             return tuple(map(self._stored, value))
-        if not isinstance(value, _Scalar) or value.variable:
+        if not isinstance(value, _Scalar) or value.constant:
             return value
         name = self._new_local(value.kind)
         self._line(f"{name} = {_bare(value.text)};")
-        return _Scalar(name, value.kind, variable=True)
+        return _Scalar(name, value.kind, constant=True)
 
     def _new_local(self, kind: str) -> str:
         name = f"{kind[0]}{self._temporaries}_"
@@ -301,7 +302,7 @@ class _Function:
     def _call(self, function: Any, values: list[Any]) -> Any:
         if function is len and isinstance(values[0], _Array):
             size = values[0].shape[0]
-            return size if isinstance(size, int) else _Scalar(size, "int", variable=True)
+            return size if isinstance(size, int) else _Scalar(size, "int", constant=True)
         if function in _HELPERS:
             name, kind = _HELPERS[function]
             return _Scalar(f"{name}({', '.join(map(_text, values))})", kind)
