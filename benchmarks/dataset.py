@@ -1,4 +1,4 @@
-"""Datasets: share of planted faults that are named, false findings, residual and contact.
+"""Which share of planted faults of a dataset is named, and how good are wrench and contacts?
 
 Usage: python benchmarks/dataset.py [EPISODES] [FRAMES]: clean episodes per rate, frames for time.
 """

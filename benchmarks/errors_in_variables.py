@@ -1,4 +1,4 @@
-"""What does noise in the measured accelerations do to the load, and who takes it out?
+"""How do noisy accelerations bias the load, and which estimator corrects it?
 
 The tool of the station, turned and moved by sines for 1.5 s at 1 kHz, 200 records with other noise:
 the JR3's of the station, and the level "High" of the UTIAS protocol (Nadeau, Giamou, Kelly, ICRA

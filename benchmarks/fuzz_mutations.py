@@ -1,4 +1,4 @@
-"""Damaged inputs: what `fuzz.py` makes of a good one, by what is in it.
+"""Damaged inputs for `fuzz.py`.
 
 Each function takes a generator of random numbers, the content and another content of the same kind
 to take parts from, and returns new content. The same numbers make the same content. Most changes

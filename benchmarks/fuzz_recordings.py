@@ -1,4 +1,4 @@
-"""What `fuzz.py` feeds where a user's names, files or recordings are at stake.
+"""Inputs of `fuzz.py` for names, included files and recordings.
 
 Each case is JSON. A case is good if the result has the property that the target names, or if a
 DrakeTeleopError of one line is raised and nothing remains.

@@ -1,4 +1,4 @@
-"""How soon is a grasped object noticed and known, and what is mistaken for one?
+"""How soon is a grasped object noticed and identified, and what causes false alarms?
 
 The tool of the station, known from 10 s of motion, then moved by sines at 1 kHz for 10 s with other
 noise: with the JR3's noise of force, torque and measured accelerations, and with an ideal sensor.

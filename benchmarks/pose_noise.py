@@ -1,4 +1,4 @@
-"""What does noise of the poses cost, and whose intervals are honest?
+"""How does noise of the poses affect the load, and whose intervals are correct?
 
 Records of 60 s of a six-joint arm with the measures of a UR5e: F, Fourier series of 6 s period and
 5 harmonics; P, pick and place, minimum-jerk moves of 0.9 to 1.8 s with rests. A load of 1.7 kg, the

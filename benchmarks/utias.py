@@ -1,4 +1,4 @@
-"""How well does each batch estimator do on the UTIAS workshop tools?
+"""How accurate is each batch estimator for the UTIAS workshop tools?
 
 The protocol of Nadeau, Giamou, Kelly (ICRA 2023): ten tools, simulated stop-and-go motion of 1000
 samples at 100 Hz, white noise of three levels on acceleration, angular acceleration and wrench,

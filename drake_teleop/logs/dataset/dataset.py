@@ -136,7 +136,7 @@ def _streams(dataset: Dataset, description: Path | None) -> dict[str, Any]:
     data = read_yaml(description)
     if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
         raise DrakeTeleopError(
-            "has no wrench", where=str(description), remedy="see docs/logs.md for an example"
+            "has no wrench", where=str(description), remedy="see docs/log-description.md"
         )
     for name in _STREAMS:
         if isinstance(data.get(name), dict):

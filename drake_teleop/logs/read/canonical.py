@@ -157,7 +157,7 @@ def write_log(log: Log, path: str | Path) -> None:
 
 
 def describe_canonical(path: Path, table: Table) -> Description:
-    """Return the description of a canonical table (columns `t`, `f_x` ... of docs/logs.md).
+    """Return the description of a canonical table (columns `t`, `f_x` ...).
 
     Rows are static poses if `t` is absent, or if they are slower than 5 Hz and gravity turns by
     more than 10 deg in a fifth of the steps.
@@ -173,7 +173,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
         raise DrakeTeleopError(
             "is not a canonical log: it has none of the columns t, f_x ... tau_z",
             where=str(path),
-            remedy="describe it in a YAML file (docs/logs.md); `drake-teleop inspect` drafts one",
+            remedy="describe it in a YAML file; `drake-teleop inspect` drafts one",
         )
     table.numbers(WRENCH, 6, str(path))
     fields: dict[str, dict[str, Any]] = {

@@ -1,4 +1,4 @@
-"""Log descriptions: YAML files that specify files, columns, units and frames (docs/logs.md).
+"""Log descriptions: YAML files of files, columns, units and frames (docs/log-description.md).
 
 A number x of a file becomes a quantity in S by
 
@@ -45,7 +45,7 @@ from drake_teleop.logs.read.description_fields import (
     Weight,
 )
 
-NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
+NO_YAML = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
 
 
@@ -364,7 +364,7 @@ def load_description(path: str | Path) -> Description:
     data = read_yaml(path)
     if not isinstance(data, dict):
         raise DrakeTeleopError(
-            "holds no fields", where=str(path), remedy="see docs/logs.md for an example"
+            "holds no fields", where=str(path), remedy="see docs/log-description.md"
         )
     try:
         description = Description.model_validate(data)
@@ -390,7 +390,7 @@ def _validation_error(error: ValidationError, path: Path) -> DrakeTeleopError:
     location = [part for part in outer if _is_field(part)]
     location += [last] if unknown or _is_field(last) else []
     where = f"{path}:{'.'.join(map(str, location))}" if location else str(path)
-    remedy = "see docs/logs.md for the fields and their units"
+    remedy = "docs/log-description.md lists fields and units"
     if unknown:
         known = list(_fields_at(location[:-1]))
         near = difflib.get_close_matches(str(location[-1]), known, n=1)
