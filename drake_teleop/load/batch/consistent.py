@@ -70,7 +70,7 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def row(self) -> Array:
-        """Return coefficients (10,): coefficients @ phi >= 0 if the ellipsoid can contain the mass."""
+        """Return coefficients (10,); their product with a phi of a mass inside is not negative."""
         A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
             raise DrakeTeleopError("is not positive definite", where="ellipsoid.matrix")
