@@ -3,7 +3,6 @@
 A comment above `FIGURES` has the source of each number. Grippers and buttons are not modelled.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import copy
 import dataclasses
 import math
