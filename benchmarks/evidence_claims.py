@@ -183,7 +183,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
     Claim(
         *(PAPER, "Without noise it leaves rounding"),
         *("ideal sensor, true load", "theory.md", "reproduce"),
-        *(lambda f: f["free_force"]["residual_ideal_max_N"], "N", 0.0, 1e-9),
+        *(lambda f: f["ideal"]["residual_max_N"], "N", 0.0, 1e-9),
     ),
     Claim(
         *(PAPER, "A contact is found that no threshold on the measured force finds (Fig. 8)"),
