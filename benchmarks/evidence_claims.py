@@ -55,7 +55,9 @@ RUNS = {
         "benchmarks/stations.py --devices phantom_premium_15,geomagic_touch,omega_6,leader"
         " --json FILE"
     ),
-    "tuning": "benchmarks/tuning.py --stations 3 --draws 100 --station-draws 6 --json FILE",
+    "tuning": (
+        "benchmarks/tuning.py --stations 2 --draws 60 --station-draws 4 --jobs 1 --json FILE"
+    ),
 }
 """Name of a record -> its command; FILE is where the figures go, FOLDER where summary.json does."""
 
@@ -357,6 +359,35 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(PUBLISHED, "and not its completion time"),
         *("the same; time over that without", "delay.md", "literature"),
         *(lambda f: f["peg"]["time_ratio"], "", 0.0, 1.1),
+    ),
+    # Tuning
+    Claim(
+        *(ANALYSIS, "A tuned station holds every draw in the stated set"),
+        *("2 random stations, 60 draws each, one axis: share of stations", "choose.md", "tuning"),
+        *(lambda f: f["all_inside"] / f["tuned"], "", 1.0),
+    ),
+    Claim(
+        *(ANALYSIS, "and in the whole station"),
+        *("the same, 4 draws each", "choose.md", "tuning"),
+        *(lambda f: f["all_station_inside"] / f["tuned"], "", 1.0),
+    ),
+    Claim(
+        *(
+            ANALYSIS,
+            "It fails where γ times stiffness is up to 20 % beyond margin and stiffest wall",
+        ),
+        *("the same, one axis: share of stations with such draws", "choose.md", "tuning"),
+        *(lambda f: f["outside_fails"] / f["tuned"], "", 0.9),
+    ),
+    Claim(
+        *(ANALYSIS, "It detects smaller contact forces than the advice, or the advice fails"),
+        *("the same, against `ledger` with γ = 1 and σ = 0: share of stations", "choose.md"),
+        *("tuning", lambda f: f["better_than_advice"] / f["tuned"], "", 0.75),
+    ),
+    Claim(
+        *(ANALYSIS, "The search takes three minutes on two cores"),
+        *("the same, CPU time of the longest", "choose.md", "tuning"),
+        *(lambda f: max(row["cpu_s"] for row in f["rows"] if "cpu_s" in row), "s", 0.0, 360.0),
     ),
     # Contact
     Claim(
