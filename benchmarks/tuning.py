@@ -85,7 +85,7 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
 
     def rests(grip: str, wall: float, gamma: float, number: int) -> bool:
-        return search._one_axis(axis, settings, gamma, grip, wall, number) >= 0.9
+        return search.share_in_one_axis(axis, settings, gamma, grip, wall, number) >= 0.9
 
     low, high = np.log(stated.walls)
     inside, outside = [], []

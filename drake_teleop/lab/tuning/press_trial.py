@@ -185,7 +185,9 @@ class GammaSearch:
 
         def stable(log_gamma: float) -> float:
             gamma = float(np.exp(log_gamma))
-            found = [self._one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners]
+            found = [
+                self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
+            ]
             shares[gamma] = min(found)
             return 1.0 if shares[gamma] >= MIN_SHARE else -1.0
 
@@ -211,7 +213,7 @@ class GammaSearch:
             stable &= unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
         return float(_LINEAR_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 
-    def _one_axis(
+    def share_in_one_axis(
         self, axis: Axis, settings: Settings, gamma: float, grip: str, wall: float, seed: int
     ) -> float:
         """Return the rendered share of the contact force; 0 if the axis does not come to rest."""
