@@ -91,8 +91,10 @@ WRITING = {
     ("common/compiled.py", ".touch"), ("common/compiled.py", ".write_bytes"),
     ("common/compiled.py", "os.replace"),
     ("lab/identified_load.py", 'open("wb'), ("lab/identified_load.py", "np.savez"),
-    ("station/slave/meshes.py", ".write_text"), ("station/slave/mjcf_meshes.py", ".write_text"),
-    ("station/slave/model_files.py", ".write_text"), ("station/slave/sdf_repair.py", ".write_text"),
+    ("station/slave/model/meshes.py", ".write_text"),
+    ("station/slave/model/mjcf_meshes.py", ".write_text"),
+    ("station/slave/model/sdf_repair.py", ".write_text"),
+    ("station/slave/model_files.py", ".write_text"),
     # A line for each change of a drive's inputs, which is to outlive the process.
     ("live/record.py", 'open("x'),
     # To memory, and then into the file with the wrenches that have come before.

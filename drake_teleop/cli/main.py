@@ -544,6 +544,40 @@ def compare_passivity(
 
 
 @cli.command()
+@click.argument("scenario", type=option.SCENARIO)
+@click.option("--hands", type=option.Names(), help="Grips.  [default: light,firm]")
+@click.option("--walls", type=option.Names(), help="Stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option("--network", help="Preset of the network.  [default: of the scenario]")
+@click.option(
+    "--task",
+    type=click.Choice(["press", "touch", "insert"]),
+    default="press",
+    show_default=True,
+    help="Task; it sets the required margin.",
+)
+@option.jobs
+@option.out("tune")
+@option.quiet
+def tune(
+    scenario: str,
+    out: Path,
+    hands: tuple[str, ...] | None,
+    walls: tuple[str, ...] | None,
+    **options: Any,
+) -> None:
+    """Choose passivity method and force scales for a station.
+
+    SCENARIO is a shipped name or a YAML file. Finds the settings with the smallest detectable
+    contact force that are stable for these grips and walls. Writes tuned.yaml and report.html.
+    After an interruption the same command continues.
+    """
+    from drake_teleop.lab.tuning.tune import tune as tune_station
+
+    stiffnesses = [option.POSITIVE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
+    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffnesses, **options)
+
+
+@cli.command()
 @click.argument("study", type=option.STUDY)
 @option.jobs
 @option.cluster

@@ -255,7 +255,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
     `residual` (N, 6) is the wrench without that of the load [N, N m].
     """
     offsets = narrowest_half(residual)[1]
-    agrees = np.zeros(len(residual), bool)
+    agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):
         distance = np.abs(residual - offsets)
         # 1.4826 * median |x| is the standard deviation of a normal x.

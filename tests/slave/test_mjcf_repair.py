@@ -324,7 +324,7 @@ BESIDE = (
         (JOINT.replace("/>", ' damping="-0.01"/>'), "", "", "no damping, instead of .* of j"),
         (JOINT, '<geom type="mesh" mesh="none"/>', "", r"not found \(.*shapes are missing of b"),
         (JOINT, '<body name="flat"><inertial pos="0 0 0" mass="1" diaginertia="1 1 2.5"/></body>',
-         "", r"check it: inertia replaced by the nearest .* of link flat \(6.7 %\)"),
+         "", r"warning: inertia replaced by the nearest .* of link flat \(6.67 %\)"),
         (JOINT, '<body name="p"><inertial pos="0 0 0" mass="0" diaginertia="1 1 1"/></body>', "",
          "an inertia without a mass left out of p"),
         (JOINT, '<geom type="hfield" hfield="h"/>', "", "hfield are not supported; .* of b"),

@@ -359,8 +359,8 @@ def _pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
         orientation = {"columns": found[form].columns, "form": form}
     elif euler := next((name for name in found if name in _EULER.values()), None):
         orientation = _group(table, "euler", found[euler]) | {"form": "euler", "axes": euler}
-    elif (form := "rotation_vector") in found:
-        orientation = _group(table, form, found[form]) | {"form": form}
+    elif (name := "rotation_vector") in found:
+        orientation = _group(table, name, found[name]) | {"form": name}
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}

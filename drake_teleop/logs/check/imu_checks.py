@@ -81,7 +81,8 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
 
 def _angular_accelerations(log: Log) -> tuple[Array, Array]:
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    return tuple(low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate))
+    given = low_pass(log.angular_acceleration, log.dt, _BAND_HZ)
+    return given, low_pass(rate, log.dt, _BAND_HZ)
 
 
 def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:

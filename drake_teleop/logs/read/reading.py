@@ -270,8 +270,7 @@ class _Reader:
     def _imu(self, stream: Imu, pose: Stream | None) -> Stream:
         table = self._table(stream)
         clock = self._clock("imu", stream, table)
-        raw_t = clock.t
-        t = uniform_times(raw_t)
+        raw_t, t = clock.t, uniform_times(clock.t)
         dt = spacing(t)
 
         def vectors(field: str, sign: float = 1.0) -> Array | None:
@@ -279,9 +278,8 @@ class _Reader:
             if quantity is None:
                 return None
             values = self._vectors("imu", field, quantity, table, clock.total, sign)
-            return self._to_S(
-                "imu", stream.frame, resample(t, raw_t, clock.select(values)), t, pose
-            )
+            values = resample(t, raw_t, clock.select(values))
+            return self._to_S("imu", stream.frame, values, t, pose)
 
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
@@ -391,8 +389,8 @@ class _Reader:
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
         if len(found_gaps):
-            half_window = self._half_window(float(np.median(np.diff(t))))
-            self._gaps.append(found_gaps + np.array([-half_window, half_window]))
+            half = self._half_window(float(np.median(np.diff(t))))
+            self._gaps.append(found_gaps + np.array([-half, half]))
         return clock
 
     def _half_window(self, dt: float) -> float:

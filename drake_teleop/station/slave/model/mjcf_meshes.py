@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 import re
-from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.mjcf_elements import Attributes, Mjcf
+from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
+from drake_teleop.station.slave.model.triangles import (
+    Triangles,
+    checked_triangles,
+    convex_hull,
+    obj_text,
+    read_triangles,
+)
 
-# Triangle of a binary STL file.
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 _NOT_FOUND = "meshes were not found (--package-path, slave.package_paths)"
 _OUTSIDE = (
     "{kind} files in {folder} are outside the model's folder and its packages"
     " (name their folder: --package-path, slave.package_paths)"
 )
 _UNREADABLE = "meshes cannot be read (convert them to .obj or .stl)"
-_Array = NDArray[np.float64]
-
-
-class Triangles(NamedTuple):
-    """Triangle mesh: vertices (n, 3) [m] and rows (m, 3) of vertex indices."""
-
-    vertices: _Array
-    faces: NDArray[np.intp]
 
 
 class Mesh:
@@ -58,14 +52,10 @@ class Mesh:
             ValueError: if the file is damaged or of another kind.
         """
         if self._triangles is None:
-            try:
-                vertices, faces = self._read()
-            except (KeyError, IndexError, OSError) as error:  # another kind, or too short
-                raise ValueError(str(error)) from None
-            if not faces.size or faces.min() < 0 or faces.max() >= len(vertices):
-                raise ValueError("no triangles")
-            if not np.isfinite(vertices).all():
-                raise ValueError("vertices that are not finite")
+            if self.file is not None:
+                vertices, faces = read_triangles(self.file)
+            else:
+                vertices, faces = checked_triangles(_read_inline(self._attributes))
             moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
             if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
                 faces = faces[:, ::-1]
@@ -85,17 +75,8 @@ class Mesh:
     def _write(self, triangles: Triangles, folder: Path) -> Path:
         number = len(list(folder.iterdir()))
         path = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)[:40]}.obj"
-        vertices, faces = triangles.vertices, triangles.faces + 1
-        text = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel())
-        path.write_text(text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel()))
+        path.write_text(obj_text(triangles))
         return path
-
-    def _read(self) -> Triangles:
-        if self.file is None:
-            return _read_inline(self._attributes)
-        data = self.file.read_bytes()
-        suffix = self.file.suffix.lower()
-        return {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}[suffix](data)
 
 
 class MeshLibrary:
@@ -120,7 +101,8 @@ class MeshLibrary:
             try:
                 mesh.triangles()
             except ValueError:
-                self._meshes[name] = mesh = f"{_suffix(mesh.file)}{_UNREADABLE}"
+                suffix = f"{mesh.file.suffix} " if mesh.file is not None else ""
+                self._meshes[name] = mesh = f"{suffix}{_UNREADABLE}"
         return mesh
 
     def _find(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
@@ -149,73 +131,8 @@ class MeshLibrary:
         return file, ""
 
 
-def _suffix(file: Path | None) -> str:
-    return f"{file.suffix} " if file is not None else ""
-
-
-def _merged(corners: _Array) -> Triangles:
-    """Return triangles (m, 3, 3) with each vertex once."""
-    points = corners.reshape(-1, 3).astype(float)
-    order = np.lexsort(points.T)
-    is_new = np.ones(len(points), bool)
-    is_new[1:] = (np.diff(points[order], axis=0) != 0.0).any(axis=1)
-    number = np.empty(len(points), np.intp)
-    number[order] = np.cumsum(is_new) - 1
-    return Triangles(points[order][is_new], number.reshape(-1, 3))
-
-
-def _read_stl(data: bytes) -> Triangles:
-    count = int.from_bytes(data[80:84], "little")
-    if len(data) == 84 + count * _TRIANGLE.itemsize:
-        return _merged(np.frombuffer(data, _TRIANGLE, count, 84)["corners"])
-    lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
-    return _merged(np.array(lines, dtype=float).reshape(-1, 3))
-
-
-def _read_obj(data: bytes) -> Triangles:
-    vertices, faces = list[list[float]](), list[tuple[int, int, int]]()
-    for line in data.splitlines():
-        words = line.split()
-        if words[:1] == [b"v"]:
-            vertices.append([float(word) for word in words[1:4]])
-        elif words[:1] == [b"f"]:
-            corners = [int(word.split(b"/")[0]) for word in words[1:]]
-            corners = [k - 1 if k > 0 else len(vertices) + k for k in corners]
-            faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
-    return Triangles(np.array(vertices).reshape(-1, 3), np.array(faces, np.intp).reshape(-1, 3))
-
-
-def _read_msh(data: bytes) -> Triangles:
-    """Read MuJoCo's binary format: four counts, then vertices, normals, texture and faces."""
-    n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
-    if min(n, normals, texture, count) < 0:
-        raise ValueError("a negative count")
-    vertices = np.frombuffer(data, "<f4", 3 * n, 16).reshape(-1, 3)
-    start = 16 + 4 * (3 * n + 3 * normals + 2 * texture)
-    faces = np.frombuffer(data, "<i4", 3 * count, start).reshape(-1, 3)
-    return Triangles(vertices.astype(float), faces.astype(np.intp))
-
-
 def _read_inline(attributes: Attributes) -> Triangles:
     vertices = np.array(attributes["vertex"].split(), dtype=float).reshape(-1, 3)
     if "face" not in attributes:
         return convex_hull(vertices)
     return Triangles(vertices, np.array(attributes["face"].split(), np.intp).reshape(-1, 3))
-
-
-def convex_hull(vertices: _Array) -> Triangles:
-    """Return the convex hull with triangles that face outwards.
-
-    Raises:
-        ValueError: if the points have no volume.
-    """
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        hull = ConvexHull(vertices)
-    except QhullError as error:
-        raise ValueError("no volume") from error
-    faces = hull.simplices.astype(np.intp)
-    inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
-    faces[inwards] = faces[inwards, ::-1]
-    return _merged(vertices[faces])

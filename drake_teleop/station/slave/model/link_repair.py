@@ -1,4 +1,4 @@
-"""Repair of masses and inertias of links in URDF and SDF."""
+"""Repair of masses and inertias of links."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.station.slave.model_numbers import MAX_VALUE, number
-from drake_teleop.station.slave.model_tree import WORLD
-from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
-from drake_teleop.station.slave.repair_report import RepairReport
+from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.model.model_tree import WORLD
+from drake_teleop.station.slave.model.repair_report import RepairReport
 
 _ENTRIES = {
     "ixx": (0, 0),
@@ -23,6 +22,8 @@ _ENTRIES = {
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _ROUNDING, _SUSPICIOUS = 1e-3, 0.05
 _NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
+# Margin of corrected moments against rounding in Drake's check, relative to the largest one.
+_MARGIN = 1e-9
 
 
 def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
@@ -58,7 +59,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     else:
         if no_mass and inertia.any():
             report.repair("an inertia without a mass left out of", name)
-        nearest = np.zeros((3, 3)) if no_mass else _possible(inertia, name, report)
+        nearest = np.zeros((3, 3)) if no_mass else possible_inertia(inertia, name, report)
         link.remove(inertial)
         _write(link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf)
     return not at_rest and not inertia.any()
@@ -80,7 +81,10 @@ def _inertia(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
     return tensor
 
 
-def _possible(inertia: NDArray[np.float64], name: str, report: RepairReport) -> NDArray[np.float64]:
+def possible_inertia(
+    inertia: NDArray[np.float64], name: str, report: RepairReport
+) -> NDArray[np.float64]:
+    """Return the nearest inertia tensor (3, 3) that the link `name` can have; state a change."""
     nearest, change = nearest_possible_inertia(inertia)
     if 0.0 < change <= _ROUNDING or 0.0 < change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
         report.state("an inertia corrected for rounding of", name)
@@ -111,3 +115,25 @@ def _write(
     else:
         SubElement(inertial, "mass", value=f"{mass:.17g}")
         SubElement(inertial, "inertia", entries)
+
+
+def nearest_possible_inertia(
+    inertia: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Return the nearest possible tensor (3, 3) about the centre of mass, and its distance.
+
+    Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal
+    parts, which is nearest in the Frobenius norm. The distance is the largest change of a
+    principal moment, relative to the largest moment; it is 0 for a possible tensor, which is
+    returned unchanged.
+    """
+    given, axes = np.linalg.eigh((inertia + inertia.T) / 2.0)
+    moments = np.maximum(given, 0.0)
+    deficit = moments[2] - moments[1] - moments[0]
+    largest = float(np.abs(given).max())
+    if given[0] >= 0.0 and deficit <= 0.0:
+        return inertia, 0.0
+    if deficit > 0.0:
+        moments += (deficit + _MARGIN * largest) / 3.0 * np.array([1.0, 1.0, -1.0])
+    distance = float(np.abs(moments - given).max()) / largest
+    return (axes * moments) @ axes.T, distance

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import re
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Capsule, Mesh
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
-from drake_teleop.station.slave.model_numbers import MAX_VALUE, number
-from drake_teleop.station.slave.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
 _READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
-# Triangle of a binary STL file.
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 # Numbers of each dimension of a shape.
 _DIMENSIONS = {
     "box": {"size": 3},
@@ -140,51 +138,20 @@ def _is_readable(path: Path, _: int) -> bool:
                 return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_CORNERS
         except RuntimeError:
             return False
-    corners = _stl_corners(path) if path.suffix.lower() == ".stl" else _obj_corners(path)
-    return len(corners) >= _MIN_CORNERS and bool(np.isfinite(corners).all())
-
-
-def _obj_corners(path: Path) -> NDArray[np.float64]:
-    """Return the corners (n, 3) of an OBJ file; none if a face names another one."""
-    data = path.read_bytes()
-    corners = _numbers(re.findall(rb"^\s*v\s+(\S+)\s+(\S+)\s+(\S+)", data, re.M))
-    faces = re.findall(rb"^\s*f\s+(.*)$", data, re.M)
-    used = [int(word) for face in faces for word in re.findall(rb"(?:^|\s)(-?\d+)", face)]
-    valid = used and min(map(abs, used)) > 0 and max(map(abs, used)) <= len(corners)
-    return corners if valid else np.empty((0, 3))
-
-
-def _stl_corners(path: Path) -> NDArray[np.float64]:
-    data = path.read_bytes()
-    count = int.from_bytes(data[80:84], "little")
-    if len(data) == 84 + count * _TRIANGLE.itemsize:
-        corners = np.frombuffer(data, _TRIANGLE, count, 84)["corners"]
-        return corners.reshape(-1, 3).astype(np.float64)
-    return _numbers(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data))
-
-
-def _numbers(rows: list[tuple[bytes, ...]]) -> NDArray[np.float64]:
     try:
-        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        read_triangles(path)
     except ValueError:
-        return np.empty((0, 3))
+        return False
+    return True
 
 
 @lru_cache(maxsize=1024)
 def _obj_of_stl(path: Path, _: int) -> str:
     """Return the convex hull of an STL file, or its triangles if flat, as text of an OBJ file."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    points = _stl_corners(path)
-    try:
-        hull = ConvexHull(points)
-        faces = np.searchsorted(hull.vertices, hull.simplices, sorter=np.argsort(hull.vertices))
-        corners = points[np.sort(hull.vertices)]
-    except QhullError:
-        corners, faces = points, np.arange(len(points)).reshape(-1, 3)
-    rows = ["v {:.9g} {:.9g} {:.9g}".format(*corner) for corner in corners]
-    rows += ["f {} {} {}".format(*face) for face in faces + 1]
-    return "\n".join(rows) + "\n"
+    triangles = read_triangles(path)
+    with suppress(ValueError):
+        triangles = convex_hull(triangles.vertices)
+    return obj_text(triangles)
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:

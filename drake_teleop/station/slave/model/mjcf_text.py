@@ -9,10 +9,10 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 import numpy as np
 from pydrake.math import RigidTransform
 
-from drake_teleop.station.slave.mjcf_bodies import Body, Geom, Joint
-from drake_teleop.station.slave.mjcf_elements import Mjcf
-from drake_teleop.station.slave.mjcf_meshes import Mesh
-from drake_teleop.station.slave.urdf_repair import Purpose
+from drake_teleop.station.slave.model.mjcf_bodies import Body, Geom, Joint
+from drake_teleop.station.slave.model.mjcf_elements import Mjcf
+from drake_teleop.station.slave.model.mjcf_meshes import Mesh
+from drake_teleop.station.slave.model.urdf_repair import Purpose
 
 
 class MjcfText:

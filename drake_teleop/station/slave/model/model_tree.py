@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
-from drake_teleop.station.slave.repair_report import RepairReport
+from drake_teleop.station.slave.model.repair_report import RepairReport
 
 WORLD = "world"  # name in URDF and SDF
 JOINT_TAGS = ("joint", "drake:joint")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from xml.etree.ElementTree import Element
 
-from drake_teleop.station.slave.model_tree import WORLD, joint_end
-from drake_teleop.station.slave.repair_report import RepairReport
+from drake_teleop.station.slave.model.model_tree import WORLD, joint_end
+from drake_teleop.station.slave.model.repair_report import RepairReport
 
 MAX_VALUE = 1e6  # largest length, mass or inertia, SI units; limits may be larger
 _LIST_ATTRIBUTES = ("xyz", "rpy", "rgba", "size", "scale")

@@ -12,26 +12,22 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from drake_teleop.station.slave.mjcf_actuators import effort_limits
-from drake_teleop.station.slave.mjcf_bodies import Body, BodyReader, touches
-from drake_teleop.station.slave.mjcf_chain import (
+from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia, possible_inertia
+from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, touches
+from drake_teleop.station.slave.model.mjcf_chain import (
     check_couplings,
+    effort_limits,
     hold_joints,
     read_all,
     read_arm,
     report_couplings,
 )
-from drake_teleop.station.slave.mjcf_elements import Mjcf
-from drake_teleop.station.slave.mjcf_masses import NO_MASS
-from drake_teleop.station.slave.mjcf_text import MjcfText
-from drake_teleop.station.slave.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
-from drake_teleop.station.slave.repair_report import RepairReport, listed
-from drake_teleop.station.slave.repaired_model import RepairedModel
-from drake_teleop.station.slave.urdf_repair import Purpose
-
-# Relative changes of an inertia: rounding below the first, suspicious above the second.
-_ROUNDING, _SUSPICIOUS = 1e-3, 0.05
+from drake_teleop.station.slave.model.mjcf_elements import Mjcf
+from drake_teleop.station.slave.model.mjcf_masses import NO_MASS
+from drake_teleop.station.slave.model.mjcf_text import MjcfText
+from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, listed
+from drake_teleop.station.slave.model.urdf_repair import Purpose
 
 
 def repair_mjcf(
@@ -120,13 +116,11 @@ def _set_mass(
         body.inertial = NO_MASS
         return
     properties = properties.scaled(factor * properties.mass)
-    inertia, change = nearest_possible_inertia(properties.inertia)
-    if is_moved and 0.0 < change <= _ROUNDING:
-        report.state("an inertia corrected for rounding of", body.name)
-    elif is_moved and change > _ROUNDING:
-        what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
-        warning = "check it: " if change > _SUSPICIOUS else ""
-        report.repair(f"{warning}{what}", f"{body.name} ({100 * change:.2g} %)")
+    inertia = (
+        possible_inertia(properties.inertia, body.name, report)
+        if is_moved
+        else nearest_possible_inertia(properties.inertia)[0]
+    )
     body.inertial = properties._replace(inertia=inertia)
 
 

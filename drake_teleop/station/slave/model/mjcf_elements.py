@@ -13,8 +13,8 @@ from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.repair_report import RepairReport
+from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.repair_report import RepairReport
 
 _MAX_DEPTH = 150  # largest depth of nested elements
 MIN_LENGTH = 1e-9

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_teleop.station.slave.mjcf_meshes import Mesh, convex_hull
+from drake_teleop.station.slave.model.mjcf_meshes import Mesh
+from drake_teleop.station.slave.model.triangles import convex_hull
 
 _Array = NDArray[np.float64]
 

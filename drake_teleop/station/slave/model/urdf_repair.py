@@ -11,16 +11,16 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from drake_teleop.station.slave.link_repair import repair_inertia
-from drake_teleop.station.slave.meshes import remove_unusable_shapes
-from drake_teleop.station.slave.model_numbers import (
+from drake_teleop.station.slave.model.link_repair import repair_inertia
+from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
+from drake_teleop.station.slave.model.model_numbers import (
     check_joint,
     check_quantities,
     number,
     separate_by_blanks,
 )
-from drake_teleop.station.slave.model_references import ModelFiles
-from drake_teleop.station.slave.model_tree import (
+from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_tree import (
     WORLD,
     ModelTree,
     fix_joint,
@@ -29,8 +29,7 @@ from drake_teleop.station.slave.model_tree import (
     link_of_frame,
     reduce_to_chain,
 )
-from drake_teleop.station.slave.repair_report import RepairReport, listed
-from drake_teleop.station.slave.repaired_model import RepairedModel
+from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, listed
 
 _URDF_PARTS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
 _URDF_PARTS |= {"drake:collision_filter_group"}

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_teleop.station.slave.mjcf_elements import MIN_LENGTH, Attributes, Mjcf, rotation_to
-from drake_teleop.station.slave.mjcf_masses import (
+from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
+from drake_teleop.station.slave.model.mjcf_elements import MIN_LENGTH, Attributes, Mjcf, rotation_to
+from drake_teleop.station.slave.model.mjcf_masses import (
     NO_MASS,
     MassProperties,
     combined,
@@ -20,8 +21,7 @@ from drake_teleop.station.slave.mjcf_masses import (
     mesh_properties,
     primitive,
 )
-from drake_teleop.station.slave.mjcf_meshes import Mesh, MeshLibrary
-from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
+from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
 
 # Elements that generate bodies or joints.
 _GENERATORS = ("replicate", "attach", "composite", "flexcomp")

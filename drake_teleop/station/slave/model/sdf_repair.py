@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
-from drake_teleop.station.slave.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.model_tree import link_of_frame
-from drake_teleop.station.slave.repair_report import RepairReport
-from drake_teleop.station.slave.repaired_model import RepairedModel
-from drake_teleop.station.slave.urdf_repair import Purpose, finish, repair_scope, repair_urdf
+from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.model_tree import link_of_frame
+from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport
+from drake_teleop.station.slave.model.urdf_repair import Purpose, finish, repair_scope, repair_urdf
 
 _MODEL_CONFIG, _URDF, _SDF = "model.config", ".urdf", ".sdf"
 _URIS = ".//include/uri"
