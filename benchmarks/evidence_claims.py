@@ -24,6 +24,7 @@ RUNS = {
     "foreign_analysis": "benchmarks/foreign_analysis.py --json FILE",
     "frequency_response": "benchmarks/frequency_response.py --json FILE",
     "identification": "benchmarks/identification.py --json FILE",
+    "kernel": "benchmarks/kernel.py --json FILE",
     "intervals": "benchmarks/intervals.py --json FILE",
     "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
     "ledger_in_station": "benchmarks/ledger_in_station.py --json FILE",
@@ -639,6 +640,33 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(LIVE, "Numbers in which `compensate replay:LOG` differs from `eliminate --causal`"),
         *("all logs of the repository, in chunks of any size", "robot.md", "replayed"),
         *(lambda f: f["different"], "numbers", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "Readings in which the exported C code differs from `compensate` in any bit"),
+        "10⁶, some invalid; gcc, clang, gcc for aarch64 in qemu, -O0 to -O3 and -Os, without fused"
+        " multiply-add; WebAssembly in node",
+        *("controller.md", "kernel"),
+        lambda f: sum(v for k, v in f.items() if k.endswith(".different") and "fused" not in k),
+        *("readings", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "Size of its object file"),
+        *("gcc, x86-64, -Os; code and constants", "controller.md", "kernel"),
+        *(lambda f: f["gcc.-Os.bytes"], "bytes", 0.0, 4096.0),
+    ),
+    Claim(
+        *(LIVE, "Its time for a reading over that of the compiled Python kernel"),
+        *("gcc, x86-64, -O2; both in a compiled loop", "controller.md", "kernel"),
+        *(lambda f: f["gcc.-O2.ns"] / f["python.ns"], "times", 0.0, 1.5),
+    ),
+    InTests(
+        *(LIVE, "FMUs of FMI 2.0 and 3.0 have the bits of `compensate`, one step later"),
+        *("FMPy validates and simulates both", "controller.md", "tests/robots/test_fmu.py"),
+    ),
+    InTests(
+        *(LIVE, "The page of the site has the numbers of `eliminate --causal`"),
+        *("the sample log, headless Chromium", "browser.md"),
+        "tests/robots/test_browser_kernel.py",
     ),
     Claim(
         *(LIVE, "Residual force in NTNU's vibrations, live, without its mean"),

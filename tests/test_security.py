@@ -53,6 +53,8 @@ EXPLAINED = {
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),
     ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop
+    # The system's C compiler, with sources of this package and numbers.
+    ("robots/controller/fmu.py", "subprocess"),
     # Likewise, with the addresses of a device and of this process.
     ("live/device_link.py", "subprocess"),
 }  # fmt: skip
@@ -99,6 +101,8 @@ WRITING = {
     ("robots/lines.py", ".write_csv"),
     # Under another name, until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
+    ("robots/controller/fmu.py", ".write_text"),  # a temporary folder, for the compiler
+    ("robots/controller/export.py", ".write_bytes"),  # by `whole_file`
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
     # Files in the output folder, by `whole_file`; and a dataset that the package generates.
