@@ -33,6 +33,7 @@ TESTED = {
     "README.md": "tests/test_readme.py",
     "analysis.md": "tests/test_analysis_doc.py",
     "blocks.md": "tests/blocks/test_plain_blocks.py",
+    "cluster.md": "tests/studies/test_study.py",
     "delay.md": "tests/test_delay_doc.py",
     "delay-figures.md": "tests/test_delay_doc.py",
     "detection.md": "tests/test_detection_doc.py",

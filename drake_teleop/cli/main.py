@@ -518,6 +518,8 @@ def compare_passivity(
 @click.argument("study", type=option.STUDY)
 @option.jobs
 @option.cluster
+@click.option("--shard", metavar="K/N", help="Run part K of N, e.g. 3/8; see docs/cluster.md.")
+@click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
 @option.yes
 @option.out("study")
 @option.quiet
