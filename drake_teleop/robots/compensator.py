@@ -113,11 +113,8 @@ class Compensator:
         detector: Detector | None = None,
     ) -> None:
         self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
-        weight = sigma if sigma_weight is None else sigma_weight
-        inertia = sigma if sigma_inertia is None else sigma_inertia
-        if weight != inertia and load.weight_removed:
-            raise removed_weight("load")
-        self._scales, self._dt = np.array([inertia, inertia, gamma, weight - inertia], float), dt
+        self._weight_removed, self._dt = load.weight_removed, dt
+        self.set_scales(sigma, gamma, sigma_weight, sigma_inertia)
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
         self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
@@ -142,6 +139,16 @@ class Compensator:
         clip(self._eliminate(np.zeros(VALUES), np.zeros(3)), self._range)
         self._reset_filters()
         self.good_count = 0
+
+    def set_scales(
+        self, sigma: float, gamma: float, sigma_weight: float | None, sigma_inertia: float | None
+    ) -> None:
+        """Set the scales from the next reading on; raise DrakeTeleopError if they are unusable."""
+        weight = sigma if sigma_weight is None else sigma_weight
+        inertia = sigma if sigma_inertia is None else sigma_inertia
+        if weight != inertia and self._weight_removed:
+            raise removed_weight("load")
+        self._scales = np.array([inertia, inertia, gamma, weight - inertia], float)
 
     def step(self, reading: Reading, now: float) -> Compensated:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
