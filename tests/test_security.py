@@ -53,6 +53,9 @@ EXPLAINED = {
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),
     ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop
+    ("robots/ros2_node.py", "subprocess"),  # the command `calibrate`
+    # Packages of messages by names that the code contains.
+    ("robots/ros2.py", "import_module"),
     # Likewise, with the addresses of a device and of this process.
     ("live/device_link.py", "subprocess"),
 }  # fmt: skip

@@ -31,7 +31,7 @@ from drake_teleop.robots.streams import NONZERO_FLAGS, Compensated, Flag, Part
 
 _NODE = "drake_teleop"
 _DIAGNOSTICS_S = 1.0  # longest period of diagnostics [s]
-_MAX_MESSAGES = 256  # messages of a stream in one call of `read`
+_MAX_MESSAGES = 256  # queued messages of a stream
 _SPIN_S = 0.05  # longest time between two waits for services [s]
 
 
@@ -159,13 +159,14 @@ class Ros2Source:
         return receive
 
     def _subscribe(self, name: str, kind: Any, topic: str) -> tuple[Any, Callable[..., None]]:
-        from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
         node, receive = self._node.node, self._receiver(name, kind)
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)
-        options = {"callback": receive, "qos_profile": qos_profile_sensor_data, "raw": True}
+        best_effort = QoSProfile(depth=_MAX_MESSAGES, reliability=ReliabilityPolicy.BEST_EFFORT)
+        options = {"callback": receive, "qos_profile": best_effort, "raw": True}
         return node.create_subscription(kind, f"/{topic}", **options), receive
 
 

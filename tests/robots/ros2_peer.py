@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import sys
 import time
 
@@ -15,7 +16,7 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
@@ -117,7 +118,8 @@ def echo(domain, topic):
         found = {"name": status.name, "message": status.message, "level": ord(status.level)}
         print(json.dumps(found | {"values": pairs}), flush=True)
 
-    node.create_subscription(WrenchStamped, topic, wrench, qos_profile_sensor_data)
+    best_effort = QoSProfile(depth=512, reliability=ReliabilityPolicy.BEST_EFFORT)
+    node.create_subscription(WrenchStamped, topic, wrench, best_effort)
     node.create_subscription(DiagnosticArray, "/diagnostics", diagnosis, 100)
     while not node.get_publishers_info_by_topic(topic):
         time.sleep(0.01)
@@ -127,15 +129,17 @@ def echo(domain, topic):
 
 
 def moving(domain, table, hz):
-    """Publish wrench and pose of a moving tool from a table of 13 columns, again and again."""
+    """Publish wrench and pose of a tool from a table of 13 columns, which may be replaced."""
     node = node_in(domain)
-    rows, dt = np.load(table), 1.0 / float(hz)
+    rows, dt, changed = np.load(table), 1.0 / float(hz), os.stat(table).st_mtime_ns
     wrenches = node.create_publisher(WrenchStamped, "/ft/wrench", qos_profile_sensor_data)
     poses = node.create_publisher(PoseStamped, "/ft/pose", qos_profile_sensor_data)
     print("ready", flush=True)
-    start = time.time()
+    start, first = time.time(), 0
     for k in range(10**9):
-        row, t = rows[k % len(rows)], start + dt * k
+        if k % 100 == 0 and os.stat(table).st_mtime_ns != changed:
+            rows, changed, first = np.load(table), os.stat(table).st_mtime_ns, k
+        row, t = rows[(k - first) % len(rows)], start + dt * k
         time.sleep(max(0.0, t - time.time()))
         poses.publish(pose_message(t, row[6:]))
         wrenches.publish(wrench_message(t, row[:6]))
