@@ -1,9 +1,9 @@
 """How fast is `compensate` between ROS 2 nodes, and does calibration by service give the truth?
 
 `python benchmarks/ros2.py [--loads 50] [--services 2] [--seconds 20] [--json FILE]`, with the extra
-`ros2`: nodes in other processes publish wrench and pose of a hand-moved tool (`posed_hand.py`: noise
-of wrench and pose, offsets, poses late by up to 8 ms), receive the contact wrench, and call the
-services.
+`ros2`: nodes in other processes publish wrench and pose of a hand-moved tool (`posed_hand.py`:
+noise of wrench and pose, offsets, poses late by up to 8 ms), receive the contact wrench, and call
+the services.
 
 * processing: from the arrival of the first message in Python to the end of the publications that
   follow, for each of them, by the clock and in time of the thread (without waits for a core);
