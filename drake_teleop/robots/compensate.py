@@ -133,9 +133,6 @@ def compensate_command(
         control: UDP port of `Control`.
         serve: function from a maker of compensators to an object that is used as a compensator.
         stream: options of `open_source`.
-
-    Raises:
-        DrakeTeleopError: if an argument cannot be used.
     """
     found = Identification.load(load)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)
