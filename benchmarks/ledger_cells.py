@@ -205,9 +205,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
     """Return the scenario of a cell without passivity method, and its times."""
     slave, channel = slave_of(drawn.arm), channel_of(drawn.network)
     times = times_of(drawn, sum(mean_delay(line) for line in channel.lines()))
-    base = replace(
-        station_base("contact_transition", seed), slave=slave, wrist_sensor__ideal=True
-    )
+    base = replace(station_base("contact_transition", seed), slave=slave, wrist_sensor__ideal=True)
     nominal = NominalSlave(slave)
     tip = nominal.start_tip - [0.0, 0.0, GAP]
     beside = np.array([math.cos(drawn.azimuth), math.sin(drawn.azimuth)])

@@ -308,7 +308,11 @@ def _add_friction(g, T, size, force, received, dx, p, memory, wrench):
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
     # A torque's weight in the metric is 0 where rotation is not transmitted.
     metric, cone = max(p[METRIC][g], 1e-12), memory[_FRICTION_CONE]
-    spring, step, slave_step = _MAX_STIFFNESS / metric, work_along(normal, dx), work_along(normal, z)
+    spring, step, slave_step = (
+        _MAX_STIFFNESS / metric,
+        work_along(normal, dx),
+        work_along(normal, z),
+    )
     lag = cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED)
     share, total = T / max(lag, _FRICTION_LAG_S), 0.0
     for i in range(3 * g, 3 * g + 3):
@@ -350,7 +354,9 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
         cost = size * max(dot(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
             cost += size * _HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
-    most = min(T * _DRAIN_RATE, 1.0) * max(memory[LEDGER][g] - _LEAST_LEVEL * p[MASTER_RESERVE][g], 0.0)
+    most = min(T * _DRAIN_RATE, 1.0) * max(
+        memory[LEDGER][g] - _LEAST_LEVEL * p[MASTER_RESERVE][g], 0.0
+    )
     share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _RECOVERY_S)
     if share * cost > most:
         share = most / cost
