@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -57,7 +58,9 @@ from drake_teleop.logs.pose_motion.spectra import (
 )
 from drake_teleop.logs.pose_motion.spectra import exclude as exclude_from_taper
 from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _thin_knots
+from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.rotations import rotation_matrices
+from drake_teleop.logs.spline_motion import use_spline_motion
 
 
 @cache
@@ -88,6 +91,24 @@ def test_signals_match_the_motion_with_jitter_and_a_gap():
     assert error[:, 1:4].max() < 0.01  # of 2 m/s^2
     assert error[:, 7:10].max() < 0.05  # of 25 rad/s^2
     assert error[:, 10:].max() < 1e-3
+
+
+@pytest.mark.parametrize(("spacing", "delay"), [(0.05, 0.0), (0.08, 0.013), (0.05, -0.02)])
+def test_samples_within_two_knots_of_ends_and_gaps_are_flagged(spacing, delay):
+    t, wrench, poses = record(Kind())
+    kept = (np.abs(poses.t - 7.3) > 0.3) & (np.abs(poses.t - 12.0) > 0.01)
+    poses = Poses(poses.t[kept], poses.position[kept], poses.quaternion[kept]).continued()
+    posed = SimpleNamespace(gravity_W=GRAVITY_W)
+    log = Log(t, wrench, *np.zeros((3, len(t), 3)), posed=posed)
+    found = SimpleNamespace(delay_s=delay, splines=PoseSplines(poses, spacing))
+    moved, flags = use_spline_motion(log, found)
+    at = moved.t + delay
+    gap = np.searchsorted(poses.t, 7.3)
+    ends = poses.t[[0, gap - 1, gap, -1]]
+    distance = np.abs(at[:, None] - ends).min(axis=1) - 2.0 * spacing
+    np.testing.assert_array_equal(flags[distance < -1e-9], True)
+    np.testing.assert_array_equal(flags[distance > 1e-9], False)
+    assert 20 < flags.sum() < 0.1 * len(t)
 
 
 def test_knots_are_thinned_where_poses_are_too_few():

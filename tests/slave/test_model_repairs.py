@@ -128,6 +128,29 @@ def test_masses_beside_the_chain_stay(tmp_path):
     assert plant.num_positions() == 6
 
 
+@pytest.mark.parametrize("hold", [None, {"j1": 0.3}])
+def test_motors_keep_gear_rotor_and_effort_of_their_joint(tmp_path, hold):
+    """Reflected inertia: gear ratio squared times the rotor's."""
+    gears, rotors, efforts = (
+        [1, 7, 50, 100, 3, 20],
+        [2e-3, 1e-3, 1e-4, 5e-5, 3e-3, 2e-4],
+        range(11, 17),
+    )
+    text, order = arm(), [3, 0, 5, 2, 1, 4]
+    for k in range(6):
+        text = text.replace(joint(k + 1), joint(k + 1).replace('"200"', f'"{efforts[k]}"'))
+    motors = "".join(
+        f'<transmission type="SimpleTransmission"><joint name="j{k + 1}"/><actuator name="a{k}">'
+        f'<drake:gear_ratio value="{gears[k]}"/><drake:rotor_inertia value="{rotors[k]}"/>'
+        "</actuator></transmission>"
+        for k in order
+    )
+    _, model, _ = read(written(tmp_path, text.replace("</robot>", f"{motors}</robot>")), hold=hold)
+    kept = slice(0 if hold is None else 1, 6)
+    np.testing.assert_allclose(model.table[:-1, 22], (np.square(gears) * rotors)[kept])
+    np.testing.assert_array_equal(model.effort_limit, efforts[kept])
+
+
 def test_continuous_joints_keep_their_limits_only_if_given(tmp_path):
     text = arm(j3=joint(3, "continuous").replace(LIMIT, '<limit effort="9" velocity="1"/>'))
     _, model, _ = read(
