@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.urdf_repair import dependent_joints
 
 
 def read(path, sensor="l6", hold=None, shapes=False):
@@ -406,3 +408,22 @@ def test_tool_may_have_joints_of_any_kind(tmp_path):
     nominal = NominalSlave(slave)
     assert nominal.arm.phi_load[0] == pytest.approx(4.0)
     assert "held: slide" in nominal.assumptions
+
+
+@pytest.mark.parametrize(
+    ("inside", "expected"),
+    [
+        ("", {}),
+        ('<mimic joint="k"/>', {"j": "moves with another joint (mimic)"}),
+        ('<axis><mimic joint="k"/></axis>', {"j": "moves with another joint (mimic)"}),
+    ],
+)
+@pytest.mark.parametrize("parent", ["world", "l2"])
+def test_coupled_joints_and_floating_links_are_dependent(inside, expected, parent):
+    ends = f'<parent link="{parent}"/><child link="c"/>'
+    root = ElementTree.fromstring(
+        f'<r><joint name="j" type="revolute">{inside}</joint>'
+        f'<joint name="f" type="floating">{ends}</joint></r>'
+    )
+    floating = {} if parent == "world" else {"c": "floats on l2"}
+    assert dependent_joints(root) == expected | floating
