@@ -196,7 +196,8 @@ def remoteness(file: str, test: str, reach: dict[str, int]) -> int:
 
     Tests of the whole have 2, others 3.
     """
-    direct, near = reach[file] == 1, test.split("/")[1] == package_of(file)
+    package, folder = package_of(file), test.split("/")[1]
+    direct, near = reach[file] == 1, folder in (package, f"test_{package}.py")
     return 2 - direct - near if direct or near else 2 if test.count("/") == 1 else 3
 
 
