@@ -200,9 +200,9 @@ ASSUMED = {
     "no speed": (with_limit('<limit velocity="0" effort="200"/>'), "a speed limit of .* for j3"),
     "no strength": (with_limit('<limit velocity="3" effort="0"/>'), "no torque limit for j3"),
     "only an upper limit": (with_limit('<limit upper="2" velocity="3" effort="200"/>'),
-                            "^acceleration limits"),
+                            "^a range of one turn from the only limit for j3"),
     "only a lower limit": (with_limit('<limit lower="-2" velocity="3" effort="200"/>'),
-                           "^acceleration limits"),
+                           "^a range of one turn from the only limit for j3"),
     "limits in degrees": (with_limit('<limit lower="-170" upper="170"/>'),
                           "limits in rad, though more than 25.13 apart, for j3"),
     "massless": (arm(l3=link("l3", "")), "no inertia of l3; a rotor inertia of 0.219 kg m.2,"
