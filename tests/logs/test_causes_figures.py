@@ -11,8 +11,10 @@ from posed_record import PHI
 from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
 
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causes.candidates import candidates
 from drake_teleop.logs.causes.cause import causes_of, stretches
 from drake_teleop.logs.causes.changes import with_ramps
+from drake_teleop.logs.causes.contacts import contact_spans
 from drake_teleop.logs.causes.instants import instants
 from drake_teleop.logs.causes.model import DELAY, Model, Step
 from drake_teleop.logs.causes.search import _remove_delay
@@ -158,3 +160,29 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
         value = found.extension(f"step {k}")[0]
         truth = load if kind == "load" else step
         np.testing.assert_allclose(value[:3], truth[:3], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "ends"), [(101.5, 103.0, 2), (99.0, 102.0, 1), (103.5, 107.0, 1)]
+)
+def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
+    monkeypatch, start, stop, ends
+):
+    s, omega, alpha, *_ = moving(T)
+    wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS
+    wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
+    touched = ((start < T) & (stop > T))[:, None]
+    wrench += touched * [8.0, 0.0, 5.0, 0.3, 0.0, 0.0] * (1.0 + np.sin(3.0 * T[:, None]))
+    state = State.of(record(wrench), Model())
+    ((found_start, found_stop),) = contact_spans(state)
+    assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
+    assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
+    for name in ("_fit_part", "_factor", "_axes"):
+        monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
+    monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step", lambda *_: None)
+    monkeypatch.setattr("drake_teleop.logs.causes.candidates._SMALLEST_GAIN", 1.0)
+    (contact,) = candidates(state, True)
+    price = (6 + 2 * ends) * np.log(state.data.used.sum())
+    gain = 2.0 * (contact.state.likelihood - state.likelihood)
+    assert contact.name == "contact" and contact.state.spans == ((found_start, found_stop),)
+    assert contact.score == pytest.approx(gain - price)

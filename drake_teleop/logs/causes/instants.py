@@ -259,4 +259,4 @@ def free_delay(data: Instants) -> float:
     left, middle, right = costs[best - 1 : best + 2]
     bend = left - 2.0 * middle + right
     move = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
-    return float(shifts[best] + _DELAY_STEP_S * np.clip(move, -1.0, 1.0))
+    return float(shifts[best] + _DELAY_STEP_S * move)  # |move| <= 0.5 at the smallest of three
