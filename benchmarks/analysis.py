@@ -1,4 +1,4 @@
-"""Is what the analysis says of stability what a simulation does, and how long does it take?
+"""Does the stability analysis agree with simulations, and how long does it take?
 
 `python benchmarks/analysis.py [--json FILE]` prints three things.
 

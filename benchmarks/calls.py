@@ -1,4 +1,4 @@
-"""Is each call as fast as the station, or who waits for it, needs it to be?
+"""Is each call of the library fast enough for the station or for the person who waits?
 
     python benchmarks/calls.py [--json FILE]
 

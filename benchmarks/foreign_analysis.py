@@ -1,4 +1,4 @@
-"""Does `analyze` hold for other arms and devices as it does for the paper's?
+"""Is `analyze` as accurate for other arms and devices as for those of the paper?
 
 Vertically and with an ideal sensor, for an RX90 with a Phantom, a Panda with an omega.6 and a UR5
 with a Touch, sigma 0.5:
