@@ -50,6 +50,8 @@ RUNS = {
     "repeated": "benchmarks/repeated.py --json FILE",
     "replayed": "benchmarks/replayed.py --json FILE",
     "reproduce": "drake-teleop reproduce --quiet --out FOLDER",
+    "ros2": "benchmarks/ros2.py --json FILE",
+    "study_shards": "benchmarks/study.py --shards 8 --runs 64 --json FILE",
     "shortest": "benchmarks/shortest.py --json FILE",
     "station": "benchmarks/station.py --json FILE",
     "stations": (
@@ -635,6 +637,24 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(LIVE, "`calibrate` calls a wrong number identified, from a robot's poses"),
         *("50 loads by hand, 0.1 mm and 0.2 mrad; right gains", "robot.md", "calibrate_poses"),
         *(lambda f: f["poses.false_known"], "numbers", 0.0, 0.0),
+    ),
+    Claim(
+        *(SPEED, "CPU time that a study in shards takes beyond one process, for each start"),
+        *("8 shards, 3 killed and submitted again, a merge", "cluster.md", "study_shards"),
+        *(lambda f: f["cost_of_a_start_cpu_s"], "s", 0.0, 10.0),
+    ),
+    Claim(
+        *(
+            LIVE,
+            "Calibrations from ROS 2 topics with every true number inside its 99.98 % interval",
+        ),
+        *("50 hand-moved loads, nodes in other processes, 200 Hz", "robot.md", "ros2"),
+        *(lambda f: f["calibrations.inside_all_intervals"], "of 50", 50.0, 50.0),
+    ),
+    Claim(
+        *(LIVE, "Processing of a reading between ROS 2 topics, 99th percentile"),
+        *("500 Hz, time of the thread, poses included", "robot.md", "ros2"),
+        *(lambda f: f["processing_thread_p99_ms"], "ms", 0.0, 1.0),
     ),
     Claim(
         *(LIVE, "Numbers in which `compensate replay:LOG` differs from `eliminate --causal`"),

@@ -11,8 +11,8 @@ mass           A delay makes a mass feel heavier: 10 % at 25 ms, 20 % at 50 ms, 
 detection      arXiv 2505.08334: inertial sensors detect contacts in 3 to 39 ms, and up to 50 %
                sooner than a momentum observer. Here: `contact_transition`, the threshold on the
                calculated contact force, and an observer with the arm's true model, exact joint
-               states and motor torques; both thresholds are 1.5 times the largest value of the same motion
-               without contact.
+               states and motor torques; both thresholds are 1.5 times the largest value of the
+               same motion without contact.
 architectures  Rodriguez-Seda, Lee and Spong, T-RO 25(6), 2009: round trips of 8 to 1088 ms, losses
                to 50 %; errors grow with both, with delay more than with loss, and no method is
                best everywhere. Here: all methods in one axis.

@@ -55,6 +55,9 @@ EXPLAINED = {
     ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop
     # The system's C compiler, with sources of this package and numbers.
     ("robots/controller/fmu.py", "subprocess"),
+    ("robots/ros2_node.py", "subprocess"),  # the command `calibrate`
+    # Packages of messages by names that the code contains.
+    ("robots/ros2.py", "import_module"),
     # Likewise, with the addresses of a device and of this process.
     ("live/device_link.py", "subprocess"),
 }  # fmt: skip

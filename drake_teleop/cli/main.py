@@ -367,15 +367,56 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Remove the load from a live wrench.
 
-    SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for lines of JSON
-    on stdin, or replay:LOG; SINK is udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://, - for stdout,
-    or a .csv, .parquet or .mcap file. Invalid wrenches are zero, with a flag. --cutoff is causal
-    here. --delay is the delay of the motion behind the wrench; auto: the value in the load file.
+    SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, ros2://TOPIC, zenoh://HOST/TOPIC, - for
+    lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT, ros2://TOPIC,
+    zenoh://HOST/TOPIC, foxglove://, - for stdout, or a .csv, .parquet or .mcap file.
+    Invalid wrenches are zero, with a flag. --cutoff is causal here. --delay is the
+    delay of the motion behind the wrench; auto: the value in the load file.
     The command ends with the source or with Ctrl-C.
     """
     from drake_teleop.robots.compensate import compensate_command
 
     compensate_command(source, load, sink, **options)
+
+
+@cli.command()
+@click.argument("source")
+@click.argument("sink")
+@option.load(required=True)
+@option.sigma("Scale of the non-contact wrench.")
+@option.separate_sigmas
+@option.gamma
+@click.option("--rate", "rate_hz", type=option.POSITIVE, required=True, metavar="HZ",
+              help="Rate of the wrenches.")  # fmt: skip
+@click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
+@option.stream
+@option.out("ros2")
+@click.pass_context
+def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **options: Any) -> None:
+    """Remove the load from a live wrench, as a ROS 2 node.
+
+    SOURCE and SINK are ros2://TOPIC as for `compensate`. The node /drake_teleop has the services
+    tare, load and calibrate, and the parameters sigma, gamma, sigma_weight, sigma_inertia, load,
+    until and seconds. Flags are on /diagnostics. Calibrations are written to --out.
+    """
+    from drake_teleop.robots.ros2_node import ros2_command
+
+    def calibrate(until: str, seconds: float) -> list[str]:
+        words = ["calibrate", source, "--until", until, "--seconds", str(seconds), "--quiet"]
+        words += ["--out", str(out)]
+        given = {"--cutoff": "cutoff_hz", "--delay": "delay", "--model": "model"}
+        given |= {"--sensor-frame": "sensor_frame", "--motion": "motion"}
+        for name, parameter in given.items():
+            if (value := ctx.params[parameter]) is not None:
+                words += [name, str(value)]
+        for name, parameter in (("--range", "largest"), ("--sensor-pose", "sensor_pose")):
+            if (numbers := ctx.params[parameter]) is not None:
+                words += [name, *map(str, numbers)]
+        return words + [
+            x for path in ctx.params["package_paths"] for x in ("--package-path", str(path))
+        ]
+
+    ros2_command(source, load, sink, out, calibrate=calibrate, **options)
 
 
 @cli.command()
@@ -581,6 +622,8 @@ def tune(
 @click.argument("study", type=option.STUDY)
 @option.jobs
 @option.cluster
+@click.option("--shard", metavar="K/N", help="Run part K of N, e.g. 3/8; see docs/cluster.md.")
+@click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
 @option.yes
 @option.out("study")
 @option.quiet

@@ -121,12 +121,9 @@ class Compensator:
         detector: Detector | None = None,
     ) -> None:
         self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
-        weight = sigma if sigma_weight is None else sigma_weight
-        inertia = sigma if sigma_inertia is None else sigma_inertia
-        if weight != inertia and load.weight_removed:
-            raise removed_weight("load")
-        self._scales, self._dt = np.empty(4), dt
-        scales_into(float(weight), float(inertia), float(gamma), self._scales)
+        self._weight_removed, self._dt = load.weight_removed, dt
+        self._scales = np.empty(4)
+        self.set_scales(sigma, gamma, sigma_weight, sigma_inertia)
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
         self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
@@ -169,6 +166,16 @@ class Compensator:
             "stale_steps": math.floor(STALE_S / self._dt + 1e-9) - 1,
             "tare_steps": len(self._tare_rows),
         }
+
+    def set_scales(
+        self, sigma: float, gamma: float, sigma_weight: float | None, sigma_inertia: float | None
+    ) -> None:
+        """Set the scales from the next reading on; raise DrakeTeleopError if they are unusable."""
+        weight = sigma if sigma_weight is None else sigma_weight
+        inertia = sigma if sigma_inertia is None else sigma_inertia
+        if weight != inertia and self._weight_removed:
+            raise removed_weight("load")
+        scales_into(float(weight), float(inertia), float(gamma), self._scales)
 
     def step(self, reading: Reading, now: float) -> Compensated:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""

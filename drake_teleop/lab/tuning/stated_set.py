@@ -21,7 +21,7 @@ _MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede th
 
 @dataclass(frozen=True)
 class TunedTask:
-    """What the settings of a task must reach.
+    """Requirements of a task.
 
     Args:
         margin: factor of the loop gain that must still be stable.

@@ -364,7 +364,7 @@ class TeleopChannel(LeafSystem):
     Args:
         R_WB: (3, 3) alignment of the master's base with the world.
         scales: (2,) scale of translation and rotation, slave over master.
-        force_scale: scale of force, slave to master.
+        force_scale: scale of the contact force (force scale times gamma), slave to master.
         start: (7,) pose X_WS of the slave at the start.
         period: time between packets [s].
     """
