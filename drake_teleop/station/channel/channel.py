@@ -3,7 +3,6 @@
 In every period both ends run one step of the method; their packets pass the network.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
 from dataclasses import dataclass
 
