@@ -8,7 +8,7 @@ import dataclasses
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, cast
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
@@ -20,9 +20,11 @@ from drake_teleop.common.config import (
     plain,
     quantity,
     settings,
+    unchecked_assignments,
 )
 from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
 from drake_teleop.common.files import scenarios_dir
+from drake_teleop.common.registry import Registry
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.station.channel.channel import LONGEST_TIMEOUT, Channel
 from drake_teleop.station.channel.network import NetworkConfig
@@ -45,15 +47,10 @@ from drake_teleop.station.slave.joint_control import JointControlConfig, default
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
-#: Types of objects in `environment`.
-Thing: TypeAlias = (
-    Wall
-    | Box
-    | Block
-    | SheetSpring
-    | Slot
-    | Scene
-)  # fmt: skip
+ENVIRONMENTS: Registry[type[Environment]] = Registry(
+    "environment", {each.__name__: each for each in (Wall, Box, Block, SheetSpring, Slot, Scene)}
+)
+"""Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
 _CONTACT_STEP_S = 1.25e-4
 
@@ -123,8 +120,8 @@ class Scenario:
     contact_detection: ContactDetectionConfig | None = None
     sheet_spring: SheetSpring | None = None
     slot: Slot | None = None
-    environment: list[Thing] = plain(
-        [], "further objects to touch, such as [!Wall {stiffness: 2e4}, !Block {}]"
+    environment: list[Environment] = plain(
+        [], "further objects to touch, such as [!Wall {stiffness: 2e4}, !Block {}]", ENVIRONMENTS
     )
 
     @property
@@ -157,6 +154,7 @@ class Scenario:
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
         check_ranges(self, where)
+        self.passivity.check(f"{where}:passivity")
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
         self.master.check(f"{where}:master")
@@ -243,9 +241,21 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
         master=Master(figures=figures_of(data.get("master"))),
         joint_control=JointControlConfig(interface=default_interface(data.get("joint_control"))),
     )
-    scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
+    scenario = unchecked_scenario(data, defaults)
     scenario.check(where)
     return scenario
+
+
+def unchecked_scenario(data: Any, defaults: Scenario | None = None) -> Scenario:
+    """Convert data whose structure has been checked."""
+    data = dict(data)
+    things = [dict(thing) for thing in data.pop("environment", [])]
+    with unchecked_assignments():
+        scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
+        for thing in things:
+            kind = ENVIRONMENTS[thing.pop("_tag", "!Wall").removeprefix("!")]
+            scenario.environment.append(yaml_load_typed(schema=kind, data=yaml_dump(thing)))
+    return cast(Scenario, scenario)
 
 
 def replace(scenario: Scenario, **changes: object) -> Scenario:
@@ -254,10 +264,8 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5
 
-    Values are checked when the scenario is used.
-
     Raises:
-        DrakeTeleopError: if there is no such block or field.
+        DrakeTeleopError: if there is no such block or field, or for an invalid value.
     """
     expect(Scenario, scenario, "scenario")
     for name, value in changes.items():

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
-from drake_teleop.common.config import check_ranges, check_structure
+from drake_teleop.common.config import check_ranges, check_structure, unchecked_assignments
 from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
@@ -32,7 +32,13 @@ from drake_teleop.lab.studies.effects import effects
 from drake_teleop.lab.studies.measures import measured
 from drake_teleop.lab.studies.pictures import write_pictures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
-from drake_teleop.station.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
+from drake_teleop.station.scenario import (
+    ReadScenario,
+    Scenario,
+    ScenarioFromData,
+    ScenarioNames,
+    unchecked_scenario,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -143,7 +149,8 @@ def LoadStudy(path: str | Path) -> Study:
     path = study_file(path)
     data = read_yaml(path)
     check_structure(Study, data, str(path))
-    study = yaml_load_typed(schema=Study, data=yaml_dump(data), defaults=Study())
+    with unchecked_assignments():
+        study = yaml_load_typed(schema=Study, data=yaml_dump(data), defaults=Study())
     study.check(str(path))
     return study
 
@@ -158,7 +165,7 @@ def _check_values(factor: Factor, where: str) -> None:
     for value in (factor.low, factor.high) if ranged else factor.listed():
         data = _with_changes({}, {factor.field: value})
         check_structure(Scenario, data, where)
-        check_ranges(yaml_load_typed(schema=Scenario, data=yaml_dump(data)), where)
+        check_ranges(unchecked_scenario(data), where)
 
 
 def _with_changes(data: Any, changes: dict[str, Any]) -> Any:

@@ -8,7 +8,7 @@ from collections import UserDict
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +16,9 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
-if TYPE_CHECKING:
-    pass
-
-_TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
-FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
 MAX_NUMBER = 1e25
 """Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
-_CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
-_Column = TypeVar("_Column")
-_MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _MAX_DECIMALS = 12
-_MAX_CELLS_IN_MEMORY = 2**24
-"""Number of cells above which columns of a Parquet file are read on access."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.registry import Registry
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINTS, Leader
@@ -129,44 +130,49 @@ _OMEGA_READING = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "ra
 # Only the Virtuose displays torque (3.1 N m D); omega.3 and Falcon do not rotate.
 
 #: Data sheets by name, for `Master.figures`.
-FIGURES: dict[str, DeviceFigures] = {
-    "geomagic_touch": _data_sheet(
-        0.045,
-        0.26,
-        3.3,
-        [0.07, 0.16, 0.12],
-        resolution=5.5e-5,
-        turn_resolution=2e-3,
-        rate_hz=1000.0,
-    ),
-    "omega_3": _data_sheet(0.25, 0.3, 12.0, _OMEGA_SIZE, turn=_NO_ROTATION, **_OMEGA_READING),
-    "omega_6": _data_sheet(0.3, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
-    "omega_7": _data_sheet(0.35, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
-    "falcon": _data_sheet(
-        0.2, 0.5, 8.9, [0.102] * 3, turn=_NO_ROTATION, resolution=6.35e-5, rate_hz=1000.0
-    ),
-    "haply_inverse3": _data_sheet(
-        0.2,
-        0.15,
-        10.0,
-        [0.2, 0.34, 0.19],
-        resolution=2e-5,
-        turn_resolution=2e-3,
-        rate_hz=4000.0,
-    ),
-    "virtuose_6d": _data_sheet(
-        1.0,
-        1.0,
-        35.0,
-        [0.26] * 3,
-        inertia=5e-3,
-        friction_torque=0.03,
-        peak_torque=[3.1] * 3,
-        resolution=2e-5,
-        turn_resolution=2e-4,
-        rate_hz=1000.0,
-    ),
-}
+FIGURES: Registry[DeviceFigures] = Registry(
+    "device",
+    {
+        "geomagic_touch": _data_sheet(
+            0.045,
+            0.26,
+            3.3,
+            [0.07, 0.16, 0.12],
+            resolution=5.5e-5,
+            turn_resolution=2e-3,
+            rate_hz=1000.0,
+        ),
+        "omega_3": _data_sheet(0.25, 0.3, 12.0, _OMEGA_SIZE, turn=_NO_ROTATION, **_OMEGA_READING),
+        "omega_6": _data_sheet(0.3, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
+        "omega_7": _data_sheet(
+            0.35, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING
+        ),
+        "falcon": _data_sheet(
+            0.2, 0.5, 8.9, [0.102] * 3, turn=_NO_ROTATION, resolution=6.35e-5, rate_hz=1000.0
+        ),
+        "haply_inverse3": _data_sheet(
+            0.2,
+            0.15,
+            10.0,
+            [0.2, 0.34, 0.19],
+            resolution=2e-5,
+            turn_resolution=2e-3,
+            rate_hz=4000.0,
+        ),
+        "virtuose_6d": _data_sheet(
+            1.0,
+            1.0,
+            35.0,
+            [0.26] * 3,
+            inertia=5e-3,
+            friction_torque=0.03,
+            peak_torque=[3.1] * 3,
+            resolution=2e-5,
+            turn_resolution=2e-4,
+            rate_hz=1000.0,
+        ),
+    },
+)
 
 
 @settings
@@ -176,8 +182,9 @@ class Master:
 
     model: str = choice(
         PHANTOM,
-        (PHANTOM, *FIGURES, "custom", LEADER),
+        (PHANTOM, "custom", LEADER),
         "device; custom: `figures` only; leader: arm from a file",
+        FIGURES,
     )
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"
