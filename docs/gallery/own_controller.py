@@ -82,7 +82,7 @@ base = replace(
     base,
     operator__intent=[MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.05])],
     sheet_spring=None,
-    environment=[Wall(position=[x, y, tip - 0.02], stiffness=2e4)],
+    environment=[Wall(position=[x, y, tip - 0.02], stiffness=1e4)],
     channel__delay=0.05,
     simulation__settle=0.0,
     simulation__duration=1.6,
@@ -91,14 +91,18 @@ base = replace(
     rates__sensor_hz=2000.0,
 )
 arm, load = NominalSlave(base.slave).arm, true_load(base)
-servo = {"servo_stiffness": [1500.0, 80.0], "servo_damping": [300.0, 16.0]}
 results, figure, axes = {}, *plt.subplots(1, 2, figsize=(7.5, 3), sharex=True)
 for method in ("tdpa", "ledger"):
-    soft = replace(base, passivity__method=method, passivity__slave_mass=[15.0, 0.5])
-    soft = replace(soft, **{f"passivity__{name}": value for name, value in servo.items()})
-    for name, scenario, controller in (
-        ("impedance", soft, ImpedanceController(arm, [1500.0, 80.0], [300.0, 16.0])),
-        ("admittance", replace(base, passivity__method=method), AdmittanceController(2, 120, 1500)),
+    scenario = replace(
+        base,
+        passivity__method=method,
+        passivity__servo_stiffness=[1500.0, 80.0],  # as seen from the channel
+        passivity__servo_damping=[300.0, 16.0],
+        passivity__slave_mass=[15.0, 0.5],
+    )
+    for name, controller in (
+        ("impedance", ImpedanceController(arm, [1500.0, 80.0], [300.0, 16.0])),
+        ("admittance", AdmittanceController(5.0, 600.0, 1500.0)),
     ):
         slave = MakeSlaveSide(scenario, load_estimate=load, controller=controller)
         station = dt.MakeTeleopStation(scenario, slave=slave)
