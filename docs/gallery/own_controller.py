@@ -16,11 +16,9 @@ import drake_teleop as dt
 from drake_teleop.lab.comparison.delayed_contact import energy_between
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.environment.solids import Wall
-from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.scenario import replace
 from drake_teleop.station.slave.arm import holding_torque, jacobian, pose_into
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave_side import MakeSlaveSide
 
 
 def rotation(pose):
@@ -80,7 +78,7 @@ x, y, z = (base := dt.LoadScenario("contact_transition")).slave.position
 tip = NominalSlave(base.slave).start_tip[2]
 base = replace(
     base,
-    operator__intent=[MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.05])],
+    operator__intent=[dt.MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.05])],
     sheet_spring=None,
     environment=[Wall(position=[x, y, tip - 0.02], stiffness=1e4)],
     channel__delay=0.05,
@@ -104,7 +102,7 @@ for method in ("tdpa", "ledger"):
         ("impedance", ImpedanceController(arm, [1500.0, 80.0], [300.0, 16.0])),
         ("admittance", AdmittanceController(5.0, 600.0, 1500.0)),
     ):
-        slave = MakeSlaveSide(scenario, load_estimate=load, controller=controller)
+        slave = dt.MakeSlaveSide(scenario, load_estimate=load, controller=controller)
         station = dt.MakeTeleopStation(scenario, slave=slave)
         result = dt.simulate(station, scenario.simulation, progress=False)
         results[name, method] = result, scenario

@@ -104,6 +104,13 @@ def check_name(schema: type, name: Any, where: str) -> None:
         raise DrakeTeleopError("there is no such field", where=where, remedy=remedy)
 
 
+def check_field(schema: type, name: str, value: Any, where: str) -> None:
+    """Raise DrakeTeleopError, with the place `where`, unless a field may have this value."""
+    check_name(schema, name, where)
+    entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    _check_value(entry, _field_types(schema)[name], value, where)
+
+
 def check_ranges(config: Any, where: str) -> None:
     """Check all values of a dataclass, recursively.
 
@@ -223,7 +230,9 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
         several = len(kind.items) > 1
         check_structure(_selected_block(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
-        raise _kind_error(" or ".join(block.__name__ for block in kind.items), value, place)
+        fields = ", ".join(_field_names(first))
+        remedy = f"make one: {first.__name__}(...), with fields {fields}"
+        raise _kind_error(" or ".join(block.__name__ for block in kind.items), value, place, remedy)
 
 
 def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
@@ -314,18 +323,39 @@ class FieldInfo:
 def settings(block: _Class) -> _Class:
     """Make a dataclass check what it is assigned, and list its fields in its docstring."""
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
+    block.__str__ = _changed_fields  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.text) for entry in fields_of(block)]
     block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
     return block
 
 
+def _changed_fields(self: Any) -> str:
+    return "\n  ".join([type(self).__name__, *_changed_lines(self)])
+
+
+def _changed_lines(config: Any) -> Iterator[str]:
+    """Yield a line for each field that differs from its default."""
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        if value == _default(entry):
+            continue
+        blocks = value if isinstance(value, list) else [value]
+        if not blocks or not dataclasses.is_dataclass(blocks[0]):
+            yield f"{entry.name}: {_shown(value)}"
+            continue
+        for index, block in enumerate(blocks):
+            place = f"{entry.name}[{index}]" if isinstance(value, list) else entry.name
+            yield f"{place}: {type(block).__name__}"
+            yield from (f"  {line}" for line in _changed_lines(block))
+
+
 def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
-    if name not in self.__dataclass_fields__:
-        check_name(type(self), name, f"{type(self).__name__}.{name}")
+    place = f"{type(self).__name__}.{name}"
     if _checks_assignments.get():
-        entry, kind = self.__dataclass_fields__[name], _field_types(type(self))[name]
-        _check_value(entry, kind, value, f"{type(self).__name__}.{name}")
+        check_field(type(self), name, value, place)
+    else:
+        check_name(type(self), name, place)
     object.__setattr__(self, name, value)
 
 

@@ -13,6 +13,7 @@ from typing import Any, cast
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.common.config import (
+    check_field,
     check_name,
     check_ranges,
     check_structure,
@@ -275,8 +276,9 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):
                 raise DrakeTeleopError(f"there is no block {block} to change", where=place)
-            check_name(type(config), inner, place)
+            check_field(type(config), inner, value, place)
             value = dataclasses.replace(config, **{inner: value})
+        check_field(Scenario, block, value, f"scenario:{block}")
         scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
     return scenario
 
