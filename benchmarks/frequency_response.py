@@ -1,4 +1,4 @@
-"""How well does the linearised Diagram predict what the nonlinear station does?
+"""How well does the linearised Diagram predict the nonlinear station?
 
 A multi-sine is drawn by the operator, with all the sensor's noise, and measured responses are
 compared with those of the linearisation: vertically, in free motion for several sigma, and pressing

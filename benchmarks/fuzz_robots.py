@@ -1,4 +1,4 @@
-"""What `fuzz.py` feeds to the sources of `compensate` that make parts: records, samples, messages.
+"""Inputs of `fuzz.py` for the sources of `compensate`: records, samples, messages.
 
 A case is what a device sends, one after another. Whatever comes, what goes out of the loop has to
 be finite, within the sensor's range, and zero if it is flagged.

@@ -40,9 +40,8 @@ from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
 from drake_teleop.logs.processing import identify_log, usable_phi
-from drake_teleop.logs.read.alignment import low_pass, undelayed
+from drake_teleop.logs.read.alignment import delay_of, low_pass, undelayed
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.calibration import evaluate_record
 

@@ -1,4 +1,4 @@
-"""How well does a study use two cores, is it the same everywhere, and what does a kill cost?
+"""How well does a study use two cores, is it reproducible, and what does a kill cost?
 
 `python benchmarks/study.py [--runs 2000] [--kills 20] [--json FILE]` runs one study of the station
 (a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first) by

@@ -96,7 +96,7 @@ WRITING = {
     # A line for each change of a drive's inputs, which is to outlive the process.
     ("live/record.py", 'open("x'),
     # To memory, and then into the file with the wrenches that have come before.
-    ("robots/table.py", ".write_csv"),
+    ("robots/lines.py", ".write_csv"),
     # Under another name, until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
     # Figures, where --json says.
@@ -105,7 +105,6 @@ WRITING = {
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
     ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_text"),
     ("logs/dataset/dataset_files.py", ".write_bytes"),
-    ("logs/dataset/sample_dataset.py", ".write_text"),
     # A mark of one byte more.
     ("lab/studies/store.py", 'open("ab'),
     ("robots/changes.py", "json.dump"),  # to the process that asked

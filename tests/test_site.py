@@ -37,6 +37,7 @@ TESTED = {
     "delay-figures.md": "tests/test_delay_doc.py",
     "detection.md": "tests/test_detection_doc.py",
     "extend.md": "tests/test_recipes.py",
+    "log-description.md": "tests/logs/test_log_description.py",
     "logs.md": "tests/logs/test_log_description.py",
     "station.md": "tests/test_sides.py",
     "studies.md": "tests/studies/test_study.py",

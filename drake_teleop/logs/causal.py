@@ -38,9 +38,6 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
         dt: sample time [s].
         cutoff_hz: frequency of half the amplitude; no filter for None or above the Nyquist rate.
         ahead_s: time over which the output is extrapolated by its slope [s].
-
-    Raises:
-        DrakeTeleopError: for an extrapolation without a filter.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -87,9 +84,6 @@ def causal_wrenches(
         cutoff_hz: cut-off of the low-pass; None: no filter.
         delay_s: delay of the motion behind the wrench [s], rounded up to a full sample.
         mode: "delayed" keeps the lag, "predicted" extrapolates over it.
-
-    Raises:
-        DrakeTeleopError: for another mode, or a prediction without a low-pass.
     """
     if mode not in MODES:
         raise DrakeTeleopError(

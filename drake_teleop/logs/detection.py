@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.contact import MIN_SAMPLES, Detection
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)
@@ -44,9 +41,6 @@ def detect_log(
         statistic: "level", "cusum" or "glr".
         cutoff_hz: cut-off of the low-pass.
         delay: delay of the motion behind the wrench [s], or "auto".
-
-    Raises:
-        DrakeTeleopError: for an unusable log or load file, static poses or an unknown statistic.
     """
     if load is None:
         load = identify_log(path, cutoff_hz=cutoff_hz, delay=delay).identification

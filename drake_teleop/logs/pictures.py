@@ -80,19 +80,11 @@ def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
     Welch's method; x (N, k) are samples with sample time `dt` [s], densities in unit of x /
     sqrt(Hz).
     """
+    from scipy.signal import welch
+
     length = min(len(x), max(16, len(x) // 8), _MAX_WINDOW)
-    window = np.hanning(length + 1)[:-1, None]
-    starts = range(0, len(x) - length + 1, max(1, length // 2))
-    power = np.mean(
-        [
-            np.abs(np.fft.rfft(window * (part - part.mean(axis=0)), axis=0)) ** 2
-            for part in (x[start : start + length] for start in starts)
-        ],
-        axis=0,
-    )
-    density = np.asarray(np.sqrt(2.0 * dt * power / np.sum(window**2)), np.float64)
-    rates = np.asarray(np.fft.rfftfreq(length, dt), np.float64)
-    return rates[1:], density[1:]
+    rates, power = welch(x, 1.0 / dt, nperseg=length, axis=0)
+    return rates[1:], np.sqrt(power[1:])
 
 
 def _fit_into(figure: Any, found: IdentifiedLog) -> None:

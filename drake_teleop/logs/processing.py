@@ -28,7 +28,6 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.cause_lines import implausible_mass_message
 from drake_teleop.logs.causes.cause import EVENTS, Cause, Stretch
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
@@ -46,11 +45,16 @@ from drake_teleop.logs.contact import (
     robust_offsets,
     samples_of,
 )
-from drake_teleop.logs.explained_log import explain_log, explained_load, named_frame, removed_note
+from drake_teleop.logs.explained_log import (
+    explain_log,
+    explained_load,
+    implausible_mass_message,
+    named_frame,
+    removed_note,
+)
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
-from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
+from drake_teleop.logs.read.alignment import delay_of, low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
 _GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
@@ -266,9 +270,6 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     Args:
         path: canonical table or log description.
         checks: result of `check_file` for this log, if known.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be read.
     """
     checks = check_file(path) if checks is None else checks
     try:
@@ -376,21 +377,15 @@ def eliminate_log(
         raise DrakeTeleopError("contains poses at rest, which have no contact", where=source)
     if found.log.static:
         return found
-    detection = detect_contact(
-        samples_of(found.log, found.contact, cutoff_hz),
-        found.log.dt,
-        cutoff_hz,
-        finite_covariance(found.phi, identification.covariance, tared=tare),
-        identification.residual_rms,
-        edge=found.edge,
-        free=None
-        if free_motion is None
-        else (
-            samples_of(free_motion.log, free_motion.contact, cutoff_hz).at(~free_motion.edge),
-            free_motion.log.dt,
-        ),
-        statistic=statistic,
-    )
+    samples = samples_of(found.log, found.contact, cutoff_hz)
+    reference = None
+    if free_motion is not None:
+        free_samples = samples_of(free_motion.log, free_motion.contact, cutoff_hz)
+        reference = free_samples.at(~free_motion.edge), free_motion.log.dt
+    covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
+    options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
+    usual = identification.residual_rms
+    detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
     if free_motion is not None and tare and detection is not None:
         notes = offset_shift_note(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)

@@ -131,9 +131,6 @@ def compensate_command(
         free: log of free motion, see `Detector`.
         control: UDP port of `Control`.
         stream: options of `open_source`.
-
-    Raises:
-        DrakeTeleopError: if an argument cannot be used.
     """
     found = Identification.load(load)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)

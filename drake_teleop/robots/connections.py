@@ -20,11 +20,10 @@ from drake_teleop.robots.assembly import (
     SensorPoseOfJoints,
     pose_from_rpy,
 )
-from drake_teleop.robots.lines import LineSink, LineSource
+from drake_teleop.robots.lines import LineSink, LineSource, TableSink
 from drake_teleop.robots.recording import PartRecorder, Recorder, Records
 from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
-from drake_teleop.robots.table import TableSink
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _REPLAY = "replay:"
@@ -53,9 +52,6 @@ def open_source(
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
         arm: kinematics for joint positions.
-
-    Raises:
-        DrakeTeleopError: for an invalid address, a missing rate, or an error of the source.
     """
     kind = _kind(address)
     if kind in PART_SOURCES:

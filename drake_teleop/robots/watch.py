@@ -14,9 +14,8 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.contact.detection import RARE, ContactDetector, flag_update
+from drake_teleop.load.contact.detection import RARE, ContactDetector, fit_noise_floor, flag_update
 from drake_teleop.load.contact.noise_floor import finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.watched import (
@@ -94,9 +93,6 @@ class Detector:
     Args:
         free: log of free motion of the load, at the rate of the stream.
         delay: delay of the log, see `eliminate_log`.
-
-    Raises:
-        DrakeTeleopError: for an unreadable log, another rate, too little motion, or no low-pass.
     """
 
     def __init__(

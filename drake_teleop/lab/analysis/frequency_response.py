@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,12 +121,6 @@ class StationResponse:
         mass = (felt / (1j * omega)).real
         weighted = acceleration[:, None] * powers
         return float(np.linalg.lstsq(weighted, acceleration * mass, rcond=None)[0][0])
-
-    def to_control(self, output: str, input_: str) -> Any:
-        """Return `response` as a `control.FRD`."""
-        import control
-
-        return control.FRD(self.response(output, input_)[None, None], self.omega)
 
 
 def measure_frequency_response(

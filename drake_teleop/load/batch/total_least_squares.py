@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior
-from drake_teleop.load.batch.moments import (
+from drake_teleop.load.moments import (
     Moments,
     Noise,
     excited_columns,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -252,14 +253,8 @@ class RecursiveLeastSquares(RecursiveEstimator):
 
     method = "recursive least squares"
 
-    def __init__(
-        self,
-        noise_std: ArrayLike,
-        forgetting: float = 1.0,
-        prior_std: ArrayLike = PRIOR_STD,
-        bound: float = SETTLED,
-    ) -> None:
-        super().__init__(noise_std, forgetting, prior_std, bound)
+    def __init__(self, noise_std: ArrayLike, *options: Any, **named: Any) -> None:
+        super().__init__(noise_std, *options, **named)
         self._squares = np.zeros(6)
 
     def initial_memory(self, theta: Array) -> Array:

@@ -71,12 +71,7 @@ class Table:
     def numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
-        """Return the numbers (N, width) of the named columns, side by side.
-
-        Raises:
-            DrakeTeleopError: if a column is absent, a cell is not finite, or `width` or `rows`
-                differ.
-        """
+        """Return the numbers (N, width) of the named columns, side by side."""
         columns = [self._column(str(name), where) for name in names]
         self._check_rows(names, columns, where, rows)
         found = sum(column.shape[1] for column in columns)
@@ -107,11 +102,7 @@ class Table:
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> Array:
-        """Return the numbers (N, k) of a column, with NaN and infinity; `where` names it in errors.
-
-        Raises:
-            DrakeTeleopError: if the column is absent or a cell is not a number.
-        """
+        """Return the numbers (N, k) of a column, with NaN and infinity; errors name `where`."""
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
@@ -120,11 +111,7 @@ class Table:
         return numbers
 
     def single(self, name: str | int, where: str) -> Array:
-        """Return the numbers (N,) of a column, with NaN and infinity.
-
-        Raises:
-            DrakeTeleopError: as `raw`, or if the column has several numbers in a row.
-        """
+        """Return the numbers (N,) of a column, with NaN and infinity."""
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(

@@ -21,7 +21,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.rotations import quaternions
+from drake_teleop.common.rotations import quaternions
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.arm import FRICTION, ArmModel, forward_kinematics, pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits

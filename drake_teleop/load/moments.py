@@ -20,6 +20,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, checked, checked_rows
 from drake_teleop.load.regressor import regressor
 
+_MAX_BLOCKS = 1024
 CHUNK = 2**15
 """Samples per pass over a long record."""
 # Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
@@ -62,10 +63,15 @@ class Noise:
 
 
 class Moments:
-    """Sum over a record of z z^T (19, 19), z = [1, wrench, s, alpha, products of omega]."""
+    """Sum over a record of z z^T (19, 19), z = [1, wrench, s, alpha, products of omega].
+
+    The sums of z over equal blocks of samples show the correlation of noise in time.
+    """
 
     def __init__(self) -> None:
-        self._sums = np.zeros((19, 19))
+        self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_BLOCKS, 19))
+        # Index of the open block, samples of a full block, samples of the open block.
+        self._state = np.array([0, 1, 0])
 
     @property
     def samples(self) -> float:
@@ -94,14 +100,14 @@ class Moments:
         alpha: ArrayLike,
         weights: ArrayLike | None = None,
     ) -> None:
-        """Add N samples with arguments as for `identify`, in any order, with `weights` (N,)."""
+        """Add N samples with arguments as for `identify`, or a single one, with `weights` (N,)."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         n = rows[0].shape[0]
         weight = np.ones(n) if weights is None else checked("weights", weights, n)
         for start in range(0, n, CHUNK):
             part = np.zeros((19, 19))
-            stop = start + CHUNK
-            _accumulate(*(table[start:stop] for table in rows), weight[start:stop], part)
+            chunk = (table[start : start + CHUNK] for table in (*rows, weight))
+            _accumulate(*chunk, part, self._blocks, self._state)
             self._sums += part + np.triu(part, 1).T
 
     def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
@@ -144,6 +150,14 @@ def coefficients() -> Array:
     return T
 
 
+def centripetal_matrix(r: Array) -> Array:
+    """Return C (..., 3, 6): C z[13:19] is the acceleration omega x (omega x r) of r (..., 3)."""
+    x, y, z = np.moveaxis(r, -1, 0)
+    o = np.zeros_like(x)
+    rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
     """Return the Gram matrix (16, 16), sum of W_cd T_c Z T_d^T, and the right-hand side (16,).
 
@@ -182,9 +196,22 @@ def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
 
 
 @njit(cache=True)
-def _accumulate(wrench, s, omega, alpha, weights, sums):
+def _accumulate(wrench, s, omega, alpha, weights, sums, blocks, state):
+    """Add samples to the upper half of the sums of z z^T, and to those of z per block.
+
+    A full table of blocks is halved by joining pairs.
+    """
     z = np.empty(19)
+    last, length, filled = state
     for i in range(wrench.shape[0]):
+        if filled == length:
+            last, filled = last + 1, 0
+        if last == blocks.shape[0]:
+            last, length = last // 2, 2 * length
+            for b in range(last):
+                blocks[b] = blocks[2 * b] + blocks[2 * b + 1]
+            blocks[last:] = 0.0
+        filled += 1
         z[0] = 1.0
         for k in range(6):
             z[1 + k] = wrench[i, k]
@@ -197,5 +224,7 @@ def _accumulate(wrench, s, omega, alpha, weights, sums):
         z[18] = omega[i, 1] * omega[i, 2]
         for j in range(19):
             weighted = weights[i] * z[j]
+            blocks[last, j] += weighted
             for k in range(j, 19):
                 sums[j, k] += weighted * z[k]
+    state[0], state[1], state[2] = last, length, filled

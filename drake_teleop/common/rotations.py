@@ -78,11 +78,15 @@ def _from_rotation_vectors(vectors: Array) -> Array:
     return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * vectors])
 
 
-def right_angled_rotations() -> list[Array]:
-    """Return the 24 rotations (3, 3) that map axes to axes, identity first."""
-    matrices = [
+def signed_permutations() -> list[Array]:
+    """Return the 48 matrices (3, 3) that map axes to axes or their opposites, identity first."""
+    return [
         np.diag(signs) @ np.eye(3)[list(order)]
         for order in permutations(range(3))
         for signs in product((1.0, -1.0), repeat=3)
     ]
-    return [R for R in matrices if np.linalg.det(R) > 0]
+
+
+def right_angled_rotations() -> list[Array]:
+    """Return the 24 rotations (3, 3) that map axes to axes, identity first."""
+    return [R for R in signed_permutations() if np.linalg.det(R) > 0]
