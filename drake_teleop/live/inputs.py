@@ -69,6 +69,7 @@ class Inputs:
         held: 1 while the hand holds the stylus.
         clutch: 1 while motion is transmitted.
         sigma: scale of the gripper's (or whole) non-contact wrench [%].
+        sigma_weight: scale of the load's weight alone [%]; -1: as its inertia.
         sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
@@ -87,6 +88,7 @@ class Inputs:
     held: int = 1
     clutch: int = 1
     sigma: int = 0
+    sigma_weight: int = -1
     sigma_object: int = 0
     gamma: int = 100
     force_scale: int = 5714
@@ -106,8 +108,16 @@ class Inputs:
         sigma, sigma_object, gamma = (
             round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()[:3]
         )
-        scale = round(scenario.force_scaling.force_scale / _SCALE_UNIT)
-        started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)
+        config = scenario.force_scaling
+        apart = config.sigma_weight is not None or config.sigma_inertia is not None
+        weight = round(config.scales().weight_gripper / _SHARE_UNIT) if apart else -1
+        started = cls(
+            sigma=sigma,
+            sigma_weight=weight,
+            sigma_object=sigma_object,
+            gamma=gamma,
+            force_scale=round(config.force_scale / _SCALE_UNIT),
+        )
         return started.changed(initial_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
@@ -154,9 +164,10 @@ class Inputs:
         return self.changed({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
 
     @property
-    def scales(self) -> dict[str, float]:
+    def scales(self) -> dict[str, Any]:
         """Force scales as arguments of `ForceScaling.SetScales`."""
         return {
+            "sigma_weight": None if self.sigma_weight < 0 else _SHARE_UNIT * self.sigma_weight,
             "sigma_gripper": _SHARE_UNIT * self.sigma,
             "sigma_object": _SHARE_UNIT * self.sigma_object,
             "gamma": _SHARE_UNIT * self.gamma,
@@ -181,7 +192,9 @@ RANGES = {
     **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
     **dict.fromkeys(("rx", "ry", "rz"), (-10_000, 10_000)),
     **dict.fromkeys(("held", "clutch"), (0, 1)),
-    **dict.fromkeys(("sigma", "sigma_object", "gamma"), (0, 300)),
+    "sigma": (0, 300),
+    "sigma_weight": (-1, 300),
+    **dict.fromkeys(("sigma_object", "gamma"), (0, 300)),
     "force_scale": (0, 100_000),
     **_CHOICE_RANGES,
 }

@@ -343,4 +343,21 @@ def test_incomplete_last_line_is_ignored(tmp_path):
     path = tmp_path / INPUTS
     path.write_text(HEADER + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
     assert read_inputs(path, MADE_BY) == [(0, Inputs()), (5, Inputs(x=3))]
-    assert len(RANGES) == 21
+    assert len(RANGES) == 22
+
+
+def test_weight_has_its_own_share_and_follows_the_inertia_at_minus_one(scenario, load):
+    apart = replace(scenario, force_scaling__sigma_weight=0.5, force_scaling__sigma_inertia=0.25)
+    assert Inputs.of(scenario).sigma_weight == -1 and Inputs().scales["sigma_weight"] is None
+    inputs = Inputs.of(apart)
+    assert (inputs.sigma, inputs.sigma_weight, inputs.scales["sigma_weight"]) == (25, 50, 0.5)
+    session = Session(scenario, load)
+    felt = {}
+    for weight in (0, 100):
+        session.apply(session.inputs.changed({"sigma": 0, "sigma_weight": weight}))
+        session.advance(150)
+        felt[weight] = session.new_rows()["force_to_master"][-1, 2]
+    session.close()
+    # 3.13 kg at rest, on the scale of the master
+    scale = scenario.force_scaling.force_scale
+    assert abs((felt[100] - felt[0]) / scale) == pytest.approx(3.13 * 9.81, rel=0.02)
