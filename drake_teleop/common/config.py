@@ -108,7 +108,7 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
     """Raise DrakeTeleopError, with the place `where`, unless a field may have this value."""
     check_name(schema, name, where)
     entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
-    _check_value(entry, _field_types(schema)[name], value, where)
+    _check_value(entry, _kind_of_field(entry, _type_hints(schema)[name]), value, where)
 
 
 def check_ranges(config: Any, where: str) -> None:
