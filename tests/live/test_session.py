@@ -154,7 +154,7 @@ def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, lo
         return session.removed_force()
 
     assert simulate(500, z=-4000) == 0.0
-    assert simulate(1000, network=2, method=METHODS.index("force_limit")) == 0.0
+    assert simulate(1000, network=2, method=list(METHODS).index("force_limit")) == 0.0
     removed = simulate(1000, method=0)
     assert rendered[-1] == pytest.approx(rendered[-2] + 0.9, abs=1e-9)
     assert rendered[-1] + removed == pytest.approx(rendered[0], rel=0.02) and removed > 1.0
