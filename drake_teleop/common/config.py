@@ -321,7 +321,10 @@ class FieldInfo:
 
 
 def settings(block: _Class) -> _Class:
-    """Make a dataclass check what it is assigned, and list its fields in its docstring."""
+    """Make a dataclass check what it is assigned, and list its fields in its docstring.
+
+    Its module must not postpone annotations: `yaml_load_typed` reads the types of the fields.
+    """
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
     block.__str__ = _changed_fields  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)

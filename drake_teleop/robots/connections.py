@@ -195,9 +195,21 @@ def _open_netft(address: str, rate_hz: float | None, joints: tuple[str, ...]) ->
 
 
 def _open_zenoh(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.ros2_zenoh import ZenohSource
+
+    return ZenohSource(address, _period(rate_hz, address), joints)
+
+
+def _open_ros2(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
     from drake_teleop.robots.ros2 import Ros2Source
 
     return Ros2Source(address, _period(rate_hz, address), joints)
+
+
+def _open_zenoh_sink(address: str) -> Sink:
+    from drake_teleop.robots.ros2_zenoh import ZenohSink
+
+    return ZenohSink(address)
 
 
 def _open_ros2_sink(address: str) -> Sink:
@@ -229,6 +241,7 @@ PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource
         "rtde": _open_rtde,
         "netft": _open_netft,
         "zenoh": _open_zenoh,
+        "ros2": _open_ros2,
     },
 )
 """Sources of wrench and motion apart, called with address, rate [Hz] or None, and joint names."""
@@ -237,7 +250,8 @@ SINKS: Registry[Callable[[str], Sink]] = Registry(
     {
         "-": lambda address: LineSink(sys.stdout),
         "udp": UdpSink,
-        "zenoh": _open_ros2_sink,
+        "zenoh": _open_zenoh_sink,
+        "ros2": _open_ros2_sink,
         "foxglove": _open_foxglove,
         ".csv": lambda address: TableSink(Path(address)),
         ".parquet": lambda address: TableSink(Path(address)),
