@@ -218,7 +218,7 @@ def test_command_prints_text_and_warnings(tmp_path, capsys):
         )
         assert printed.err.splitlines() == [f"warning: {text}" for text in warnings]
     (choice,) = (p.type for p in cli.commands["export"].params if p.name == "to")
-    assert tuple(choice.choices) == tuple(FORMATS)
+    assert tuple(choice.choices) == (*FORMATS, "c99", "fmu", "ros2_filter")
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))
