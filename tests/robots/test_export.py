@@ -17,6 +17,7 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.robots.controller.export import FORMATS as CONTROLLER_FORMATS
 from drake_teleop.robots.export import FORMATS, STANDARD_GRAVITY, export
 
 MASS, COM = 1.7, np.array([0.012, -0.034, 0.091])
@@ -218,7 +219,7 @@ def test_command_prints_text_and_warnings(tmp_path, capsys):
         )
         assert printed.err.splitlines() == [f"warning: {text}" for text in warnings]
     (choice,) = (p.type for p in cli.commands["export"].params if p.name == "to")
-    assert tuple(choice.choices) == tuple(FORMATS)
+    assert tuple(choice.choices) == (*FORMATS, *CONTROLLER_FORMATS)
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))
