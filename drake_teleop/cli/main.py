@@ -454,12 +454,16 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 _EXPORT_FORMATS = (
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
 )
+_CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
 
 
 @cli.command()
 @click.argument("identification", type=option.PATH)
 @click.option(
-    "--to", required=True, type=click.Choice(_EXPORT_FORMATS), help="Robot or file format."
+    "--to",
+    required=True,
+    type=click.Choice(_EXPORT_FORMATS + _CONTROLLER_FORMATS),
+    help="Robot or file format.",
 )
 @option.sensor_pose("Sensor in the flange [m, deg].  [default: values in the sensor's frame]")
 @click.option(
@@ -469,17 +473,42 @@ _EXPORT_FORMATS = (
     show_default=True,
     help="As in the log description: -1 if the sensor measures the wrench of the load on it.",
 )
-def export(identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str) -> None:
-    """Print a load in the format of a robot or model.
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=option.POSITIVE,
+    metavar="HZ",
+    help="Rate of the readings; required by c99.",
+)
+@option.cutoff
+@option.sensor_range
+@option.out("export")
+def export(
+    identification: Path,
+    to: str,
+    sensor_pose: tuple[float, ...] | None,
+    sign: str,
+    **loop: Any,
+) -> None:
+    """Write a load for a robot, model or controller.
 
-    Converts the load of an identification.json into the format, units and frame of a robot, a
-    compensation or a model. Values that are dropped or not identified are listed on stderr.
+    Prints the load of an identification.json in the format, units and frame of a robot, a
+    compensation or a model. c99 writes the compensation itself into --out, as code of a controller
+    with --rate, --cutoff and --range. Values that are dropped or not identified are listed on
+    stderr.
     """
     from drake_teleop.load.identification import Identification
-    from drake_teleop.robots.export import export as export_load
 
     found = Identification.load(identification)
-    text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
+    if to in _CONTROLLER_FORMATS:
+        from drake_teleop.robots.controller.export import export_controller
+
+        notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **loop)
+        text = ""
+    else:
+        from drake_teleop.robots.export import export as export_load
+
+        text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
     for note in notes:
         click.echo(f"warning: {note}", err=True)
     click.echo(text, nl=False)
@@ -553,6 +582,40 @@ def compare_passivity(
         methods=methods or comparison.METHODS,
         **options,
     )
+
+
+@cli.command()
+@click.argument("scenario", type=option.SCENARIO)
+@click.option("--hands", type=option.Names(), help="Grips.  [default: light,firm]")
+@click.option("--walls", type=option.Names(), help="Stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option("--network", help="Preset of the network.  [default: of the scenario]")
+@click.option(
+    "--task",
+    type=click.Choice(["press", "touch", "insert"]),
+    default="press",
+    show_default=True,
+    help="Task; it sets the required margin.",
+)
+@option.jobs
+@option.out("tune")
+@option.quiet
+def tune(
+    scenario: str,
+    out: Path,
+    hands: tuple[str, ...] | None,
+    walls: tuple[str, ...] | None,
+    **options: Any,
+) -> None:
+    """Choose passivity method and force scales for a station.
+
+    SCENARIO is a shipped name or a YAML file. Finds the settings with the smallest detectable
+    contact force that are stable for these grips and walls. Writes tuned.yaml and report.html.
+    After an interruption the same command continues.
+    """
+    from drake_teleop.lab.tuning.tune import tune as tune_station
+
+    stiffnesses = [option.POSITIVE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
+    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffnesses, **options)
 
 
 @cli.command()

@@ -235,6 +235,26 @@ def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: 
     assert set(flags[-200:]) == {Flag.WRONG_RATE if named else 0}
 
 
+@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize(
+    ("status", "flag"),
+    [(0, 0), (1 << 30 | 1 << 18 | 1 << 16, 0), (1 << 31, Flag.DAMAGED), (1 << 31 | 1, Flag.DAMAGED),
+     (1 << 17, Flag.SATURATED), (1 << 31 | 1 << 17, Flag.SATURATED)],
+)  # fmt: skip
+def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
+    status: int, flag: int, still: bool
+) -> None:
+    source = NetFtSource("netft://127.0.0.1?counts=2,4&rate=1000&sign=-1")
+    counts = [2, -4, 6, 4, -8, 12]
+    source.part(struct.pack(">III6i", 1, 7, 0, *counts), 0.0)
+    for after, stale in ((0.049, 0), (0.051, Flag.STALE)):
+        record = struct.pack(">III6i", 2, 7 + (not still), status, *counts)
+        part = source.part(record, after)
+        assert part.flags == flag | (stale if still else 0)
+        np.testing.assert_array_equal(part.values, [-1, 2, -3, -1, 2, -3])
+    source.close()
+
+
 def test_netft_page_contains_counts_units_and_rate() -> None:
     page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
         <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""

@@ -13,7 +13,6 @@ pictures     main effects, interactions of two factors, Pareto front
 from __future__ import annotations
 
 import copy
-import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -21,10 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydrake.common.yaml import yaml_dump, yaml_load_typed
-
-from drake_teleop.common.config import check_ranges, check_structure
-from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
+from drake_teleop.common.config import check_ranges
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.lab.run import run_scenario
@@ -34,7 +31,14 @@ from drake_teleop.lab.studies.measures import measured
 from drake_teleop.lab.studies.pictures import write_pictures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
 from drake_teleop.lab.studies.shards import parse_shard
-from drake_teleop.station.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
+from drake_teleop.station.scenario import (
+    ReadScenario,
+    Scenario,
+    ScenarioFromData,
+    ScenarioNames,
+    settings_from_data,
+    shipped_file,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -109,7 +113,7 @@ def study_command(
     ):
         if both:
             raise DrakeTeleopError(f"{first} and {second} exclude each other", where=str(path))
-    study, path = LoadStudy(path), study_file(path)
+    study, path = LoadStudy(path), shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_size(str(path), yes)
     data, where = ReadScenario(_scenario_path(study, path))
@@ -134,36 +138,14 @@ def study_command(
     return summary
 
 
-def study_file(name_or_path: str | Path) -> Path:
-    """Return the file of a shipped study, or the given path.
-
-    Raises:
-        DrakeTeleopError: if neither exists.
-    """
-    expect((str, Path), name_or_path, "study")
-    shipped = studies_dir() / f"{name_or_path}.yaml"
-    path = shipped if os.path.isfile(shipped) else Path(name_or_path)
-    if not os.path.isfile(path):
-        names = sorted(file.stem for file in studies_dir().glob("*.yaml"))
-        raise DrakeTeleopError(
-            f"there is no study '{name_or_path}'",
-            remedy=suggestion(
-                name_or_path, names, f"give a YAML file or one of {', '.join(names)}"
-            ),
-        )
-    return path
-
-
 def LoadStudy(path: str | Path) -> Study:
     """Load a study file and check everything that does not depend on the scenario.
 
     Raises:
         DrakeTeleopError: if it is invalid; with file and field.
     """
-    path = study_file(path)
-    data = read_yaml(path)
-    check_structure(Study, data, str(path))
-    study = yaml_load_typed(schema=Study, data=yaml_dump(data), defaults=Study())
+    path = shipped_file("study", path, studies_dir())
+    study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study
 
@@ -177,8 +159,7 @@ def _check_values(factor: Factor, where: str) -> None:
     ranged = factor.low is not None and factor.high is not None
     for value in (factor.low, factor.high) if ranged else factor.listed():
         data = _with_changes({}, {factor.field: value})
-        check_structure(Scenario, data, where)
-        check_ranges(yaml_load_typed(schema=Scenario, data=yaml_dump(data)), where)
+        check_ranges(settings_from_data(Scenario, data, where), where)
 
 
 def _with_changes(data: Any, changes: dict[str, Any]) -> Any:
