@@ -24,6 +24,7 @@ RUNS = {
     "foreign_analysis": "benchmarks/foreign_analysis.py --json FILE",
     "frequency_response": "benchmarks/frequency_response.py --json FILE",
     "identification": "benchmarks/identification.py --json FILE",
+    "kernel": "benchmarks/kernel.py --json FILE",
     "intervals": "benchmarks/intervals.py --json FILE",
     "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
     "ledger_in_station": "benchmarks/ledger_in_station.py --json FILE",
@@ -49,6 +50,8 @@ RUNS = {
     "repeated": "benchmarks/repeated.py --json FILE",
     "replayed": "benchmarks/replayed.py --json FILE",
     "reproduce": "drake-teleop reproduce --quiet --out FOLDER",
+    "ros2": "benchmarks/ros2.py --json FILE",
+    "study_shards": "benchmarks/study.py --shards 8 --runs 64 --json FILE",
     "shortest": "benchmarks/shortest.py --json FILE",
     "station": "benchmarks/station.py --json FILE",
     "stations": (
@@ -636,9 +639,54 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["poses.false_known"], "numbers", 0.0, 0.0),
     ),
     Claim(
+        *(SPEED, "CPU time that a study in shards takes beyond one process, for each start"),
+        *("8 shards, 3 killed and submitted again, a merge", "cluster.md", "study_shards"),
+        *(lambda f: f["cost_of_a_start_cpu_s"], "s", 0.0, 10.0),
+    ),
+    Claim(
+        *(
+            LIVE,
+            "Calibrations from ROS 2 topics with every true number inside its 99.98 % interval",
+        ),
+        *("50 hand-moved loads, nodes in other processes, 200 Hz", "robot.md", "ros2"),
+        *(lambda f: f["calibrations.inside_all_intervals"], "of 50", 50.0, 50.0),
+    ),
+    Claim(
+        *(LIVE, "Processing of a reading between ROS 2 topics, 99th percentile"),
+        *("500 Hz, time of the thread, poses included", "robot.md", "ros2"),
+        *(lambda f: f["processing_thread_p99_ms"], "ms", 0.0, 1.0),
+    ),
+    Claim(
         *(LIVE, "Numbers in which `compensate replay:LOG` differs from `eliminate --causal`"),
         *("all logs of the repository, in chunks of any size", "robot.md", "replayed"),
         *(lambda f: f["different"], "numbers", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "Readings in which the exported C code differs from `compensate` in any bit"),
+        "10⁶, some invalid; gcc, clang, gcc for aarch64 in qemu, -O0 to -O3 and -Os, without fused"
+        " multiply-add; WebAssembly in node",
+        *("controller.md", "kernel"),
+        lambda f: sum(v for k, v in f.items() if k.endswith(".different") and "fused" not in k),
+        *("readings", 0.0, 0.0),
+    ),
+    Claim(
+        *(LIVE, "Size of its object file"),
+        *("gcc, x86-64, -Os; code and constants", "controller.md", "kernel"),
+        *(lambda f: f["gcc.-Os.bytes"], "bytes", 0.0, 4096.0),
+    ),
+    Claim(
+        *(LIVE, "Its time for a reading over that of the compiled Python kernel"),
+        *("gcc, x86-64, -O2; both in a compiled loop", "controller.md", "kernel"),
+        *(lambda f: f["gcc.-O2.ns"] / f["python.ns"], "times", 0.0, 1.5),
+    ),
+    InTests(
+        *(LIVE, "FMUs of FMI 2.0 and 3.0 have the bits of `compensate`, one step later"),
+        *("FMPy validates and simulates both", "controller.md", "tests/robots/test_fmu.py"),
+    ),
+    InTests(
+        *(LIVE, "The page of the site has the numbers of `eliminate --causal`"),
+        *("the sample log, headless Chromium", "browser.md"),
+        "tests/robots/test_browser_kernel.py",
     ),
     Claim(
         *(LIVE, "Residual force in NTNU's vibrations, live, without its mean"),

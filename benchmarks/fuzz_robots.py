@@ -16,7 +16,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.robots.assembly import Assembly, Parts
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD, NetFtSource
-from drake_teleop.robots.ros2 import KINDS, Messages, attachment, message_types
+from drake_teleop.robots.ros2_messages import KINDS
+from drake_teleop.robots.ros2_zenoh import Messages, attachment, message_types
 from drake_teleop.robots.rtde import parts_of
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import IMU, JOINTS, NONZERO_FLAGS, POSE, WRENCH, Part, Reading

@@ -5,7 +5,7 @@ share in proportion to the root of its number of places for mistakes. For each m
 tests run, the most direct and quickest first, until one fails. A mutant that passes all of them has
 survived: it needs a test, or a reason in `mutants_equivalent.yaml` why no result changes.
 
-    python benchmarks/mutants.py [--number 220] [--seed 0] [--only FILE] [--jobs 2] [--json FILE]
+    python benchmarks/mutants.py [--number 220] [--seed 0] [--only FILE ...] [--near] [--jobs 2]
 
 All happens in copies in a folder for temporary files. What is found is written there at once, so
 that the same command goes on after an interruption; `--again` runs the survivors again. Each mutant
@@ -40,7 +40,7 @@ from mutations import Mutation, mutations
 
 PACKAGE = "drake_teleop"
 GROUPS = ("station", "lab", "live")
-"""Packages whose subpackages are counted separately."""
+"""Packages whose subpackages have test folders of their own."""
 #: Tests of texts and long runs; none of them checks one number of one package.
 LEFT_OUT = {"test_benchmarks", "test_layers", "test_notebooks", "test_packaging", "test_quality"}
 LEFT_OUT |= {"test_readme", "test_language"}
@@ -55,7 +55,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--number", type=int, default=220, help="of mutants")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="files with this in their path")
+    parser.add_argument(
+        "--only", nargs="+", default=[""], help="files with any of these in the path"
+    )
+    parser.add_argument("--near", action="store_true", help="only tests of the package or file")
+    parser.add_argument("--marks", default="not checks", help="tests to run, as pytest's -m")
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
     parser.add_argument("--budget", type=float, default=60.0, help="s of tests for one mutant")
     parser.add_argument("--again", action="store_true", help="run what survived once more")
@@ -74,7 +78,7 @@ def main() -> None:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
 
 
-def numeric_files(root: Path, only: str = "") -> list[str]:
+def numeric_files(root: Path, only: Iterable[str] = ("",)) -> list[str]:
     """Return the files that compute and neither draw nor print."""
     files = []
     for path in sorted((root / PACKAGE).rglob("*.py")):
@@ -82,7 +86,12 @@ def numeric_files(root: Path, only: str = "") -> list[str]:
         shows = path.name == "verdict.py" or re.search(
             rf"^\s*(from|import) (matplotlib|rich|{PACKAGE}\.common\.style)\b", text, re.M
         )
-        if only in file and not shows and "/cli/" not in file and path.name != "__init__.py":
+        if (
+            any(part in file for part in only)
+            and not shows
+            and "/cli/" not in file
+            and path.name != "__init__.py"
+        ):
             files.append(file)
     return files
 
@@ -93,7 +102,12 @@ def package_of(file: str) -> str:
     return parts[1] if len(parts) > 1 and parts[0] in GROUPS else parts[0]
 
 
-def sample(root: Path, number: int, seed: int, only: str = "") -> list[Mutation]:
+def folder_of(file: str) -> str:
+    """Return a file's subpackage, by which mutants are counted."""
+    return "/".join(file.split("/")[1:-1])
+
+
+def sample(root: Path, number: int, seed: int, only: Iterable[str] = ("",)) -> list[Mutation]:
     """Mutants of all numeric files; those of a file depend on the seed and on that file alone."""
     sites = {
         file: mutations(file, (root / file).read_bytes()) for file in numeric_files(root, only)
@@ -177,26 +191,29 @@ def distances(graph: dict[str, set[str]], start: str) -> dict[str, int]:
     return reached
 
 
+def remoteness(file: str, test: str, reach: dict[str, int]) -> int:
+    """Return 0 for a test file of the package that imports `file`, 1 if it is one of the two.
+
+    Tests of the whole have 2, others 3.
+    """
+    package, folder = package_of(file), test.split("/")[1]
+    direct, near = reach[file] == 1, folder in (package, f"test_{package}.py")
+    return 2 - direct - near if direct or near else 2 if test.count("/") == 1 else 3
+
+
 def related(
     file: str, reach: dict[str, dict[str, int]], seconds: dict[str, float], budget: float
 ) -> list[str]:
-    """Test files that can see `file`, the nearest and quickest first, of `budget` seconds.
-
-    First those that import it or are of its package; then those of the whole; then the rest.
-    """
-    package = package_of(file)
-
-    def key(test: str) -> tuple[int, float]:
-        direct, near = reach[test][file] == 1, test.split("/")[1] == package
-        whole = test.count("/") == 1
-        return 0 if direct and near else 1 if direct or near else 2 if whole else 3, seconds[test]
-
-    tests = sorted((test for test in seconds if file in reach[test]), key=key)
+    """Test files that can see `file`, the nearest and quickest first, of `budget` seconds."""
+    tests = sorted(
+        (test for test in seconds if file in reach[test]),
+        key=lambda test: (remoteness(file, test, reach[test]), seconds[test]),
+    )
     sums = [sum(seconds[test] for test in tests[:count]) for count in range(len(tests))]
     return [
         test
         for test, before in zip(tests, sums, strict=True)
-        if before < budget or key(test)[0] == 0
+        if before < budget or remoteness(file, test, reach[test]) == 0
     ]
 
 
@@ -222,7 +239,8 @@ def tested(
         or (arguments.again and known[names[mutant]]["outcome"] == "survived")
     ]
     if wanted:
-        reach, seconds = warmed(root, tree, folder, {mutant.file for mutant in wanted})
+        files = {mutant.file for mutant in wanted}
+        reach, seconds = warmed(root, tree, folder, files, arguments)
     # In any order, so that an interrupted run is a sample of all packages too.
     random.Random(arguments.seed).shuffle(wanted)
     running: dict[Any, tuple[Mutation, Fork]] = {}
@@ -231,7 +249,7 @@ def tested(
             while wanted and len(running) < arguments.jobs:
                 mutant = wanted.pop()
                 tests = related(mutant.file, reach, seconds, arguments.budget)
-                fork = Fork(_copy(tree, folder, mutant), tests)
+                fork = Fork(_copy(tree, folder, mutant), tests, arguments.marks)
                 running[fork.process.sentinel] = mutant, fork
             for sentinel in _over(running):
                 mutant, fork = running.pop(sentinel)
@@ -269,7 +287,7 @@ def _name(mutant: Mutation, source: bytes) -> str:
 
 
 def warmed(
-    root: Path, tree: Path, folder: Path, files: Iterable[str]
+    root: Path, tree: Path, folder: Path, files: Iterable[str], arguments: argparse.Namespace
 ) -> tuple[dict[str, dict[str, int]], dict[str, float]]:
     """Makes `tree` a copy of `root` in which all that the tests need is compiled already.
 
@@ -291,10 +309,16 @@ def warmed(
         for test, duration in seconds.items()
         if test in reach and not changed & reach[test].keys()
     }
-    new = [t for t in tests if t not in seconds and any(file in reach[t] for file in files)]
+    farthest = 1 if arguments.near else 3
+    new = [
+        test
+        for test in tests
+        if test not in seconds
+        and any(f in reach[test] and remoteness(f, test, reach[test]) <= farthest for f in files)
+    ]
     print(f"{len(new)} test files without any mutant", flush=True)
     for test in sorted(new):  # one by one: what fails without a mutant tells nothing with one
-        fork = Fork(tree, [test])
+        fork = Fork(tree, [test], arguments.marks)
         while fork.process.is_alive() and not fork.waits_too_long():
             fork.process.join(5.0)
         result = fork.result()
@@ -350,13 +374,13 @@ def _keep_compiled(copy: Path, tree: Path) -> None:
 class Fork:
     """Tests in a process of their own, until one fails."""
 
-    def __init__(self, tree: Path, tests: list[str]) -> None:
+    def __init__(self, tree: Path, tests: list[str], marks: str) -> None:
         self.tree, self.tests = tree, tests
         self.found = tree.parent / "found.json"
         self.found.unlink(missing_ok=True)
         self._start = time.monotonic()
         context = multiprocessing.get_context("fork")
-        self.process = context.Process(target=_run, args=(tree, tests, self.found))
+        self.process = context.Process(target=_run, args=(tree, tests, marks, self.found))
         self.process.start()
 
     def waits_too_long(self) -> bool:
@@ -385,7 +409,7 @@ class Fork:
         }
 
 
-def _run(tree: Path, tests: list[str], found: Path) -> None:
+def _run(tree: Path, tests: list[str], marks: str, found: Path) -> None:
     """The body of a fork; its exit code is pytest's."""
     import pytest
 
@@ -409,7 +433,7 @@ def _run(tree: Path, tests: list[str], found: Path) -> None:
         "-p",
         "no:cacheprovider",
         "-m",
-        "not checks",
+        marks,
         f"--rootdir={tree}",
     ]
     options.append(f"--basetemp={tree.parent / 'temporary'}")
@@ -418,6 +442,7 @@ def _run(tree: Path, tests: list[str], found: Path) -> None:
     for part in (tests[:3], tests[3:]):
         if part and code == 0:
             code = int(pytest.main([*options, *part], plugins=[_Watch(found)]))
+            code = 0 if code == pytest.ExitCode.NO_TESTS_COLLECTED else code
     sys.stdout.flush()
     os._exit(code)
 
@@ -485,7 +510,7 @@ def summary(records: list[dict[str, Any]]) -> dict[str, float]:
     """Return figures by name: of all, and of each package."""
     known, counts = explanations(), Counter()
     for record in records:
-        for group in ("all", package_of(record["file"])):
+        for group in ("all", folder_of(record["file"])):
             counts[f"{group}.made"] += 1
             counts[f"{group}.{record['outcome'].replace(' ', '_')}"] += 1
             if record["outcome"] == "survived":
@@ -508,10 +533,10 @@ def report(records: list[dict[str, Any]], figures: dict[str, float]) -> None:
             print(f"  {why}")
     print()
     names = ("made", "killed", "timed_out", "survived", "explained")
-    print(f"{'':20s}" + "".join(f"{name:>11s}" for name in names))
+    print(f"{'':24s}" + "".join(f"{name:>11s}" for name in names))
     for package in sorted({name.partition(".")[0] for name in figures}):
         cells = [figures.get(f"{package}.{name}", 0.0) for name in names]
-        print(f"{package:20s}" + "".join(f"{cell:11.0f}" for cell in cells))
+        print(f"{package:24s}" + "".join(f"{cell:11.0f}" for cell in cells))
     print(f"noticed: {figures['all.killed_percent']:.1f} %")
 
 

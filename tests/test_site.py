@@ -32,7 +32,9 @@ COPIED = {"benchmarks.md", "changelog.md", "contributing.md", "evidence.md"}
 TESTED = {
     "README.md": "tests/test_readme.py",
     "analysis.md": "tests/test_analysis_doc.py",
+    "browser.md": "tests/robots/test_browser_kernel.py",
     "blocks.md": "tests/blocks/test_plain_blocks.py",
+    "cluster.md": "tests/studies/test_study.py",
     "delay.md": "tests/test_delay_doc.py",
     "delay-figures.md": "tests/test_delay_doc.py",
     "detection.md": "tests/test_detection_doc.py",

@@ -51,6 +51,7 @@ KEYWORDS = {
         "a-side-of-your-own": "LeafSystem",
         "ports": "port",
     },
+    "cluster": {"a-batch-script": "SLURM, HPC, array job, shard, merge"},
     "studies": {"how-long-it-takes": "Dask, cluster"},
     "wrench-not-zero": {"a-robot-s-log-after-eliminate": "tare, offset, drift"},
 }

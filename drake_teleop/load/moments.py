@@ -80,11 +80,7 @@ class Moments:
 
     @property
     def mean(self) -> Array:
-        """Mean of z z^T (19, 19) over the record.
-
-        Raises:
-            DrakeTeleopError: for fewer than 3 samples.
-        """
+        """Mean of z z^T (19, 19) over the record."""
         if self.samples < 3:
             raise DrakeTeleopError(
                 f"{self.samples:.3g} samples cannot determine a load",

@@ -56,11 +56,7 @@ class NormalEquations(Moments):
         self._weights = np.ones(6) if noise is None else positive("noise", noise, 6) ** -2.0
 
     def solve(self, delay_s: float = 0.0) -> Identification:
-        """Return the least squares solution; `delay_s` [s] is only stored in it.
-
-        Raises:
-            DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
-        """
+        """Return the least squares solution; `delay_s` [s] is only stored in it."""
         inverse, undetermined, condition_number = self._pseudo_inverse()
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:

@@ -1,9 +1,9 @@
-"""Identification of the load, and its removal, for log files (long: two commands)."""
+"""Identification of the load, and its removal, for log files (long: three commands)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from drake_teleop.logs.check.conventions import (
 )
 from drake_teleop.logs.check.corrections import EFFECTS, Finding
 from drake_teleop.logs.contact import (
+    MIN_SAMPLES,
     Detection,
     detect_contact,
     noise_floor,
@@ -594,3 +595,50 @@ def _scales(
         )
     sigma_gripper, kept, gamma = scales_from_eta(eta)
     return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}
+
+
+@dataclass(frozen=True)
+class DetectedLog(Detection):
+    """Contacts of a log, and the log after removal of the load's wrench (`eliminated`)."""
+
+    eliminated: EliminatedLog = field(kw_only=True)
+
+
+def detect_log(
+    path: str | Path,
+    load: str | Path | Identification | None = None,
+    *,
+    free: str | Path | None = None,
+    statistic: str = "level",
+    cutoff_hz: float = 30.0,
+    delay: str | float = "auto",
+) -> DetectedLog:
+    """Find contact in a log, after a zero-phase low-pass.
+
+    Args:
+        path: canonical table or log description.
+        load: identification.json or its content; None: load identified from the log itself.
+        free: log of equally fast free motion with the same load; None: calm parts of the log
+            itself.
+        statistic: "level", "cusum" or "glr".
+        cutoff_hz: cut-off of the low-pass.
+        delay: delay of the motion behind the wrench [s], or "auto".
+    """
+    if load is None:
+        load = identify_log(path, cutoff_hz=cutoff_hz, delay=delay).identification
+    elif not isinstance(load, Identification):
+        load = Identification.load(load)
+    found = eliminate_log(
+        path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
+    )
+    if found.log.static:
+        raise DrakeTeleopError(
+            "contains poses at rest, which have no contact", where=found.log.source
+        )
+    if found.detection is None:
+        raise DrakeTeleopError(
+            f"{len(found.log)} samples are too few to separate contact from noise",
+            where=found.log.source,
+            remedy=f"give a record of more than {MIN_SAMPLES} samples",
+        )
+    return DetectedLog(**vars(found.detection), eliminated=found)

@@ -84,19 +84,10 @@ def export(
             f"{to!r} is not a target", where="export", remedy=f"one of {', '.join(FORMATS)}"
         )
     format = FORMATS[to]
-    if found.weight_removed and format.of_sensor:
-        raise DrakeTeleopError(
-            f"the robot has removed the load's weight from the wrench, and {to} would subtract it"
-            " once more",
-            where="export",
-            remedy="use a wrench without the robot's payload compensation, or `compensate`",
-        )
+    if format.of_sensor:
+        refuse_removed_weight(found, to)
     if sensor_pose is not None and format.of_sensor:
-        raise DrakeTeleopError(
-            f"{to} takes its values in the sensor's frame",
-            where="export",
-            remedy="remove the sensor's pose",
-        )
+        raise in_sensor_frame(to)
     x, y, z, *angles = [0.0] * 6 if sensor_pose is None else sensor_pose
     R_FS = rotation_matrices(np.radians([angles]), "euler", "xyz")[0]
     phi = transform_phi(found.phi, R_FS, [x, y, z])
@@ -111,6 +102,26 @@ def export(
     warnings = _warnings(found, to, format)
     notes = "".join(f"{format.comment} {text}\n" for text in warnings if format.comment)
     return notes + format.write(load), warnings
+
+
+def in_sensor_frame(to: str) -> DrakeTeleopError:
+    """Return the error for a sensor's pose and a format in the sensor's frame."""
+    return DrakeTeleopError(
+        f"{to} takes its values in the sensor's frame",
+        where="export",
+        remedy="remove the sensor's pose",
+    )
+
+
+def refuse_removed_weight(found: Identification, to: str) -> None:
+    """Raise DrakeTeleopError for a load that was identified from a wrench without its weight."""
+    if found.weight_removed:
+        raise DrakeTeleopError(
+            f"the robot has removed the load's weight from the wrench, and {to} would subtract it"
+            " once more",
+            where="export",
+            remedy="use a wrench without the robot's payload compensation, or `compensate`",
+        )
 
 
 def _warnings(found: Identification, to: str, format: Format) -> list[str]:

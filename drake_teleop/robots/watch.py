@@ -112,7 +112,7 @@ class Detector:
                 where=str(free),
                 remedy="use the log that `calibrate` wrote from this stream",
             )
-        self._fast, self._slow = (_low_pass(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
+        self._fast, self._slow = (low_pass_coefficients(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
@@ -157,11 +157,6 @@ class Detector:
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
         return int(Flag.IN_CONTACT) if touched else 0
-
-
-def _low_pass(dt: float, cutoff_hz: float) -> Array:
-    b, a, settled = low_pass_coefficients(dt, cutoff_hz)
-    return np.concatenate([b, a[1:], settled])
 
 
 @njit(cache=True)

@@ -20,7 +20,7 @@ from drake_teleop.live.experiment.design import (
     PegInSlot,
 )
 from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, trials_of
-from drake_teleop.live.experiment.psychometrics import correct_probability
+from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
 from drake_teleop.live.experiment.store import Store, open_results
 
 SMALL = Experiment(
@@ -195,3 +195,16 @@ def test_the_shipped_experiment_is_complete():
     experiment, scenarios = LoadExperiment("contact_and_mass")
     assert len(scenarios) == len(experiment.tasks) == 3
     assert "without your name" in experiment.consent
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.2, 20.0), (1.0, 8.0)])
+def test_practice_has_the_largest_level_and_changes_no_estimate(tmp_path, low, high):
+    task = ContactDetection(trials=2, practice=3, low=low, high=high)
+    experiment = Experiment(tasks=[task], conditions=[Condition(name="a")])
+    store = Store(tmp_path)
+    go_through(Procedure(experiment, 1, store), np.random.default_rng(3), 1e9)
+    rows, psi = store.rows(1), Psi(low, high)
+    assert not all(row.correct for row in rows[:3])
+    assert [row.level for row in rows[:4]] == [high, high, high, psi.next_level()]
+    psi.update(rows[3].level, bool(rows[3].correct))
+    assert rows[4].level == psi.next_level()

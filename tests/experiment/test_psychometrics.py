@@ -50,3 +50,18 @@ def test_intervals_contain_the_true_thresholds():
         off.append(abs(np.log(found.value / truth)))
     assert sum(held) >= 28
     assert np.exp(np.median(off)) < 1.3
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.2, 20.0), (0.004, 0.15)])
+@pytest.mark.parametrize(("node", "slope", "lapse"), [(3, 0, 0), (40, 2, 3), (77, 6, 1)])
+def test_a_single_node_of_the_grid_is_the_median(low, high, node, slope, lapse):
+    psi = Psi(low, high)
+    psi._posterior[:] = 0.0
+    psi._posterior[node, slope, lapse] = 1.0
+    spacing = (4.0 * high / low) ** (1 / 80)  # of 81 thresholds from low / 2 to 2 high
+    threshold = low / 2.0 * spacing**node
+    cell = threshold * spacing ** np.array([0.0, -0.475, 0.475])
+    np.testing.assert_allclose(psi.threshold(), cell, rtol=1e-12)
+    for level in (low, high):
+        expected = (level / threshold) ** np.geomspace(0.7, 3.0, 7)[slope]
+        assert psi.d_prime(level).value == pytest.approx(expected)

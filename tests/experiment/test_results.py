@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,10 +11,10 @@ from test_procedure import SMALL, go_through
 
 from drake_teleop.cli.experiment import whose_turn
 from drake_teleop.common.style import Picture
-from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
+from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
 from drake_teleop.live.experiment.procedure import Procedure, trials_of
 from drake_teleop.live.experiment.results import Result, _draw, results, write_results
-from drake_teleop.live.experiment.store import Store
+from drake_teleop.live.experiment.store import Row, Store
 
 CONTACT = "threshold of contact [N at the tool]"
 
@@ -62,3 +63,30 @@ def test_next_participant_has_trials_left_or_is_new(tmp_path):
     assert whose_turn(store, trials) == 2
     go_through(Procedure(SMALL, 2, store), np.random.default_rng(0), 2.0, most=5)
     assert (whose_turn(store, trials), whose_turn(store, trials, 7)) == (2, 7)
+
+
+def test_shares_have_arithmetic_means_and_times_geometric_ones(tmp_path):
+    """Failed and practice trials have no time; t(0.975, 1) = 12.706."""
+    experiment, store = (
+        Experiment(tasks=[PegInSlot()], conditions=[Condition(name="a")]),
+        Store(tmp_path),
+    )
+    for number, done, time in ((1, (1, 1, 1, 0), 2.0), (2, (0, 0, 1, 0), 8.0)):
+        rows = [
+            Row(k, "PegInSlot", "a", 0, 0.0, 0, 0, ok, time if ok else 30.0, 3.0 * time, 0.0)
+            for k, ok in enumerate(done)
+        ]
+        rows.append(dataclasses.replace(rows[2], trial=4, practice=1, time_s=20.0))
+        store.write(number, rows)
+    found = {(r.quantity, r.participant): r for r in results(experiment, store)}
+    shares = [found["share of trials done", n].value for n in (1, 2, 0)]
+    assert shares == pytest.approx([0.75, 0.25, 0.5])
+    times = [found["time to the floor [s]", n].value for n in (1, 2, 0)]
+    assert times == pytest.approx([2.0, 8.0, 4.0])
+    half = 12.706 * np.std(np.log([2.0, 8.0]), ddof=1) / np.sqrt(2.0)
+    over = found["time to the floor [s]", 0]
+    assert (over.low, over.high) == pytest.approx(
+        (4.0 / np.exp(half), 4.0 * np.exp(half)), rel=1e-3
+    )
+    assert found["largest contact force [N]", 0].value == pytest.approx(12.0)
+    assert {r.trials for r in found.values() if not r.participant} == {8}

@@ -209,11 +209,31 @@ def test_force_stays_within_limits_and_is_zero_after_50_ms_without_commands():
             assert np.linalg.norm(now[:3]) == pytest.approx(5.0)
         if age < 0.05:
             assert np.linalg.norm((now - last)[:3]) <= 1.0 + 1e-9
+            assert np.linalg.norm((now - last)[3:]) <= 0.01 + 1e-9
         else:
             assert not now.any()
         if 0 <= k - 250 < 50:  # it comes back by 100 N/s
             assert np.linalg.norm(now[:3]) <= 0.1 * (k - 249) + 1e-9
         last = now
+
+
+@pytest.mark.parametrize(
+    ("axis", "force", "pressed"), [(0, 4.0, 0.2), (2, -9.0, 0.1), (1, 6.0, 0.02)]
+)
+def test_at_most_300_mJ_of_stored_energy_return(axis, force, pressed):
+    guard, position, wrench = DeviceGuard(Limits(10.0, slew=1e9)), np.zeros(3), np.zeros(6)
+    wrench[axis] = force
+    for _ in range(200):
+        guard.tick(position, wrench, 0.0, MS)
+    energies = []
+    for speed in (-1.0, 1.0):
+        for _ in range(round(1.2e4 * pressed)):
+            position[axis] += speed * np.sign(force) * 1e-4
+            guard.tick(position, wrench, 0.0, MS)
+        energies.append(guard.energy)
+    stored = abs(force) * 1.2 * pressed
+    assert energies[0] == pytest.approx(stored, rel=1e-2)
+    assert energies[0] - energies[1] == pytest.approx(min(stored, 0.3), abs=1e-3)
 
 
 def tap_on_wall(stiffness, grip, delay, *, observe):

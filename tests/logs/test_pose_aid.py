@@ -13,7 +13,7 @@ from posed_record import GRAVITY_W, LATE, PHI, SECONDS, TRUTH, Kind, motion_at, 
 from scipy.interpolate import BSpline
 
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
-from drake_teleop.logs.pose_motion.imu_rows import compare_imu
+from drake_teleop.logs.pose_motion.imu_rows import _least_squares, compare_imu
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.pose_motion.spectra import (
     Grid,
@@ -59,6 +59,26 @@ def test_poses_determine_bias_axes_clock_and_noise_of_an_imu():
     assert np.sqrt((error**2).mean()) == pytest.approx(NOISE[0], rel=0.1)
     assert np.abs(error.mean(axis=0)).max() < 3e-3
     assert aid.own_powers == pytest.approx([x**2 / RATE for x in NOISE], rel=0.3)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.3, 1e-3])
+def test_gains_of_an_imu_have_a_prior_of_10_percent(size):
+    """Ridge regression: an axis that hardly turns has no gain error."""
+    rng, K = np.random.default_rng(7), 40
+    y, X, one, change = rng.normal(size=(4, K, 3)) + 1j * rng.normal(size=(4, K, 3))
+    X[:, 1] *= size
+    one, weight = one[:, :1], rng.uniform(0.5, 2.0, K)
+    rows = []
+    for i in range(3):
+        row = np.zeros((K, 13), complex)
+        row[:, 3 * i : 3 * i + 3], row[:, 9 + i], row[:, 12] = X, one[:, 0], change[:, i]
+        rows.append(np.column_stack([row, y[:, i]]) * weight[:, None])
+    stacked = np.concatenate(rows)
+    prior = np.column_stack([np.eye(9) / 0.1, np.zeros((9, 5))])
+    stacked = np.concatenate([stacked.real, stacked.imag, prior])
+    expected = np.linalg.lstsq(stacked[:, :13], stacked[:, 13], rcond=None)[0]
+    D, b, shift = _least_squares(y, X, one, change, weight)
+    np.testing.assert_allclose([*D.ravel(), *b, shift], expected, atol=1e-10)
 
 
 def test_derivatives_enter_the_normal_equations_as_rows():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ from posed_record import (
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
+from drake_teleop.logs.aligned_log import use_spline_motion
+from drake_teleop.logs.pose_motion.estimate import PoseEstimate, _base_taper, estimate_from_poses
 from drake_teleop.logs.pose_motion.linear_model import (
     Window,
     best_delay,
@@ -36,6 +38,7 @@ from drake_teleop.logs.pose_motion.linear_model import (
     fit_linear_model,
 )
 from drake_teleop.logs.pose_motion.poses import Poses
+from drake_teleop.logs.pose_motion.rejection import NOTHING_REJECTED, find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     ReadOff,
     State,
@@ -49,6 +52,7 @@ from drake_teleop.logs.pose_motion.rigid import (
     read_off,
 )
 from drake_teleop.logs.pose_motion.spectra import (
+    RATES,
     Grid,
     Levels,
     bands,
@@ -59,6 +63,7 @@ from drake_teleop.logs.pose_motion.spectra import (
 )
 from drake_teleop.logs.pose_motion.spectra import exclude as exclude_from_taper
 from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _thin_knots
+from drake_teleop.logs.read.canonical import Log
 
 
 @cache
@@ -89,6 +94,40 @@ def test_signals_match_the_motion_with_jitter_and_a_gap():
     assert error[:, 1:4].max() < 0.01  # of 2 m/s^2
     assert error[:, 7:10].max() < 0.05  # of 25 rad/s^2
     assert error[:, 10:].max() < 1e-3
+
+
+@pytest.mark.parametrize(("spacing", "delay"), [(0.05, 0.0), (0.08, 0.013), (0.05, -0.02)])
+def test_samples_within_two_knots_of_ends_and_gaps_are_flagged(spacing, delay):
+    t, wrench, poses = record(Kind())
+    kept = (np.abs(poses.t - 7.3) > 0.3) & (np.abs(poses.t - 12.0) > 0.01)
+    poses = Poses(poses.t[kept], poses.position[kept], poses.quaternion[kept]).continued()
+    posed = SimpleNamespace(gravity_W=GRAVITY_W)
+    log = Log(t, wrench, *np.zeros((3, len(t), 3)), posed=posed)
+    found = SimpleNamespace(delay_s=delay, splines=PoseSplines(poses, spacing))
+    moved, flags = use_spline_motion(log, found)
+    at = moved.t + delay
+    gap = np.searchsorted(poses.t, 7.3)
+    ends = poses.t[[0, gap - 1, gap, -1]]
+    distance = np.abs(at[:, None] - ends).min(axis=1) - 2.0 * spacing
+    np.testing.assert_array_equal(flags[distance < -1e-9], True)
+    np.testing.assert_array_equal(flags[distance > 1e-9], False)
+    assert 20 < flags.sum() < 0.1 * len(t)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.2, -0.15])
+@pytest.mark.parametrize(("length", "excluded"), [(0.06, False), (0.12, True), (0.7, True)])
+def test_400_ms_beside_gaps_of_the_poses_and_lost_samples_have_no_weight(delay, length, excluded):
+    t, wrench, poses = record(Kind())
+    kept = np.abs(poses.t - 7.0) > 0.5 * length
+    poses = Poses(poses.t[kept], poses.position[kept], poses.quaternion[kept])
+    gap = np.searchsorted(poses.t, 7.0)
+    first, last = poses.t[gap - 1] - delay, poses.t[gap] - delay
+    taper = _base_taper(Grid(t, wrench, 1), poses, np.abs(t - 12.0) < 0.05, delay)
+    near = (t > first - 0.399) & (t < last + 0.399)
+    assert (taper[near] == 0.0).all() if excluded else taper[near].min() > 0.99
+    assert (taper[np.abs(t - 12.0) < 0.05] == 0.0).all()
+    far = (t > 2.0) & (t < 18.0) & ((t < first - 1.5) | (t > last + 1.5)) & (np.abs(t - 12.0) > 1.0)
+    assert taper[far].min() > 0.99
 
 
 def test_knots_are_thinned_where_poses_are_too_few():
@@ -149,6 +188,7 @@ def test_noise_moments_predict_the_effect_of_noise():
     both = sums[well], Q[well]
     diagonal, expected = (np.diagonal(x, axis1=1, axis2=2).sum(axis=0) for x in both)
     shown = expected > 0.0
+    assert shown[1:16].all() and shown[RATES][1:].all()
     np.testing.assert_allclose(diagonal[shown], expected[shown], rtol=0.15)
 
 
@@ -484,3 +524,33 @@ def test_too_little_overlap_raises_error():
     t, wrench, poses = record(Kind(seed=1))
     with pytest.raises(DrakeTeleopError, match="too little in common"):
         estimate_from_poses(t + 100.0, wrench, poses, GRAVITY_W)
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize(
+    ("moving", "push"), [((0.0, 20.0), 4.0), ((0.0, 20.0), 0.0), ((8.0, 12.0), 0.0)]
+)
+def test_residual_only_where_the_load_moves_rejects_nothing(known, moving, push):
+    """The third motion is sensed 50 ms late; a push of 1 s is rejected with a margin."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 20.0, 0.01)
+    C, late = rng.normal(size=(6, 16)), 0.05 if moving[1] < 20.0 else 0.0
+
+    def signals(t):
+        moves = ((t > moving[0]) & (t < moving[1]))[:, None]
+        waves = [np.sin(2.0 * np.pi * f * t + f) for f in (0.3, 0.8, 1.3, 2.0)] + 11 * [0.0 * t]
+        return np.column_stack([np.ones(len(t)), moves * np.transpose(waves)])
+
+    wrench = signals(t + late) @ C.T + 0.02 * rng.normal(size=(len(t), 6))
+    wrench[(t > 5.0) & (t < 6.0)] += push
+    grid = Grid(t, wrench, 1, C if known else None)
+    spectra = SimpleNamespace(
+        of=SimpleNamespace(frequency=grid.frequency),
+        grid=grid,
+        taper=np.ones(len(t)),
+        signals=np.fft.rfft(signals(t), grid.length, axis=0),
+        wrench=np.fft.rfft(wrench, grid.length, axis=0),
+    )
+    rejected, note = find_disturbances(spectra, 0.05)
+    assert note == (NOTHING_REJECTED if late else "")
+    assert rejected[(t > 5.0) & (t < 6.0)].all() == bool(push)
+    assert not rejected[(t < 4.6) | (t > 6.4)].any()

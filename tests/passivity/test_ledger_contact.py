@@ -10,10 +10,16 @@ import pytest
 
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.ledger_slave import (
+    _CONTACT_DAMPING,
+    _CONTACT_STIFFNESS,
+    _DISPLAYED_FORCE,
+    _LAST_SPEED,
     CONTACT_STIFFNESS,
     IN_CONTACT,
     NORMAL,
+    OWN_VELOCITY,
     ROUND_TRIP,
+    _wall_is_removed,
     component_along,
     find_direction,
 )
@@ -253,6 +259,22 @@ def test_wrench_cross_fades_after_missing_packets():
     assert np.diff(course).max() <= MAX_WRENCH_RATE[0] * T + 1e-12 and course[-1] == pytest.approx(
         3.0
     )
+
+
+@pytest.mark.parametrize("shown", [0.25, 0.5, 4.0, 30.0])
+@pytest.mark.parametrize("stiffness, step", [(1e3, 0.0), (1e3, -2e-4), (4e4, 3e-4), (1e3, 1e-5)])
+@pytest.mark.parametrize("damping, speeds", [(0.0, (0.3, 0.0)), (20.0, (0.0, 0.1)), (9.0, (1, 1))])
+def test_wall_is_removed_if_its_motion_does_not_explain_the_lost_force(
+    shown, stiffness, step, damping, speeds
+):
+    memory = initial_memory("ledger", parameters(RICH), START)
+    normal = np.array([0.6, 0.0, -0.8, 0.0, 0.0, 0.0])
+    memory[NORMAL], memory[OWN_VELOCITY] = normal, -speeds[0] * normal
+    memory[_LAST_SPEED], memory[_DISPLAYED_FORCE] = speeds[1], shown
+    memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = stiffness, damping
+    explained = stiffness * abs(step) + damping * abs(speeds[1] - speeds[0])
+    removed = _wall_is_removed(step * normal, memory)
+    assert removed == (shown > max(0.3, 2.0 * explained))
 
 
 def test_friction_that_changes_its_sign_does_not_soften_the_wall():

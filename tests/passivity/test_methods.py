@@ -16,7 +16,19 @@ from drake_teleop.lab.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import HELD_WRENCH, LEDGER, LIMIT, MEMORY, SENT
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.passivity.force_limit import _LOCAL_LIMIT, ForceLimitConfig
+from drake_teleop.station.passivity.memory import (
+    DAMPING,
+    HELD_WRENCH,
+    LEDGER,
+    LIMIT,
+    MASS,
+    MEMORY,
+    MOTION_SCALE,
+    SENT,
+    STIFFNESS,
+)
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -213,6 +225,33 @@ def test_slave_keeps_its_pose_until_a_packet_arrives(method):
         method, config, poses(rng, 50), still, np.zeros((50, 6)), np.full((2, 50), -1)
     )
     np.testing.assert_allclose(command, np.tile([*START, *np.zeros(6)], (50, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("power", [(1.0, 1.0), (0.5, 8.0)])
+@pytest.mark.parametrize("motion", [(1.0, 1.0), (4.0, 0.25)])
+@pytest.mark.parametrize("limits", [(3.0, 0.2), (0.7, 5.0)])
+def test_limits_and_servo_have_their_own_scales(power, motion, limits):
+    config = PassivityConfig(
+        method="force_limit",
+        force_limit=limits[0],
+        torque_limit=limits[1],
+        servo_stiffness=[11.0, 12.0],
+        servo_damping=[13.0, 14.0],
+        slave_mass=[15.0, 16.0],
+        local_force_limit=ForceLimitConfig(force=0.5 * limits[0], torque=2.0 * limits[1]),
+    )
+    p = parameters(config, power, motion)
+    np.testing.assert_allclose(p[LIMIT] * motion, limits)
+    np.testing.assert_allclose(p[_LOCAL_LIMIT] * motion, np.multiply(limits, [0.5, 2.0]))
+    for part, values in ((STIFFNESS, (11, 12)), (DAMPING, (13, 14)), (MASS, (15, 16))):
+        np.testing.assert_allclose(p[part] / power, values)
+    np.testing.assert_array_equal(p[MOTION_SCALE], motion)
+
+
+def test_limits_are_those_of_the_default_device_unless_given():
+    device, config = Master().device(0.0, 0.0), PassivityConfig()
+    assert config.force_limit == device.peak_force
+    assert config.torque_limit == min(device.peak_torque)
 
 
 def test_unknown_method_is_rejected():

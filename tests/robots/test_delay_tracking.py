@@ -17,7 +17,13 @@ NOISE = np.repeat([0.05, 0.0025], 3)
 
 
 def followed(
-    follower: DelayTracker, start: float, stop: float, late: float, *, push: float = 0.0
+    follower: DelayTracker,
+    start: float,
+    stop: float,
+    late: float,
+    *,
+    push: float = 0.0,
+    noise: float = 1.0,
 ) -> None:
     """Feed wrenches with noise and drifted offsets, and motions whose stamps are `late`.
 
@@ -27,7 +33,7 @@ def followed(
     for t in np.arange(start, stop, DT):
         wrench = non_contact_wrench(*np.split(truth(t)[1], 3), PHI) + OFFSETS
         wrench[:3] += 1.0
-        wrench += NOISE * rng.normal(size=6)
+        wrench += noise * NOISE * rng.normal(size=6)
         error = follower.delay_s - late
         at, before, after = [(t + e, truth(t + e + error)[1]) for e in (0.0, -0.001, 0.001)]
         ends = (non_contact_wrench(*np.split(each[1], 3), PHI)[0] for each in (before, after))
@@ -42,6 +48,28 @@ def test_delay_is_estimated_and_tracked(late: float) -> None:
     assert follower.delay_s == pytest.approx(late, abs=2e-4)
     followed(follower, 3.0, 5.0, late + 0.003)
     assert late + 5e-4 < follower.delay_s < late + 0.003
+
+
+@pytest.mark.parametrize(("noise", "samples", "late"), [(1.0, 80, 0.006), (4.0, 200, -0.01)])
+def test_delay_stays_until_it_is_certain_and_then_changes_slowly(
+    noise: float, samples: int, late: float
+) -> None:
+    """Noise beyond the stated one takes longer."""
+    follower = DelayTracker(load(), 0.001, 30.0, 0.0)
+    followed(follower, 0.0, (samples - 0.5) * DT, late, noise=noise)
+    assert follower.delay_s == 0.0
+    for k in range(samples, samples + 280, 20):
+        before = follower.delay_s
+        followed(follower, k * DT, (k + 19.5) * DT, late, noise=noise)
+        assert 0.0 <= (follower.delay_s - before) * np.sign(late) <= 0.005 * 20.1 * DT
+    assert follower.delay_s * np.sign(late) > 1e-3
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_delay_is_at_most_100_ms(side: float) -> None:
+    follower = DelayTracker(load(), 0.001, 30.0, side * 0.099)
+    followed(follower, 0.0, 1.1, side * 0.115)
+    assert follower.delay_s == side * 0.1
 
 
 def test_contact_is_excluded_and_another_clock_restarts_the_tracking() -> None:

@@ -29,7 +29,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.netft import NetFtSource, parse_page
-from drake_teleop.robots.ros2 import Ros2Source
+from drake_teleop.robots.ros2_zenoh import ZenohSource
 from drake_teleop.robots.rtde import RtdeSource
 from drake_teleop.robots.streams import (
     ACCELERATION,
@@ -65,13 +65,15 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
 class Seen(list[Compensated]):
     """Outputs of the loop of `compensate` for a source, with their times."""
 
-    def __init__(self, source: Source, last: int, end: Flag = Flag.RESTART) -> None:
+    def __init__(
+        self, source: Source, last: int, end: Flag = Flag.RESTART, seconds: float = 5.0
+    ) -> None:
         """Read until a good wrench with number `last` after the flag `end`, with a tool at rest."""
         self.at: list[float] = []
         self.parts: list[Part] = []
         compensator = Compensator(load(), source.dt, cutoff_hz=None)
         compensator.offsets = OFFSETS - non_contact_wrench(*np.split(AT_REST, 3), PHI)
-        begun, until = False, time.monotonic() + 5.0
+        begun, until = False, time.monotonic() + seconds
         while time.monotonic() < until:
             parts = source.read(0.01)
             assert parts is not None
@@ -162,7 +164,7 @@ def test_rtde() -> None:
 
 def test_ros_2() -> None:
     with peer("ros", free_port()) as (port, _):
-        source = Ros2Source(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
+        source = ZenohSource(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
         seen = Seen(source, 510, Flag.CLOCK_JUMP)
         source.close()
     flags = Flag.REORDERED | Flag.NOT_FINITE | Flag.DAMAGED | Flag.STALE | Flag.RESTART
@@ -231,6 +233,26 @@ def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: 
         flags.append(compensator.step(Reading(part.number, part.t, values, part.flags), now).flags)
     source.close()
     assert set(flags[-200:]) == {Flag.WRONG_RATE if named else 0}
+
+
+@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize(
+    ("status", "flag"),
+    [(0, 0), (1 << 30 | 1 << 18 | 1 << 16, 0), (1 << 31, Flag.DAMAGED), (1 << 31 | 1, Flag.DAMAGED),
+     (1 << 17, Flag.SATURATED), (1 << 31 | 1 << 17, Flag.SATURATED)],
+)  # fmt: skip
+def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
+    status: int, flag: int, still: bool
+) -> None:
+    source = NetFtSource("netft://127.0.0.1?counts=2,4&rate=1000&sign=-1")
+    counts = [2, -4, 6, 4, -8, 12]
+    source.part(struct.pack(">III6i", 1, 7, 0, *counts), 0.0)
+    for after, stale in ((0.049, 0), (0.051, Flag.STALE)):
+        record = struct.pack(">III6i", 2, 7 + (not still), status, *counts)
+        part = source.part(record, after)
+        assert part.flags == flag | (stale if still else 0)
+        np.testing.assert_array_equal(part.values, [-1, 2, -3, -1, 2, -3])
+    source.close()
 
 
 def test_netft_page_contains_counts_units_and_rate() -> None:

@@ -12,7 +12,7 @@ from test_compensator import OFFSETS, PHI, load
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.assembly import Assembly, Parts
+from drake_teleop.robots.assembly import Assembly, Parts, pose_from_rpy
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
@@ -177,3 +177,12 @@ def test_imu_gives_the_motion() -> None:
 def test_wrench_without_motion_is_refused() -> None:
     with pytest.raises(DrakeTeleopError, match="delivers no motion; give --motion"):
         Assembly(Parts(StreamStub(WRENCH)))
+
+
+@pytest.mark.parametrize("angles", [(20.0, -35.0, 110.0), (0.0, 80.0, 30.0), (-170.0, 5.0, 0.0)])
+def test_pose_of_the_sensor_has_fixed_axes_as_in_a_urdf(angles: tuple[float, ...]) -> None:
+    roll, pitch, yaw = np.radians(angles)
+    pose = pose_from_rpy((0.1, -0.2, 0.3, *angles))
+    R = rotation_matrices(pose[None, :4], "quaternion_wxyz")[0]
+    np.testing.assert_allclose(R, turn(2, yaw) @ turn(1, pitch) @ turn(0, roll), atol=1e-12)
+    np.testing.assert_array_equal(pose[4:], [0.1, -0.2, 0.3])

@@ -178,6 +178,8 @@ ERRORS = {
     "SDF of two models": ("sdf", sdf("</model><model name='n'>"), "cannot be read as a robot"),
     "SDF of the future": ("sdf", sdf("", "99"), "Unable to convert from SDF version 99"),
     "SDF without an axis": ("sdf", sdf(sdf_joint("revolute", "")), "axis must be specified for"),
+    "SDF of a mimic": ("sdf", sdf(sdf_joint("revolute", "<axis><xyz>0 0 1</xyz><mimic joint='k'>"
+                       "<multiplier>1</multiplier></mimic></axis>")), "j moves with another"),
     "SDF of a gearbox": ("sdf", sdf(sdf_joint("gearbox")), "j is a gearbox joint"),
     "SDF of a fixed arm": ("sdf", sdf(sdf_joint("fixed")),
                            "sensor_frame: no moving joint between the world and l6"),
@@ -197,6 +199,10 @@ ASSUMED = {
                    "turns without end for j3"),
     "no speed": (with_limit('<limit velocity="0" effort="200"/>'), "a speed limit of .* for j3"),
     "no strength": (with_limit('<limit velocity="3" effort="0"/>'), "no torque limit for j3"),
+    "only an upper limit": (with_limit('<limit upper="2" velocity="3" effort="200"/>'),
+                            "^a range of one turn from the only limit for j3"),
+    "only a lower limit": (with_limit('<limit lower="-2" velocity="3" effort="200"/>'),
+                           "^a range of one turn from the only limit for j3"),
     "limits in degrees": (with_limit('<limit lower="-170" upper="170"/>'),
                           "limits in rad, though more than 25.13 apart, for j3"),
     "massless": (arm(l3=link("l3", "")), "no inertia of l3; a rotor inertia of 0.219 kg m.2,"
@@ -212,6 +218,8 @@ ASSUMED = {
                     "warning: inertia replaced by the nearest .* of link l3 .6.67 %."),
     "hardly a triangle": (with_inertial(('izz="0.01"', 'izz="0.0403"')),
                           "^inertia replaced by the nearest .* of link l3 .0.248 %."),
+    "nearly a triangle": (with_inertial(('izz="0.01"', 'izz="0.046"')),
+                          "^inertia replaced by the nearest .* of link l3 .4.35 %."),
     "no triangle of what hangs on the arm": (
         arm(beyond=link("x", INERTIAL.replace('izz="0.01"', 'izz="0.05"'))
             + joint(8, parent="l2", child="x")), "inertia replaced by .* of link x .6.67 %."),

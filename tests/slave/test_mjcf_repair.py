@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import struct
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +16,11 @@ from test_model_repairs import pose, read, written
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import DAMPING, PHI, ROTOR
+from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
+from drake_teleop.station.slave.model.mjcf_masses import fitted_shape
+from drake_teleop.station.slave.model.mjcf_meshes import Mesh, Triangles
+from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.repair_report import RepairReport
 from drake_teleop.station.slave.models import ParseScene, ParseTool
 
 INERTIAL = '<inertial pos="0 0 0" mass="2" diaginertia="0.02 0.02 0.02"/>'
@@ -212,6 +219,50 @@ def test_mass_of_shapes(tmp_path, shape, suffix):
 
 
 @pytest.mark.parametrize(
+    ("kind", "by_box", "expected"),
+    [
+        ("box", False, [0.05, 0.1, 0.15]),
+        ("ellipsoid", True, [0.05, 0.1, 0.15]),
+        ("sphere", False, [0.1, 0.0, 0.0]),
+        ("sphere", True, [0.15, 0.0, 0.0]),
+        ("cylinder", False, [0.075, 0.15, 0.0]),
+        ("cylinder", True, [0.1, 0.15, 0.0]),
+        ("capsule", False, [0.075, 0.1125, 0.0]),
+        ("capsule", True, [0.1, 0.05, 0.0]),
+    ],
+)
+@pytest.mark.parametrize("sides", [(1, 2, 3), (3, 1, 2), (2, 3, 1)])
+def test_primitive_that_replaces_a_mesh(kind, by_box, expected, sides):
+    """A box of 0.1 x 0.2 x 0.3 m, in any order and orientation; z is the longest axis."""
+    X = RigidTransform(degrees(10, 20, 30), [0.4, -0.5, 0.6])
+    triangles = Triangles(X.multiply((CORNERS * sides).T).T, FACES)
+    mesh = SimpleNamespace(triangles=lambda: triangles, inertia="exact")
+    X_found, size = fitted_shape(mesh, kind, by_box=by_box)
+    np.testing.assert_allclose(size, expected, atol=1e-12)
+    np.testing.assert_allclose(X_found.translation(), X.translation(), atol=1e-12)
+    longest = X.rotation().matrix()[:, sides.index(3)]
+    assert abs(longest @ X_found.rotation().matrix()[:, 2]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "file", "expected"),
+    [
+        ({}, "a.obj", True),
+        ({"scale": "1 1 1", "refpos": "0 0 0"}, "a.OBJ", True),
+        ({}, "a.stl", False),
+        ({"scale": "1 1 -1"}, "a.obj", False),
+        ({"refpos": "0 0 1"}, "a.obj", False),
+        ({"refquat": "0 1 0 0"}, "a.obj", False),
+    ],
+)
+def test_drake_reads_a_mesh_itself_if_it_stays_as_it_is(tmp_path, attributes, file, expected):
+    path, report = written(tmp_path, mjcf(""), "a.xml"), RepairReport()
+    reader = Mjcf(read_xml(path), path, ModelFiles(path, ()), report)
+    mesh = Mesh(reader, Attributes(attributes, "mesh", report), Path(file))
+    assert mesh.is_plain == expected
+
+
+@pytest.mark.parametrize(
     ("mode", "expected"),
     [
         ("exact", 7.0),  # a square of 3 x 3 without 1 x 2, 1 thick
@@ -324,7 +375,12 @@ BESIDE = (
         (JOINT.replace("/>", ' damping="-0.01"/>'), "", "", "no damping, instead of .* of j"),
         (JOINT, '<geom type="mesh" mesh="none"/>', "", r"not found \(.*shapes are missing of b"),
         (JOINT, '<body name="flat"><inertial pos="0 0 0" mass="1" diaginertia="1 1 2.5"/></body>',
-         "", r"check it: inertia replaced by the nearest .* of link flat \(6.7 %\)"),
+         "", r"warning: inertia replaced by the nearest .* of link flat \(6.67 %\)"),
+        *((JOINT, f'<body name="flat">{INERTIAL.replace("0.02 0.02 0.02", f"1 1 {z}")}</body>', "",
+           expected) for z, expected in (
+            (2.0045, "an inertia corrected for rounding of flat"),
+            (2.009, r"(^|; )inertia replaced by the nearest .* of link flat \(0.1[45]\d* %\)"),
+            (2.28, r"(^|; )inertia replaced by the nearest .* of link flat \(4.09 %\)"))),
         (JOINT, '<body name="p"><inertial pos="0 0 0" mass="0" diaginertia="1 1 1"/></body>', "",
          "an inertia without a mass left out of p"),
         (JOINT, '<geom type="hfield" hfield="h"/>', "", "hfield are not supported; .* of b"),
@@ -340,7 +396,7 @@ def test_repair_is_stated(tmp_path, joint, inside, tail, expected):
 
 def test_held_joint_has_the_drawn_or_requested_pose(tmp_path):
     """A joint with `ref` is drawn at this position."""
-    lift = '<body name="lift"><joint name="lift" type="slide" axis="0 0 1" ref="0.2"/>{}</body>'
+    lift = '<body name="lift"><joint name="lift" type="slide" axis="0 0 3" ref="0.2"/>{}</body>'
     path = written(tmp_path, mjcf(lift.format(INERTIAL + arm())), "a.xml")
     for hold, height in (({"lift": 0.5}, 0.3), ({"lift": 0.1}, -0.1), ({}, None)):
         _, model, _ = read(path, "S", hold=hold)

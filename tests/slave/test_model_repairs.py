@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -18,9 +19,12 @@ from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
+from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia, repair_inertia
+from drake_teleop.station.slave.model.model_numbers import check_quantities
+from drake_teleop.station.slave.model.repair_report import RepairReport
+from drake_teleop.station.slave.model.urdf_repair import _has_colour, dependent_joints
 from drake_teleop.station.slave.models import ParseModel, ParseScene
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
 
@@ -126,6 +130,29 @@ def test_masses_beside_the_chain_stay(tmp_path):
     masses = model.table[:-1, 12]  # first of the inertial parameters
     np.testing.assert_allclose(masses, [2.0, 2.0, 2.0, 10.0, 2.0, 2.0])
     assert plant.num_positions() == 6
+
+
+@pytest.mark.parametrize("hold", [None, {"j1": 0.3}])
+def test_motors_keep_gear_rotor_and_effort_of_their_joint(tmp_path, hold):
+    """Reflected inertia: gear ratio squared times the rotor's."""
+    gears, rotors, efforts = (
+        [1, 7, 50, 100, 3, 20],
+        [2e-3, 1e-3, 1e-4, 5e-5, 3e-3, 2e-4],
+        range(11, 17),
+    )
+    text, order = arm(), [3, 0, 5, 2, 1, 4]
+    for k in range(6):
+        text = text.replace(joint(k + 1), joint(k + 1).replace('"200"', f'"{efforts[k]}"'))
+    motors = "".join(
+        f'<transmission type="SimpleTransmission"><joint name="j{k + 1}"/><actuator name="a{k}">'
+        f'<drake:gear_ratio value="{gears[k]}"/><drake:rotor_inertia value="{rotors[k]}"/>'
+        "</actuator></transmission>"
+        for k in order
+    )
+    _, model, _ = read(written(tmp_path, text.replace("</robot>", f"{motors}</robot>")), hold=hold)
+    kept = slice(0 if hold is None else 1, 6)
+    np.testing.assert_allclose(model.table[:-1, 22], (np.square(gears) * rotors)[kept])
+    np.testing.assert_array_equal(model.effort_limit, efforts[kept])
 
 
 def test_continuous_joints_keep_their_limits_only_if_given(tmp_path):
@@ -239,11 +266,13 @@ def test_arm_is_taken_out_of_an_sdf(tmp_path, text, stated):
         np.testing.assert_allclose(pose(model, [q]), expected, atol=1e-12)
 
 
-def test_included_model_is_repaired(tmp_path):
-    written(tmp_path, f"<sdf version='1.7'>{ARM_SDF}</sdf>", "inside.sdf")
-    outer = (
-        "<sdf version='1.7'><model name='m'><include><uri>inside.sdf</uri></include></model></sdf>"
-    )
+@pytest.mark.parametrize("uri", ["inside/arm.sdf", "inside"])
+def test_included_model_is_repaired(tmp_path, uri):
+    """The folder of a model names its file in model.config."""
+    (tmp_path / "inside").mkdir()
+    written(tmp_path / "inside", f"<sdf version='1.7'>{ARM_SDF}</sdf>", "arm.sdf")
+    written(tmp_path / "inside", "<model><sdf> arm.sdf </sdf></model>", "model.config")
+    outer = f"<sdf version='1.7'><model name='m'><include><uri>{uri}</uri></include></model></sdf>"
     _, model, said = read(written(tmp_path, outer, "outer.sdf"), "ft")
     assert model.joint_names == ("a",) and model.effort_limit[0] == 30.0
     assert "of link l1 (11.1 %)" in said
@@ -383,3 +412,79 @@ def test_tool_may_have_joints_of_any_kind(tmp_path):
     nominal = NominalSlave(slave)
     assert nominal.arm.phi_load[0] == pytest.approx(4.0)
     assert "held: slide" in nominal.assumptions
+
+
+@pytest.mark.parametrize(
+    ("inside", "expected"),
+    [
+        ("", {}),
+        ('<mimic joint="k"/>', {"j": "moves with another joint (mimic)"}),
+        ('<axis><mimic joint="k"/></axis>', {"j": "moves with another joint (mimic)"}),
+    ],
+)
+@pytest.mark.parametrize("parent", ["world", "l2"])
+def test_coupled_joints_and_floating_links_are_dependent(inside, expected, parent):
+    ends = f'<parent link="{parent}"/><child link="c"/>'
+    root = ElementTree.fromstring(
+        f'<r><joint name="j" type="revolute">{inside}</joint>'
+        f'<joint name="f" type="floating">{ends}</joint></r>'
+    )
+    floating = {} if parent == "world" else {"c": "floats on l2"}
+    assert dependent_joints(root) == expected | floating
+
+
+@pytest.mark.parametrize(
+    ("value", "allowed"),
+    [("9e5", True), ("1.1e6", False), ("-9e5", True), ("-1.1e6", False), ("inf", False)],
+)
+def test_lengths_masses_and_inertias_are_at_most_1e6(tmp_path, value, allowed):
+    texts = [f'<origin xyz="0 0 {value}"/>', f'<box size="1 1 {value}"/>']
+    inertial = '<inertial><mass value="{}"/><inertia ixx="1e6" iyy="1e6" izz="1e6" ixy="{}"/>'
+    texts += [inertial.format(value, 0.0), inertial.format(1, value)]
+    for k, text in enumerate(texts):
+        report = RepairReport()
+        link = ElementTree.fromstring(f'<link name="l">{text}{"</inertial>" * (k > 1)}</link>')
+        check_quantities(link, "link l", report)
+        repair_inertia(link, report, is_sdf=False, at_rest=False)
+        if allowed and not (k == 2 and value[0] == "-"):
+            report.raise_causes(tmp_path)
+        else:
+            with pytest.raises(DrakeTeleopError, match="link l"):
+                report.raise_causes(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("rgba", "kept"),
+    [
+        ("0.8 1 0 1", True),
+        ("0 0 0 0", True),
+        ("1.1 0 0 1", False),
+        ("0 0 -0.1 1", False),
+        ("0 0 1", False),
+        ("0 0 1 a", False),
+    ],
+)
+def test_colours_have_four_numbers_from_0_to_1(rgba, kept):
+    material = ElementTree.fromstring(f'<material><texture/><color rgba="{rgba}"/></material>')
+    assert _has_colour(material) == kept
+    assert material.find("texture") is None
+
+
+@pytest.mark.parametrize("izz", [0.04, 0.09])
+@pytest.mark.parametrize("is_sdf", [False, True])
+def test_products_of_inertia_are_kept(izz, is_sdf):
+    """With 0.09 the nearest possible inertia is written."""
+    inertia = np.array([[0.03, 4e-3, -5e-3], [4e-3, 0.035, 6e-3], [-5e-3, 6e-3, izz]])
+    entries = {f"i{'xyz'[i]}{'xyz'[j]}": inertia[i, j] for i in range(3) for j in range(i, 3)}
+    inner = "".join(f"<{name}>{value}</{name}>" for name, value in entries.items())
+    text = f"<mass>2</mass><inertia>{inner}</inertia>"
+    if not is_sdf:
+        words = " ".join(f'{name}="{value}"' for name, value in entries.items())
+        text = f'<mass value="2"/><inertia {words}/>'
+    link = ElementTree.fromstring(f'<link name="l"><inertial>{text}</inertial></link>')
+    repair_inertia(link, RepairReport(), is_sdf=is_sdf, at_rest=False)
+    element = link.find("inertial/inertia")
+    nearest, change = nearest_possible_inertia(inertia)
+    assert (change > 0.0) == (izz == 0.09)
+    for (name, _), value in zip(entries.items(), nearest[np.triu_indices(3)], strict=True):
+        assert float(element.get(name) or element.findtext(name)) == pytest.approx(value)

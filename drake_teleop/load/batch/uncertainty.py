@@ -48,9 +48,6 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
     """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi] [SI].
 
     By Student's t distribution; (-inf, inf) for undetermined parameters.
-
-    Raises:
-        DrakeTeleopError: if the level is outside (0, 1).
     """
     if not 0.0 < level < 1.0:
         raise DrakeTeleopError(f"{level} is not within (0, 1)", where="level")
@@ -63,11 +60,7 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
 def prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Return (n,) True where a standard deviation is at least `share` of the prior's.
-
-    Raises:
-        DrakeTeleopError: if shapes differ or a prior standard deviation is not positive.
-    """
+    """Return (n,) True where a standard deviation is at least `share` of the prior's."""
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
@@ -145,11 +138,7 @@ class BaseParameters:
 
 
 def base_parameters(equations: NormalEquations) -> BaseParameters:
-    """Return the base parameters of a record.
-
-    Raises:
-        DrakeTeleopError: as `NormalEquations.solve`.
-    """
+    """Return the base parameters of a record."""
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scale(load.phi)

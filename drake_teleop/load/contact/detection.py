@@ -207,9 +207,6 @@ class ContactDetector:
         slack: slack of the cumulative sum [standard deviations].
         following: sample period over time constant of a mean that is subtracted from the contact
             wrench, updated while the level is below `leave`; 0: no mean.
-
-    Raises:
-        DrakeTeleopError: for an unknown statistic or values outside their range.
     """
 
     def __init__(

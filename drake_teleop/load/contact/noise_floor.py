@@ -37,11 +37,7 @@ less often than that value, which is reached about once in a record of the same 
 
 
 def statistic_index(statistic: str) -> int:
-    """Return the column of a statistic: "level", "cusum" or "glr".
-
-    Raises:
-        DrakeTeleopError: for another name.
-    """
+    """Return the column of a statistic: "level", "cusum" or "glr"."""
     if statistic not in STATISTICS:
         raise DrakeTeleopError(
             f"{statistic!r} is not a statistic",
@@ -113,11 +109,7 @@ class NoiseFloor:
             raise DrakeTeleopError("is not positive definite", where="correlation")
 
     def threshold(self, statistic: str, margin: float = MARGIN) -> float:
-        """Return a contact threshold: `margin` times the largest statistic in free motion.
-
-        Raises:
-            DrakeTeleopError: for an unknown statistic, or without a fitted motion.
-        """
+        """Return a contact threshold: `margin` times the largest statistic in free motion."""
         return margin * float(positive("reached", self.reached, 3)[statistic_index(statistic)])
 
     @property

@@ -102,9 +102,6 @@ class RecursiveEstimator(ABC):
         forgetting: factor per sample on the weight of past samples, 0 < forgetting <= 1.
         prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
         bound: standard deviation that `settled` requires, relative to `natural_scale`.
-
-    Raises:
-        DrakeTeleopError: for values outside their range.
     """
 
     #: Value of `Identification.method`.
@@ -215,11 +212,7 @@ class RecursiveEstimator(ABC):
         self._samples += len(rows[0])
 
     def identification(self) -> Identification:
-        """Return the present estimate.
-
-        Raises:
-            DrakeTeleopError: before the first update.
-        """
+        """Return the present estimate."""
         if self._theta[6] == 0.0:
             raise DrakeTeleopError("there was no update yet", where="estimator")
         covariance = self.covariance

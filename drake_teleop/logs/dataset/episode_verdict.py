@@ -310,7 +310,7 @@ def offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | No
     fewest = max(_FEWEST_STEP_FRAMES, int(_STEP_SHARE * n))
 
     def inliers(part: Array) -> tuple[NDArray[np.bool_], Array]:
-        centre = calm_half(part, np.zeros(6))[1]
+        centre = calm_half(part, np.full(6, 1e-300))[1]
         return (np.abs(part - centre) <= _INLIER * deviation).all(axis=1), centre
 
     whole = inliers(residual)[0].sum()

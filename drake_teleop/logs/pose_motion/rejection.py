@@ -81,8 +81,10 @@ def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) ->
 def _information_loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
     if kept.sum() < 2 * x.shape[1]:
         return np.inf
+    whole, left = (x[rows].T @ x[rows] for rows in (inside, kept))
+    # pinv returns zeros for motions that no kept sample contains, hence the share of the whole.
     every, some = (
-        np.diag(np.linalg.pinv(x[rows].T @ x[rows], rcond=1e-12, hermitian=True))
-        for rows in (inside, kept)
+        np.diag(np.linalg.pinv(G, rcond=1e-12, hermitian=True))
+        for G in (whole, left + 1e-6 * whole)
     )
     return float(np.sqrt(np.max(some / every) * kept.sum() / inside.sum()))

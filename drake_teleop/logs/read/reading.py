@@ -390,7 +390,7 @@ class _Reader:
             )
         if len(found_gaps):
             half = self._half_window(float(np.median(np.diff(t))))
-            self._gaps.append(found_gaps + [-half, half])
+            self._gaps.append(found_gaps + np.array([-half, half]))
         return clock
 
     def _half_window(self, dt: float) -> float:

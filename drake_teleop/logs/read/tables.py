@@ -7,6 +7,7 @@ import math
 from collections import UserDict
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,9 @@ class Table:
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
-        numbers = self._numbers(name)
+        column = self.columns[name]
+        numbers = _as_numbers(column, partial(self._cell_error, name))
+        numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
         self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
@@ -168,11 +171,6 @@ class Table:
                 remedy="cut the log before it or repair the rows",
             )
         return numbers
-
-    def _numbers(self, name: str) -> Array:
-        column = self.columns[name]
-        numbers = _as_numbers(column, lambda row, cell: self._cell_error(name, row, cell))
-        return numbers.reshape(len(column), math.prod(numbers.shape[1:]))
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(

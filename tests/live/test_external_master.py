@@ -1,0 +1,59 @@
+"""Displayed wrench of a real haptic device."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drake_teleop.live.external_master import (
+    _ALLOWED,
+    _DISPLAY,
+    _FAULT,
+    MakeExternalMasterSide,
+    _display_step,
+)
+from drake_teleop.station.scenario import LoadScenario
+
+PERIOD = 1e-3
+
+
+@pytest.mark.parametrize("limits", [(10.0, 0.2), (3.0, 5.0)])
+@pytest.mark.parametrize("wrench", [(0.0, 80.0, -60.0, 0.0, 4.0, 3.0), (0.3, 0, 0, 0, 0, 0.02)])
+def test_force_and_torque_have_their_own_limits_and_slew_rates(limits, wrench):
+    wrench, last, shown = np.array(wrench, float), np.zeros(_DISPLAY), []
+    for k in range(500):
+        now, held = np.empty(_DISPLAY), k < 400
+        _display_step(wrench, held, PERIOD, np.array(limits), last, now)
+        shown.append(now)
+        last = now
+    for part, limit in zip((slice(0, 3), slice(3, 6)), limits, strict=True):
+        sizes = np.linalg.norm([each[part] for each in shown], axis=1)
+        size = np.linalg.norm(wrench[part])
+        assert sizes[399] == pytest.approx(min(size, limit))
+        np.testing.assert_allclose(shown[399][part], wrench[part] * sizes[399] / size)
+        assert (sizes[:10] <= 4.0 * PERIOD * np.arange(1, 11) * limit + 1e-12).all()
+        assert np.abs(np.diff(sizes)).max() <= 150.0 * PERIOD * limit + 1e-12
+        assert sizes[407] == 0.0
+
+
+@pytest.mark.parametrize("place", range(6))
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_wrench_that_is_not_finite_is_a_fault_and_fades(place, value):
+    last, now, wrench = np.zeros(_DISPLAY), np.empty(_DISPLAY), np.ones(6)
+    last[0], last[_ALLOWED] = 2.0, 1.0
+    wrench[place] = value
+    _display_step(wrench, True, PERIOD, np.array([4.0, 1.0]), last, now)
+    assert now[_FAULT] > 0.0
+    assert now[_ALLOWED] == pytest.approx(0.98)
+    np.testing.assert_allclose(now[:6], [2.0 - 0.15 * 4.0, 0, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize("model", ["phantom_premium_15", "omega_6"])
+def test_side_of_a_real_device_has_the_limits_of_the_device(model):
+    scenario = LoadScenario("free_motion_force")
+    scenario.master.model = model
+    device = scenario.master.device(0.0, 0.0)
+    side = MakeExternalMasterSide(scenario)
+    limits = side.GetSubsystemByName("live_hand")._limits
+    np.testing.assert_array_equal(limits, [device.peak_force, max(device.peak_torque)])
+    assert limits[0] > 2.0 * limits[1]

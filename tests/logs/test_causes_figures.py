@@ -1,0 +1,187 @@
+"""Figures of named causes, loads of the parts of a record, and the delay of a fitted model."""
+
+from __future__ import annotations
+
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from posed_record import PHI
+from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
+
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causes.candidates import candidates
+from drake_teleop.logs.causes.cause import causes_of, stretches
+from drake_teleop.logs.causes.changes import contact_spans, with_ramps
+from drake_teleop.logs.causes.explain import _remove_delay
+from drake_teleop.logs.causes.instants import instants
+from drake_teleop.logs.causes.model import DELAY, Model, Step
+from drake_teleop.logs.causes.state import State, gain_of
+
+LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
+
+
+def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleNamespace:
+    x = np.concatenate([OFFSETS, PHI, [0.0], values])
+    covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
+    fit, data = SimpleNamespace(covariance=covariance), record(np.zeros((len(T), 6)))
+    state = SimpleNamespace(model=model, x=x, fit=fit, data=data, spans=spans)
+    state.extension = partial(State.extension, state)
+    return state
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "name", "figures", "words"),
+    [
+        (Model(axes=SWAPPED), [], "axes", {"axes": ["-y", "z", "x"]}, "are -y, z, x of the motion"),
+        (Model(("gravity",)), [0.4, -0.3, 0.21], "gravity direction",
+         {"gravity": [0.0, 0.0, -10.0], "angle_deg": 2.924}, "gravity is 2.92 deg (+- 0.049)"),
+        (Model(("weight",)), [1.72, 0.01, 0.02, 0.03], "weight removed",
+         {"removed_mass": 1.72, "removed_moment": [0.01, 0.02, 0.03]}, "1.7 kg (+- 0.0052)"),
+        (Model(("weight",)), [1.6, 0.016, 0.032, -0.048], "payload configured",
+         {"removed_mass": 1.6}, "1.6 kg (+- 0.0083) at [10, 20, -30] mm in S"),
+        (Model(("frame",)), [0.01, -0.02, 0.03], "pose frame",
+         {"position_in_sensor": [-0.01, 0.02, -0.03]}, "[-10, 20, -30] mm in S (+- 8.8 mm)"),
+        (Model(("rotation",)), [0.0, 0.3, -0.4], "sensor rotation",
+         {"rotation_vector": [0.0, 0.3, -0.4]}, "rotated by 28.65 deg (+- 0.5) against"),
+        (Model(gains=(4,)), [0.2], "gain", {"gain": 1.2}, "tau_y reads 20.00 % (+- 0.83) more"),
+        (Model(("linear drift",)), [1.0, -2.0, 0.5, 0.1, 0.3, -0.2], "drift",
+         {"range": [2.0, 4.0, 1.0, 0.2, 0.6, 0.4]}, "4 N and 0.6 N m"),
+        (Model(("drift",)), [*np.zeros(15), 0.1, -0.2, 0.3], "drift",
+         {"range": [0, 0, 0, 0, 0, 1.2]}, "0 N and 1.2 N m"),
+        (Model(("cable",)), [*np.zeros(3), 3.0, 0.0, 0.0, -7.0, 0.0, 5.0, *np.zeros(3)], "cable",
+         {"stiffness": 7.0}, "about 7 N/m"),
+        (Model(steps=(Step("offsets", 102.5),)), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3], "zero change",
+         {"change": [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]}, "from t = 102.50 s on"),
+        (Model(steps=(Step("load", 103.0),)), LOAD.tolist(), "load change",
+         {"mass_change": 0.5, "com_of_change": [0.02, -0.04, 0.06]}, "[20, -40, 60] mm in S"),
+        (Model(steps=(Step("load", 103.0),)), (-LOAD).tolist(), "load change",
+         {"mass_change": -0.5}, "0.5 kg (+- 0.0083) at [20, -40, 60] mm in S are removed"),
+    ],
+)  # fmt: skip
+def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, name, figures, words):
+    (cause,) = causes_of(state_of(model, values))
+    assert cause.name == name and words in cause.message
+    for key, value in figures.items():
+        found = cause.values[key]
+        assert found == (value if key == "axes" else pytest.approx(value, abs=1e-3))
+    given = causes_of(state_of(model, values), given=model.parts)
+    assert bool(given) != bool(model.parts)
+
+
+@pytest.mark.parametrize(
+    ("span", "shown"),
+    [((101.0, 101.5), True), ((102.8, 103.5), False), ((103.1, 109.0), True)],
+)
+def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
+    steps = (Step("load", 103.0), Step("offsets", 105.0))
+    values = [*LOAD, 1.0, *np.zeros(5)]
+    found = causes_of(state_of(Model(steps=steps), values, (span,)))
+    assert ("contact" in [x.name for x in found]) == shown
+    starts = [x.start_s for x in found]
+    assert starts == sorted(starts) and {103.0, 105.0} <= set(starts)
+
+
+def test_each_part_of_a_record_has_its_load_and_the_uncertainty_of_all_changes_before():
+    steps = (Step("load", 104.0), Step("offsets", 101.0), Step("load", 102.0))
+    values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
+    state = state_of(Model(steps=steps), values)
+    covariance = 4.0 * state.fit.covariance[:16, :16]
+    parts = stretches(state, covariance)
+    assert [(x.start_s, x.stop_s) for x in parts] == [
+        (pytest.approx(a), pytest.approx(b))
+        for a, b in ((100.0, 102.0), (102.0, 104.0), (104.0, T[-1]))
+    ]
+    for part, phi in zip(parts, (PHI, PHI + LOAD, PHI + 3.0 * LOAD), strict=True):
+        np.testing.assert_allclose(part.phi, phi)
+    np.testing.assert_allclose(parts[0].covariance, covariance)
+    variance = 4e-6 * np.arange(7.0, 17.0)
+    np.testing.assert_allclose(
+        np.diag(parts[2].covariance)[6:],
+        variance + 4e-6 * (np.arange(18.0, 28) + np.arange(34.0, 44)),
+    )
+    assert stretches(state_of(Model(steps=steps[1:2]), [1.0] * 6), covariance) == []
+
+
+@pytest.mark.parametrize(
+    ("before", "moves"), [(0.0, True), (0.29, True), (0.31, False), (-0.31, False)]
+)
+@pytest.mark.parametrize("late", [0.004, -0.009])
+def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
+    noise = np.repeat([1e-3, 1e-4], 3) * np.random.default_rng(0).normal(size=(len(T), 6))
+    s, omega, alpha, *_ = moving(T)
+    wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS + noise
+
+    def with_delay(delay: float):
+        return instants(T, wrench, moving(T + delay - before - late), GRAVITY_W)
+
+    state = State.of(with_delay(before), Model())
+    assert state.x[DELAY] == pytest.approx(late, abs=1e-3)
+    after, delay = _remove_delay(state, before, with_delay)
+    assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
+    assert (abs(after.x[DELAY]) < 5e-4) == moves
+    assert _remove_delay(state, before, None) == (state, before)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e2])
+def test_gain_of_smooth_signals_counts_independent_ones(scale):
+    rng = np.random.default_rng(0)
+    A, e = rng.normal(size=(30, 4)) * [1.0, scale, 1e-3, 2.0], rng.normal(size=30)
+    for columns, rank in ((A, 4), (np.column_stack([A, A[:, 0] + A[:, 3], 0.0 * e]), 4)):
+        gain, found = gain_of(columns.T @ columns, columns.T @ e)
+        fitted = A @ np.linalg.lstsq(A, e, rcond=None)[0]
+        assert found == rank and gain == pytest.approx(fitted @ fitted, rel=1e-5)
+    some = gain_of(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
+    assert some[1] == 3 and some[0] < gain
+
+
+@pytest.mark.parametrize(
+    ("kinds", "guess"),
+    [(["load"], 103.04), (["offsets", "load"], 102.96), (["offsets"], 103.02)],
+)
+def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
+    """An earlier change stays; the ramp lasts 0.4 s."""
+    s, omega, alpha, *_ = moving(T)
+    step, load = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3]), LOAD + np.eye(10)[4] * 1e-3
+    share = np.clip((T - 102.8) / 0.4, 0.0, 1.0)[:, None]
+    wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS + (T[:, None] > 101.0) * step[::-1]
+    wrench += share * ("load" in kinds) * non_contact_wrench(s, omega, alpha, load)
+    wrench += share * ("offsets" in kinds) * step
+    wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
+    state = State.of(record(wrench), Model(steps=(Step("offsets", 100.99),)))
+    found = with_ramps(state, [kinds], [guess], ((100.5, 100.6),))
+    assert found.spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
+    assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
+    assert found.model.steps[0].time == 100.99
+    for k, kind in enumerate(kinds, start=1):
+        assert found.model.steps[k].time == pytest.approx(103.0, abs=0.03)
+        value = found.extension(f"step {k}")[0]
+        truth = load if kind == "load" else step
+        np.testing.assert_allclose(value[:3], truth[:3], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "ends"), [(101.5, 103.0, 2), (99.0, 102.0, 1), (103.5, 107.0, 1)]
+)
+def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
+    monkeypatch, start, stop, ends
+):
+    s, omega, alpha, *_ = moving(T)
+    wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS
+    wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
+    touched = ((start < T) & (stop > T))[:, None]
+    wrench += touched * [8.0, 0.0, 5.0, 0.3, 0.0, 0.0] * (1.0 + np.sin(3.0 * T[:, None]))
+    state = State.of(record(wrench), Model())
+    ((found_start, found_stop),) = contact_spans(state)
+    assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
+    assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
+    for name in ("_fit_part", "_factor", "_axes"):
+        monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
+    monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step", lambda *_: None)
+    monkeypatch.setattr("drake_teleop.logs.causes.candidates._SMALLEST_GAIN", 1.0)
+    (contact,) = candidates(state, True)
+    price = (6 + 2 * ends) * np.log(state.data.used.sum())
+    gain = 2.0 * (contact.state.likelihood - state.likelihood)
+    assert contact.name == "contact" and contact.state.spans == ((found_start, found_stop),)
+    assert contact.score == pytest.approx(gain - price)
