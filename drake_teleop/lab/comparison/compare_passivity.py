@@ -9,8 +9,9 @@ decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_
           leaked_J. If unstable, these are empty or null
 station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with the energy between
           hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
-          left_behind [m]; leaked [J]. A run that is not at rest in its hold ends there
-          (left_behind and drift are null); `error` says why a run ended early (others are null)
+          left_behind [m]; leaked [J]; fast_force, rms above 5 Hz in the hold [N]. A run that is
+          not at rest in its hold ends there (left_behind and drift are null); `error` says why a
+          run ended early (others are null)
 hands     list: method, network, fields of `release_and_taps.ReleaseAndTaps`
 one_dof   list: method, wall_N_per_m, jitter, loss; longest_s, up to which all round trips of
           grid_s were stable (0: none)
@@ -55,6 +56,7 @@ from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_ta
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.oscillation import fast_part
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, steps_of
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
@@ -188,7 +190,7 @@ def station_run(
     """
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]
-    names += ["pressed_force", "felt_share", "left_behind", "leaked"]
+    names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
@@ -200,7 +202,9 @@ def station_run(
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
+    fast = fast_part(result.t[held], result["force_to_master"][held, :3])
     additional = {
+        "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),
         "felt_share": max(1 + found.force_error, 0.0),
         "left_behind": abs(found.drift),

@@ -161,7 +161,13 @@ _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 @dataclass
 class _CommonConfig:
-    method: str = choice("none", (), "passivity method of the channel", METHODS)
+    method: str = choice(
+        "none",
+        (),
+        "passivity method of the channel; two_layer, pspm, four_channel and force_limit are"
+        " references for comparison",
+        METHODS,
+    )
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest rendered force at the hand")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
