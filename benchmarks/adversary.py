@@ -1,4 +1,4 @@
-"""How much energy does each method give out to an adversary, and how fast does it throw the hand?
+"""How much energy does each method deliver to an adversary, and how fast does the hand move?
 
 `python benchmarks/adversary.py [--runs N] [--seed S] [--method M ...] [--json FILE]` lets
 `lab.comparison.one_dof` run for 12 s, N (10 000) times in all: as often with each method.

@@ -1,4 +1,4 @@
-"""What the adversary of `adversary.py` may do: a case is a row of numbers from 0 to 1.
+"""Cases of the adversary of `adversary.py`: a case is a row of numbers from 0 to 1.
 
 `DRAWS` says what each of them stands for, so that all are drawn, or changed a little, alike.
 """

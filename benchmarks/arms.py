@@ -1,4 +1,4 @@
-"""Is every published arm file read, read right, and ready to run without an edit?
+"""Is every published arm file read correctly, and ready to run without an edit?
 
 For each file of `arms.yaml`, in a process of its own: the package reads it; an independent reader
 (`arms_reference.py`) gives the pose of the sensor frame at five random configurations, masses and

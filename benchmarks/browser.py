@@ -1,4 +1,4 @@
-"""A page in headless Chromium, through the browser's own debugging socket.
+"""A page in headless Chromium, through the browser's debugging socket.
 
 It serves `live_page.py`, the film of a drive (docs/make_film.py) and the test of the page.
 """

@@ -1,4 +1,4 @@
-"""Do the commands write the same bytes, whatever surrounds them?
+"""Do the commands write the same bytes, whatever the environment?
 
 `python benchmarks/bytes.py [--all] [--json FILE]` has drake-teleop run, reproduce, sample-log,
 identify, eliminate, detect, inspect, study, excite and analyze write into new folders, under

@@ -1,4 +1,4 @@
-"""Does `calibrate` stop in time, and is what it then calls known true?
+"""Does `calibrate` stop in time, and is the load that it calls identified correct?
 
 `python benchmarks/calibrate.py [--json FILE] [--loads 100]` lets it calibrate simulated loads (0.8
 to 6 kg, radii of gyration of 4 to 9 cm) in virtual time, at 500 Hz, until "mass 0.5 %, com 0.5 mm"

@@ -1,4 +1,4 @@
-"""Is each call as fast as the station, or who waits for it, needs it to be?
+"""Is each call of the library fast enough for the station or for the person who waits?
 
     python benchmarks/calls.py [--json FILE]
 
@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from drake_teleop.lab.analysis.delayed_loop import delay_margin, station_loop, unstable_poles
+from drake_teleop.lab.analysis.cut_loop import cut_loop, delay_margin, unstable_multipliers
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.load.contact.detection import SIZE, detection_update
@@ -99,11 +100,11 @@ def detection() -> tuple[float, float]:
 
 
 def margin_grid() -> tuple[float, float]:
-    """Margins and unstable poles over delay and stiffness, and cell by cell [s]."""
+    """Margins and unstable multipliers over delay and stiffness, and cell by cell [s]."""
 
     def margins(delay: Any, stiffness: Any) -> None:
-        loop = station_loop(OneAxis(delay=delay, wall_stiffness=stiffness))
-        unstable_poles(loop)
+        loop = cut_loop(OneAxis(wall_stiffness=stiffness), Sampling())
+        unstable_multipliers(loop, delay)
         delay_margin(loop)
 
     return grid(margins, np.linspace(0, 0.2, N), np.geomspace(100, 1e5, N))
@@ -113,8 +114,8 @@ def wall_grid() -> tuple[float, float]:
     """Passive and stable stiffness over the device's and the wall's damping, cell by cell [s]."""
 
     def limits(b: Any, B: Any) -> None:
-        passive_stiffness(b, B, 1e-3, 1)
-        stable_stiffness(0.15, b, B, 1e-3, 1)
+        passive_stiffness(b, B, 1e-3)
+        stable_stiffness(0.15, b, B, 1e-3)
 
     return grid(limits, np.linspace(0.1, 5, N), np.linspace(0, 2, N))
 

@@ -1,4 +1,4 @@
-"""Which contact is noticed, how soon, and by which detector?
+"""Which contacts are detected, how soon, and by which detector?
 
 `python benchmarks/contact_detection.py [--json FILE] [--hours 1]` moves a load of 3.1 kg fast and
 touches it 500 times with 0.05 to 5 N in any direction, 0.3 s each. The wrench has white noise
@@ -39,9 +39,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import statistics
+from drake_teleop.load.contact.detection import fit_noise_floor, statistics
 from drake_teleop.load.contact.noise_floor import STATISTICS, NoiseFloor, finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 

@@ -1,4 +1,4 @@
-"""When does the station notice a contact, when does the hand know, and what does it cry wolf at?
+"""When does the station detect a contact, when is it displayed, and what are false alarms?
 
 `python benchmarks/contact_in_station.py [--minutes 100] [--json FILE]`. The load, its offsets and
 the noise floor are identified first, by the station's own sensor (JR3, with noise, random walk and

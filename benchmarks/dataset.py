@@ -1,4 +1,4 @@
-"""Datasets: share of planted faults that are named, false findings, residual and contact.
+"""Which share of planted faults of a dataset is named, and how good are wrench and contacts?
 
 Usage: python benchmarks/dataset.py [EPISODES] [FRAMES]: clean episodes per rate, frames for time.
 """
@@ -14,16 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from sample_dataset import write_sample_dataset
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.dataset.dataset import dataset_command
-from drake_teleop.logs.dataset.sample_dataset import (
-    NOISE,
-    SampleEpisode,
-    write_sample_dataset,
-)
+from drake_teleop.logs.sample import NOISE, SampleEpisode
 
 RATES = (10.0, 15.0, 30.0, 50.0)
 TOOLS = [

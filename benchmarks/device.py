@@ -1,4 +1,4 @@
-"""Is the link to a haptic device fast, safe when it is silent, and passive? With a virtual device.
+"""Is the link to a haptic device fast, safe when it is silent, and passive (virtual device)?
 
     python benchmarks/device.py [--seconds 10] [--drive] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""Where does each method hold a wall: how stiff, by which grip, over how long a round trip?
+"""For which stiffness, grip and round trip does each method hold a wall?
 
 `python benchmarks/domain.py [--method M ...] [--json FILE]` lets `lab.comparison.one_dof`
 run its usual task over a constant delay: a hand presses 20 mm into a wall, holds for 5 s, lets go.

@@ -1,4 +1,4 @@
-"""What does noise in the measured accelerations do to the load, and who takes it out?
+"""How do noisy accelerations bias the load, and which estimator corrects it?
 
 The tool of the station, turned and moved by sines for 1.5 s at 1 kHz, 200 records with other noise:
 the JR3's of the station, and the level "High" of the UTIAS protocol (Nadeau, Giamou, Kelly, ICRA
@@ -24,9 +24,9 @@ import numpy as np
 from instrumental import RecursiveInstrumentalVariables
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import PARAMETERS
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor

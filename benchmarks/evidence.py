@@ -1,18 +1,19 @@
-"""What is claimed, is it so, and when was that last seen?
+"""Which claims of README and docs are shown by which run, and when was it run?
 
-    python benchmarks/evidence.py                       writes docs/evidence.md
+    python benchmarks/evidence.py                       writes docs/evidence.md and the README
     python benchmarks/evidence.py RUN ... [--beside T]  runs these first, and keeps their figures
 
-The page has each claim of the docs (`evidence_claims.py`) with the figure that a run gave, the
-bound, the command, the date and the commit, then what is not met and what is not shown at all.
-Figures lie in `records/`, one file for each run, as its `--json` wrote them. `--beside` says what
-else ran on the machine ("nothing else", if it is left out); times mean little beside something.
-`--from FILE` keeps what a run of the same command has written already.
+The page lists each claim of the docs (`evidence_claims.py`) with the figure of a run, the bound,
+the command, the date and the commit, then the claims that are not met or not shown. The README of
+this folder lists the scripts, their questions and the same figures. `records/` contains the figures
+of each run as its `--json` wrote them. `--beside` names other programs that ran at the same time
+(default: nothing else). `--from FILE` keeps the figures of a run that was made before.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import shlex
 import subprocess
@@ -29,14 +30,29 @@ import drake_teleop
 FOLDER = Path(__file__).parent
 RECORDS = FOLDER / "records"
 PAGE = FOLDER.parent / "docs" / "evidence.md"
+README = FOLDER / "README.md"
+
+_README_HEAD = """# Benchmarks
+
+Each script answers one question. A baseline runs in the same process, so that the answer is a
+ratio; times are those of the thread, for orientation. `--help` lists the options of a script.
+
+<!-- not run by the tests: it installs from the network -->
+```sh
+.venv-test/bin/pip install -e '.[test,bench]'
+OMP_NUM_THREADS=1 .venv-test/bin/python benchmarks/identification.py
+```
+
+`benchmarks/evidence.py` writes this page from the records of the runs (`benchmarks/records`) and
+the claims of README and docs (`benchmarks/evidence_claims.py`). A claim that is not met is bold.
+"""
 
 _HEAD = """# Evidence
 
-What this library promises, and the run that shows it. Each figure is read from the record of that
-run (`benchmarks/records`), not typed; `python benchmarks/evidence.py NAME` runs it again, and the
-first column leads to where the promise is made. A time is only as good as the machine was idle,
-which the last column says. What a test shows is shown by every run of the tests; it has no figure
-here.
+Claims of this library, and the run that shows each. Every figure is read from the record of its run
+(`benchmarks/records`); `python benchmarks/evidence.py NAME` repeats the run. The first column links
+to the page with the claim. Other programs on the machine affect times; the last column names them.
+A claim with a test is checked by every run of the tests and has no figure here.
 """
 
 
@@ -51,6 +67,7 @@ def main(arguments: list[str] | None = None) -> None:
         figures = json.loads(asked.file.read_text()) if asked.file else run(name)
         keep(name, figures, asked.beside)
     PAGE.write_text(page(), encoding="utf-8")
+    README.write_text(readme(), encoding="utf-8")
     print(f"{PAGE}: {summary()}")
 
 
@@ -150,6 +167,43 @@ def page() -> str:
             lacks = f"no record of `{RUNS[claim.run]}` is kept"
             parts.append(f"- *{claim.section}.* {claim.says} ({claim.where}): {lacks}.")
     return "\n".join(parts) + "\n"
+
+
+def readme() -> str:
+    """Return the README of this folder: scripts, questions, commands and figures."""
+    known = records()
+    parts = [_README_HEAD]
+    helpers = []
+    for script in sorted(FOLDER.glob("*.py")):
+        doc = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) or ""
+        question = doc.splitlines()[0].strip()
+        if not question.endswith("?"):
+            helpers.append(f"| `{script.name}` | {question} |")
+            continue
+        parts.append(f"## {script.name}: {question}\n")
+        runs = [name for name in RUNS if RUNS[name].split()[0] == f"benchmarks/{script.name}"]
+        if not runs:
+            parts.append("No record is kept.\n")
+        for name in runs:
+            parts += _run_lines(name, known.get(name))
+    parts += ["## Modules of these scripts\n", "| module | contents |", "|---|---|", *helpers]
+    return "\n".join(parts) + "\n"
+
+
+def _run_lines(name: str, record: dict[str, Any] | None) -> list[str]:
+    command = RUNS[name].replace("FILE", f"records/{name}.json")
+    if record is None:
+        return [f"`{command}`: no record is kept.\n"]
+    lines = [
+        f"`{command}`, {record['date']}, commit {record['commit']}, beside {record['beside']}:\n"
+    ]
+    claims = [claim for claim in CLAIMS if isinstance(claim, Claim) and claim.run == name]
+    lines += ["| claim | where it holds | figure | bound |", "|---|---|---|---|"]
+    for claim in claims:
+        figure = claim.text(record["figures"])
+        figure = figure if claim.met(record["figures"]) else f"**{figure}**"
+        lines.append(f"| {claim.says} | {claim.where} | {figure} | {claim.bound} |")
+    return [*lines, ""]
 
 
 def _shown(claim: Claim | InTests | NotShown, known: dict[str, Any]) -> bool:

@@ -1,4 +1,4 @@
-"""How good is an excitation trajectory, how soon, and what does the criterion matter?
+"""How good is an excitation trajectory, how soon, and how much does the criterion matter?
 
 `python benchmarks/excitation.py [--seeds 7] [--json FILE]` designs for the station's slave with its
 tool and 30 % more, with every limit, and prints

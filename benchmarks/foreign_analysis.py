@@ -1,4 +1,4 @@
-"""Does `analyze` hold for other arms and devices as it does for the paper's?
+"""Is `analyze` as accurate for other arms and devices as for those of the paper?
 
 Vertically and with an ideal sensor, for an RX90 with a Phantom, a Panda with an omega.6 and a UR5
 with a Touch, sigma 0.5:
@@ -40,8 +40,7 @@ from drake_teleop.lab.analysis.cut_loop import cut_loop, dominant_multiplier
 from drake_teleop.lab.analysis.figures import OMEGA, bounded_figures, with_grip
 from drake_teleop.lab.analysis.linearization import Linearization, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
+from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.analysis.two_port import absorb
 from drake_teleop.lab.identification import slave_arm

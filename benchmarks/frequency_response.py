@@ -1,4 +1,4 @@
-"""How well does the linearised Diagram predict what the nonlinear station does?
+"""How well does the linearised Diagram predict the nonlinear station?
 
 A multi-sine is drawn by the operator, with all the sensor's noise, and measured responses are
 compared with those of the linearisation: vertically, in free motion for several sigma, and pressing
@@ -13,20 +13,26 @@ import argparse
 import dataclasses
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.lab.analysis.frequency_response import (
     MultiSine,
+    StationResponse,
     measure_frequency_response,
-    predict_frequency_response,
 )
-from drake_teleop.lab.analysis.task_direction import task_direction
+from drake_teleop.lab.analysis.linearization import delays, linearize_station
+from drake_teleop.lab.analysis.one_axis import Complex
+from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+
+Array = NDArray[np.float64]
 
 _UP = (0.0, 0.0, 1.0)
 _GAP, _DEPTH = 0.03, 0.03  # m, from the tip to the leaf; how deep it is pressed
@@ -56,6 +62,38 @@ def main() -> None:
         print(f"{name:80s} {figure:10.5f}")
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def predict_frequency_response(
+    scenario: Scenario,
+    task: TaskDirection,
+    omega: Array,
+    *,
+    load_estimate: Array | None = None,
+    displacement: Sequence[float] = (0.0, 0.0, 0.0),
+) -> StationResponse:
+    """Return the spectra at omega (n,) [rad/s] that the linearised Diagram predicts.
+
+    They are for a unit force; other arguments: see `linearize`.
+    """
+    system = linearize_station(scenario, load_estimate=load_estimate, displacement=displacement)
+    first = system.inputs.index("hand_wrench.x")
+    pushed = system.frequency_response(omega)[:, :, first : first + 6] @ task.hand
+
+    def along(port: str, direction: Array) -> Complex:
+        row = system.outputs.index(f"{port}.x")
+        return (pushed[:, row : row + 6] @ direction)[None]
+
+    _, backward = delays(scenario)
+    delay_factor = np.exp(-1j * np.asarray(omega) * system.dt * backward)
+    spectra = {
+        # Unit force in place of the intent, plus the operator's reaction.
+        "hand_force": 1 + along("operator_wrench", task.hand),
+        "hand_velocity": along("twist_master", task.hand),
+        "felt_force": delay_factor * along("wrench_B", task.hand),
+        "tool_velocity": along("twist_slave", task.tool),
+    }
+    return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
 
 
 def _scenario(sigma: float, friction: float) -> Scenario:

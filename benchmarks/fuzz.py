@@ -1,4 +1,4 @@
-"""Is there a file or an option that ends in anything but a result or one line?
+"""Does every damaged file or option end in a result or in one error line?
 
 Feeds damaged inputs, made by grammar from good ones, to every reader (`fuzz_targets.py`,
 `fuzz_mutations.py`). A case is a finding if it raises anything but a DrakeTeleopError of one line

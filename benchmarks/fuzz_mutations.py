@@ -1,4 +1,4 @@
-"""Damaged inputs: what `fuzz.py` makes of a good one, by what is in it.
+"""Damaged inputs for `fuzz.py`.
 
 Each function takes a generator of random numbers, the content and another content of the same kind
 to take parts from, and returns new content. The same numbers make the same content. Most changes
@@ -26,7 +26,7 @@ import yaml
 from scipy.io import savemat
 
 from drake_teleop.common.parquet_sizes import check_parquet_content
-from drake_teleop.logs.read.mat_file import read_mat
+from drake_teleop.logs.read.array_files import read_mat
 
 Mutation = Callable[[random.Random, bytes, bytes], bytes]
 

@@ -1,4 +1,4 @@
-"""What `fuzz.py` feeds where a user's names, files or recordings are at stake.
+"""Inputs of `fuzz.py` for names, included files and recordings.
 
 Each case is JSON. A case is good if the result has the property that the target names, or if a
 DrakeTeleopError of one line is raised and nothing remains.
@@ -36,7 +36,7 @@ from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import INPUTS, Inputs, read_inputs
 from drake_teleop.live.record import Record, made_by
-from drake_teleop.robots import table
+from drake_teleop.robots import lines
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Compensated, Reading
 from drake_teleop.station.scenario import LoadScenario, Scenario
@@ -253,8 +253,8 @@ def full_disk(path: Path) -> None:
     with ExitStack() as last:
         _limit(target, room, last)
         file = target / ("x.parquet" if "parquet" in name else "x.csv")
-        table.PERIOD_S = dict.fromkeys(table.PERIOD_S, 0.0)
-        sink = table.TableSink(file)
+        lines.PERIOD_S = dict.fromkeys(lines.PERIOD_S, 0.0)
+        sink = lines.TableSink(file)
         try:
             for k in range(rows):
                 sink.write(Compensated(k, 1e-5 / (k + 1), np.ones(6), np.zeros(6), 0))

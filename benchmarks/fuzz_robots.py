@@ -1,4 +1,4 @@
-"""What `fuzz.py` feeds to the sources of `compensate` that make parts: records, samples, messages.
+"""Inputs of `fuzz.py` for the sources of `compensate`: records, samples, messages.
 
 A case is what a device sends, one after another. Whatever comes, what goes out of the loop has to
 be finite, within the sensor's range, and zero if it is flagged.
@@ -16,7 +16,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.robots.assembly import Assembly, Parts
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD, NetFtSource
-from drake_teleop.robots.ros2 import KINDS, Messages, attachment, message_types
+from drake_teleop.robots.ros2_messages import KINDS
+from drake_teleop.robots.ros2_zenoh import Messages, attachment, message_types
 from drake_teleop.robots.rtde import parts_of
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import IMU, JOINTS, NONZERO_FLAGS, POSE, WRENCH, Part, Reading

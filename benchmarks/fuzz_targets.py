@@ -1,4 +1,4 @@
-"""What `fuzz.py` feeds: readers of files that people are handed, and options (long: all of them).
+"""Targets of `fuzz.py`: readers of user files, and options (long: all of them).
 
 A target has good inputs to begin with, a way to damage them, and what is done with the result. A
 case is good if that returns, or raises a DrakeTeleopError of one line.

@@ -1,4 +1,4 @@
-"""How fast is the load core, next to what one would use instead?
+"""How fast is the load core, compared with other libraries?
 
 Every figure is a ratio of times of this one thread, taken in turns (the best of several), next to
 the time itself; results are compared before anything is timed.

@@ -1,4 +1,4 @@
-"""How often do the stated 95 % intervals of an identification hold, whatever the noise's colour?
+"""How often do the stated 95 % intervals contain the true load, for noise of any colour?
 
 `python benchmarks/intervals.py [--json FILE] [--seeds N]` identifies the same load N times (500)
 from the same motion with new noise of six colours, counts for each of the 16 parameters how often

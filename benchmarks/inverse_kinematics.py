@@ -1,5 +1,4 @@
-"""Does the numeric inverse kinematics meet every pose, keep its speed where it is singular, and
-what does it cost?
+"""Does the inverse kinematics reach every pose, with bounded speed at singularities?
 
 `python benchmarks/inverse_kinematics.py [--poses 100000] [--json FILE]` takes the RX90, one with a
 sliding joint, one of five joints, one of eight, and of the `bench` extra's robot descriptions a

@@ -1,4 +1,4 @@
-"""A rigid load and paths of a sensor that are known in closed form, for `cause_records`.
+"""A rigid load and sensor paths in closed form, for `cause_records.py`.
 
 Newton and Euler's equations about the load's centre of mass give its wrench; nothing comes from the
 package. Frame S is the sensor's, the wrench is what

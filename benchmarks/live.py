@@ -1,4 +1,4 @@
-"""Does a station that is driven keep up with the clock, and how much of a core does that take?
+"""Does a driven station keep up with the clock, and which share of a core does it take?
 
     python benchmarks/live.py [--seconds 60] [--slices] [--json FILE]
 

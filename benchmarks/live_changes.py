@@ -1,4 +1,4 @@
-"""Does a station that is driven take a step when network and method change under a pressing tool?
+"""Does a driven station jump when network and method change under a pressing tool?
 
     python benchmarks/live_changes.py [--methods A,B] [--networks A,B] [--depth 95] [--json FILE]
 

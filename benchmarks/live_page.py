@@ -1,4 +1,4 @@
-"""How soon does the page show what a driver does, and when does a gamepad vibrate?
+"""How soon does the page show the driver's input, and when does a gamepad vibrate?
 
     python benchmarks/live_page.py [--trials 20] [--seconds 60] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""How soon is a grasped object noticed and known, and what is mistaken for one?
+"""How soon is a grasped object noticed and identified, and what causes false alarms?
 
 The tool of the station, known from 10 s of motion, then moved by sines at 1 kHz for 10 s with other
 noise: with the JR3's noise of force, torque and measured accelerations, and with an ideal sensor.
@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import Identification, identified_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.change import (
     OFFSET_DRIFT,
     STATES,

@@ -1,4 +1,4 @@
-"""Does the memory of a long simulation stay flat, when its log goes to disk?
+"""Does the memory of a long simulation stay constant when its log is written to disk?
 
 The contact of Fig. 8 again and again. Resident memory after the first minute and at the end, with
 the log written in parts, against the same station with its log in memory for two minutes at most.

@@ -1,4 +1,4 @@
-"""Is the wrist's wrench another simulator's, along the same motion?
+"""Is the wrist wrench equal to that of MuJoCo along the same motion?
 
 For each arm the station runs in free motion. At each of the hand's instants MuJoCo, which has read
 the same URDF by itself, is given joint positions, velocities and accelerations, and says by its own

@@ -1,4 +1,4 @@
-"""Small mistakes in numeric code, one at a time: what `mutants.py` makes of a source file.
+"""Small mistakes in numeric code, one at a time, for `mutants.py`.
 
 Each is one that people make in such code: a sign, a frame transposed, arguments exchanged, a limit
 forgotten. Text, messages, checks that only raise, declarations of quantities and default values

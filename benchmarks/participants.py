@@ -1,4 +1,4 @@
-"""Do the thresholds of an experiment hold, with participants whose threshold is known?
+"""Do the thresholds of an experiment hold for participants with a known threshold?
 
     python benchmarks/participants.py [--participants 200] [--trials 40] [--json FILE]
 

@@ -1,4 +1,4 @@
-"""Does any method give out energy that was not put in, over random networks and random ports?
+"""Does any method deliver energy that it did not receive, over random networks and ports?
 
 `python benchmarks/passivity.py [--json FILE] [--networks N] [--seconds S]` runs both ends of every
 method over N (10 000) random networks of 10 s at 500 Hz: delay up to 300 ms, jitter up to 100 %,

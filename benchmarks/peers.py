@@ -15,6 +15,11 @@
   tare in free air: their offsets are taken away with an error of 0.2 N and 0.01 N m;
 * vendor: gravity alone, of the true mass and centre of mass, typed in, and a tare at the start.
 
+With --rls, that many loads are followed by recursive least squares of gravity, bias and mounting
+(a 3 x 4 matrix times [vertical, 1] for force and for torque, as arXiv 2604.23696 describes it; its
+forgetting factor is ours), in slow motion and in a hand's, beside ours: `identify` of one motion of
+`excite`, and a tare. Figures are the share of the wrench that is removed in the second half.
+
 Held out is another motion of the same load, with offsets of its own, a tare, and 30 Hz. With
 --bota, the Python of an environment that has bota-payload-utils and numpy, its estimator is given
 five loads' motions (a hand's, 15 s each), paced by the clock. With --ntnu, the load of NTNU's 24
@@ -40,9 +45,8 @@ from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
 from drake_teleop.logs.processing import identify_log, usable_phi
-from drake_teleop.logs.read.alignment import low_pass, undelayed
+from drake_teleop.logs.read.alignment import delay_of, low_pass, undelayed
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.calibration import evaluate_record
 
@@ -173,6 +177,55 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
     for name, held in covered.items():
         figures[f"{name}.coverage_95"] = float(np.mean(held))
     return figures
+
+
+def slowed(rng: np.random.Generator, t: Array, factor: float) -> Motion:
+    """A hand's motion, `factor` times as slow."""
+    s, omega, alpha = hand(rng, t / factor)
+    up = turned(omega, (t[1] - t[0]) / factor)
+    return 9.81 * up + (s - 9.81 * up) / factor**2, omega / factor, alpha / factor**2
+
+
+def recursive_gravity(up: Array, wrench: Array, forgetting: float) -> Array:
+    """(N, 6) predictions of the wrench, each from the samples before it."""
+    P, theta, predicted = 1e6 * np.eye(4), np.zeros((4, 6)), np.empty_like(wrench)
+    for row, measured, out in zip(np.c_[up, np.ones(len(up))], wrench, predicted, strict=True):
+        out[:] = row @ theta
+        gain = P @ row / (forgetting + row @ P @ row)
+        theta += np.outer(gain, measured - out)
+        P = (P - np.outer(gain, row @ P)) / forgetting
+    return predicted
+
+
+def recursive(loads: int, folder: Path) -> dict[str, Any]:
+    """Shares of the wrench that recursive least squares of gravity and ours remove [%]."""
+    shares: dict[str, list[Array]] = {}
+    t = np.arange(round(SECONDS * HZ)) / HZ
+    excitation = excited(t)
+    for k in range(loads):
+        rng = np.random.default_rng([k, 23696])
+        phi = load_of(rng)
+        found = ours(log_of(stream_of(rng, phi, t, excitation, late=0)), folder / "log.parquet")
+        for domain, factor in (("slow", 10.0), ("fast", 1.0)):
+            seen = np.arange(6000) / 100.0
+            motion = slowed(rng, seen, factor)
+            log = log_of(stream_of(rng, phi, seen, motion, late=0))
+            up = turned(motion[1], log.dt)
+            half = len(seen) // 2
+            ours_left = log.wrench - non_contact_wrench(*log.motion, found.phi)
+            ours_left -= ours_left[:half].mean(axis=0)
+            peer_left = log.wrench - recursive_gravity(up, log.wrench, 0.999)
+            for name, left in (("rls", peer_left), ("ours", ours_left)):
+                of = [
+                    np.sqrt((x[half:].reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0))
+                    for x in (low_pass(left, log.dt, 10.0), log.wrench)
+                ]
+                shares.setdefault(f"{name} {domain}", []).append(100.0 * (1.0 - of[0] / of[1]))
+    return {
+        f"{name}.removed_{what}_%": float(np.median(rows, axis=0)[i])
+        for name, rows in shares.items()
+        for i, what in enumerate(("force", "torque"))
+    }
 
 
 # Run by another Python: config, and t and rows as .npy; in the sensor's convention, by the clock.
@@ -346,11 +399,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--loads", type=int, default=30)
+    parser.add_argument("--rls", type=int, default=0, help="loads for recursive least squares")
     parser.add_argument("--ntnu", type=Path, help="folder of the records of NTNU")
     parser.add_argument("--bota", type=Path, help="a Python that has bota-payload-utils and numpy")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         figures = simulated(options.loads, Path(folder)) if options.loads else {}
+        if options.rls:
+            figures |= recursive(options.rls, Path(folder))
         if options.ntnu is not None:
             figures |= ntnu(options.ntnu, Path(folder))
         if options.bota is not None:

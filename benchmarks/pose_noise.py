@@ -1,4 +1,4 @@
-"""What does noise of the poses cost, and whose intervals are honest?
+"""How does noise of the poses affect the load, and whose intervals are correct?
 
 Records of 60 s of a six-joint arm with the measures of a UR5e: F, Fourier series of 6 s period and
 5 harmonics; P, pick and place, minimum-jerk moves of 0.9 to 1.8 s with rests. A load of 1.7 kg, the
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -37,14 +38,13 @@ from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.read.alignment import (
     angular_motion,
+    estimate_delay,
     low_passed,
     resample,
     smooth_derivatives,
     undelayed,
 )
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import estimate_delay
-from drake_teleop.logs.read.rotations import rotation_matrices
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""A hand's motion as a robot tells it, for `calibrate.py`: poses of a frame that is not S.
+"""Hand motion as reported by a robot, for `calibrate.py`: poses of a frame other than S.
 
 Poses at 250 Hz with noise of 0.1 mm and 0.2 mrad, white, late by up to 8 ms; every other load has
 them on another clock than the wrench, and packets take up to 2 ms longer than the fastest. The

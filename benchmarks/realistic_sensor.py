@@ -1,4 +1,4 @@
-"""How well is a load known with a realistic JR3, and what stays of the paper's 100 N, and why?
+"""How well is a load identified with a realistic JR3, and what remains of the 100 N?
 
 The slave runs the shipped identification; then it swings as in Fig. 6. Both are simulated once at
 8 kHz with an ideal sensor. What that saw goes through the kernels of sensor and motion estimation

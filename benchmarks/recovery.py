@@ -1,4 +1,4 @@
-"""Does every method recover from every random network, and never push harder than it may?
+"""Does every method recover from every random network within its force limit?
 
 `python benchmarks/recovery.py [--json FILE] [--networks N]` presses on a wall of 0.1 to 5 kN/m with
 `lab.comparison.one_dof` over N (10 000) pairs of random lines: delay up to 300 ms, jitter

@@ -1,4 +1,4 @@
-"""Does a drive in which everything is changed repeat itself to the last bit, however it is cut?
+"""Does a drive with every change repeat to the last bit, however it is divided?
 
     python benchmarks/repeated.py [--seconds 60] [--json FILE]
 

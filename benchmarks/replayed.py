@@ -1,4 +1,4 @@
-"""Is `compensate replay:LOG` what `eliminate --causal` writes, and what does either leave?
+"""Does `compensate replay:LOG` equal `eliminate --causal`, and which residual remains?
 
 `python benchmarks/replayed.py [--json FILE] [--data FOLDER] [LOG ...]` replays logs in chunks of
 one reading, of 7, of 256 and of all, delayed and predicted, and counts the numbers that differ in

@@ -1,4 +1,4 @@
-"""Is the motion of `excite --until` the shortest, and does it reach what is asked?
+"""Is the motion of `excite --until` the shortest, and does it reach the required accuracy?
 
 `python benchmarks/shortest.py [--json FILE] [--restarts 20] [--records 50]` designs it for the
 shipped station's arm and "mass 0.1 %, com 0.1 mm, inertia 1 %" from 20 seeds, and prints how much

@@ -1,4 +1,4 @@
-"""What does the whole station cost over its bare plant, how fast is it, and how exact?
+"""What does the station cost over its bare plant, and how fast and accurate is it?
 
 Bare plant: arm and tool under a constant torque, nothing around them, in steps of 125 us by the
 second-order Runge-Kutta method. All run interleaved in this process; times are thread CPU time, so

@@ -1,4 +1,4 @@
-"""Does every station keep the promises of the paper's: each arm and device, free and at things?
+"""Do stations of other arms and devices fulfil the figures of the paper's station?
 
 For each cell: the ideal sensor's force against the plant's reaction port; the mass that `identify`
 finds, and what elimination leaves of the peak inertial force; what the hand feels of the device and

@@ -1,10 +1,12 @@
-"""How well does a study use two cores, is it the same everywhere, and what does a kill cost?
+"""How well does a study use two cores, is it reproducible, and what does a kill cost?
 
 `python benchmarks/study.py [--runs 2000] [--kills 20] [--json FILE]` runs one study of the station
 (a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first) by
 one process, by two, and on a local Dask cluster, each from an empty folder, and once more by two
 processes with SIGKILL at random moments. Baseline of the efficiency is the one process, by the
-clock: it wants an idle machine. Parts are compared byte by byte.
+clock: it wants an idle machine. Parts are compared byte by byte. `--shards 8` runs only shards in
+random order, kills three of them, submits these again and merges; the overhead is their CPU time
+beyond that of one process.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import argparse
 import json
 import os
 import random
+import resource
 import shlex
 import signal
 import subprocess
@@ -41,11 +44,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=2000, help="a multiple of 400")
     parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument(
+        "--shards", type=int, default=0, help="compare only shards with one process"
+    )
     parser.add_argument("--no-cluster", action="store_true", help="without Dask")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        figures = measured(Path(folder), arguments)
+        measure = sharded if arguments.shards else measured
+        figures = measure(Path(folder), arguments)
     for name, figure in figures.items():
         print(f"{name:30s} {figure:10.4g}")
     if arguments.json:
@@ -92,6 +99,55 @@ def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
         "rows_lost": figures["runs"] - rows["run"].n_unique(),
         "killed_the_same": float(parts(folder / "serial") == parts(folder / "killed")),
     }
+
+
+def sharded(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
+    """One process, and shards one after another: three are killed and submitted again."""
+    study, warm, out = folder / "study.yaml", folder / "warm.yaml", folder / "out"
+    study.write_text(_STUDY.format(sigmas=arguments.runs // 4, gammas=2, repeats=2))
+    warm.write_text(_STUDY.format(sigmas=2, gammas=2, repeats=2))
+    run(warm, folder / "warm", "--jobs", "1")
+    before = cpu_s()
+    run(study, folder / "serial", "--jobs", "1")
+    whole, count, draw = cpu_s() - before, arguments.shards, random.Random(1)
+    spent, lost = 0.0, 0.0
+    killed = draw.sample(range(1, count + 1), 3)
+    for number in draw.sample(range(1, count + 1), count):
+        words = command(study, out, "--jobs", "1", "--shard", f"{number}/{count}")
+        before, rows = cpu_s(), out / f"shards/{number}-of-{count}/runs.parquet"
+        process = subprocess.Popen(words)
+        stop = draw.randint(1, arguments.runs // count - 1) if number in killed else 0
+        while stop and process.poll() is None and len(list(rows.glob("*.parquet"))) < stop:
+            time.sleep(0.01)
+        if stop:
+            process.send_signal(signal.SIGKILL)
+        process.wait()
+        spent += cpu_s() - before
+    again = cpu_s()
+    for number in killed:
+        run(study, out, "--jobs", "1", "--shard", f"{number}/{count}")
+    lost = cpu_s() - again
+    before = cpu_s()
+    run(study, out, "--merge")
+    merge = cpu_s() - before
+    total = spent + lost + merge
+    starts = count + len(killed) + 1
+    return {
+        "runs": float(pl.read_parquet(out / "runs.parquet").height),
+        "one_process_cpu_s": whole,
+        "shards_cpu_s": total,
+        "overhead": total / whole - 1.0,
+        "cost_of_a_start_cpu_s": (total - whole) / (starts - 1),
+        "merge_cpu_s": merge,
+        "the_same": float(parts(folder / "serial") == parts(out)),
+        "cpu_s_for_2_percent": (total - whole) / 0.02,
+    }
+
+
+def cpu_s() -> float:
+    """CPU time of all processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def command(study: Path, out: Path, *options: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""How well does each batch estimator do on the UTIAS workshop tools?
+"""How accurate is each batch estimator for the UTIAS workshop tools?
 
 The protocol of Nadeau, Giamou, Kelly (ICRA 2023): ten tools, simulated stop-and-go motion of 1000
 samples at 100 Hz, white noise of three levels on acceleration, angular acceleration and wrench,
@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.inertia import mass_com_inertia
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.regressor import non_contact_wrench
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "utias_workshop_tools"

@@ -41,6 +41,7 @@ extensions = [
     "mathml",
     "formulas",
     "keywords",
+    "kernel_page",
     "known_names",
     "pydrake_system",
     "repository",

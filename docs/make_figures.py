@@ -38,8 +38,7 @@ from drake_teleop.common.style import (
     shade_contact,
 )
 from drake_teleop.lab.reproduction.reproduce import reproduce_command
-from drake_teleop.logs.detection import detect_log
-from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.processing import detect_log, identify_log
 from drake_teleop.logs.sample import sample_log_command
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import without

@@ -15,6 +15,7 @@ from drake_teleop.common.version import __version__
 if TYPE_CHECKING:
     from drake_teleop.lab.identification import identify_load
     from drake_teleop.lab.run import run_scenario
+    from drake_teleop.lab.tuning.tune import tune
     from drake_teleop.live.server import drive
     from drake_teleop.load.compensation import contact_wrench, scaled_wrench
     from drake_teleop.load.identification import Identification
@@ -51,11 +52,13 @@ __all__ = [
     "run_scenario",
     "scaled_wrench",
     "simulate",
+    "tune",
 ]
 
 _HOMES = {
     "lab.identification": ("identify_load",),
     "lab.run": ("run_scenario",),
+    "lab.tuning.tune": ("tune",),
     "live.server": ("drive",),
     "load.compensation": ("contact_wrench", "scaled_wrench"),
     "load.identification": ("Identification",),

@@ -80,7 +80,7 @@ def test_no_command_shows_the_help(capsys):
     for command in (
         "reproduce", "run", "identify", "eliminate", "inspect", "detect", "compare-passivity",
         "study", "scaling-study", "excite", "replay", "sample-log", "scenario", "export", "new",
-        "compensate", "calibrate", "dataset",
+        "compensate", "calibrate", "dataset", "tune", "ros2",
     ):  # fmt: skip
         assert f"  {command} " in out
     assert "..." not in out.split("Commands:")[1]  # every summary fits its line

@@ -95,25 +95,3 @@ def test_how_to_choose_is_told_the_same_figures():
         method: [stable, good, felt, least[method][-1].rpartition(" ")[2]]
         for method, (stable, good, _, _, felt) in holds.items()
     }
-
-
-@pytest.mark.parametrize(
-    ("name", "head"),
-    [("ledger_in_station", "| cells (two leaves"), ("ledger_with_friction", "| cells | at rest")],
-)
-def test_what_is_said_of_ledger_in_the_station_is_what_its_record_says(name, head):
-    rows = figures_of_record(name)["rows"]
-    for network, written in table("benchmarks/README.md", head).items():
-        held = [row for row in rows if row["network"] == network]
-        errors = [abs(row["felt_error"]) for row in held]
-        found = [
-            *(sum(row["stable"] for row in held), len(held)),
-            *(sum(error <= 0.1 for error in errors), 100.0 * max(errors)),
-            1e3 * max(row["left_m"] for row in held),
-            *np.min([row["energy_J"] for row in held], axis=0),
-            max(row["chatter_N"] for row in held),
-        ]
-        words = re.findall(r"\d+(?:\.\d+)?", " ".join(written))
-        assert words == [
-            f"{x:.{len(word.partition('.')[2])}f}" for x, word in zip(found, words, strict=True)
-        ]

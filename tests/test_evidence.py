@@ -44,6 +44,10 @@ def test_each_record_has_the_figures_and_is_of_the_command_that_is_told():
             assert not math.isnan(claim.value(KNOWN[claim.run]["figures"])), claim.says
 
 
+def test_readme_of_the_benchmarks_is_generated_from_the_records():
+    assert evidence.README.read_text(encoding="utf-8") == evidence.readme()
+
+
 def test_a_figure_beyond_its_bound_is_said_to_be_missed(monkeypatch):
     claim = next(claim for claim in MEASURED if claim.run in KNOWN)
     figure = claim.value(KNOWN[claim.run]["figures"])

@@ -53,6 +53,11 @@ EXPLAINED = {
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),
     ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop
+    # The system's C compiler, with sources of this package and numbers.
+    ("robots/controller/fmu.py", "subprocess"),
+    ("robots/ros2_node.py", "subprocess"),  # the command `calibrate`
+    # Packages of messages by names that the code contains.
+    ("robots/ros2.py", "import_module"),
     # Likewise, with the addresses of a device and of this process.
     ("live/device_link.py", "subprocess"),
 }  # fmt: skip
@@ -89,21 +94,24 @@ WRITING = {
     ("common/compiled.py", ".touch"), ("common/compiled.py", ".write_bytes"),
     ("common/compiled.py", "os.replace"),
     ("lab/identified_load.py", 'open("wb'), ("lab/identified_load.py", "np.savez"),
-    ("station/slave/meshes.py", ".write_text"), ("station/slave/mjcf_meshes.py", ".write_text"),
-    ("station/slave/model_files.py", ".write_text"), ("station/slave/sdf_repair.py", ".write_text"),
+    ("station/slave/model/meshes.py", ".write_text"),
+    ("station/slave/model/mjcf_meshes.py", ".write_text"),
+    ("station/slave/model/sdf_repair.py", ".write_text"),
+    ("station/slave/model_files.py", ".write_text"),
     # A line for each change of a drive's inputs, which is to outlive the process.
     ("live/record.py", 'open("x'),
     # To memory, and then into the file with the wrenches that have come before.
-    ("robots/table.py", ".write_csv"),
+    ("robots/lines.py", ".write_csv"),
     # Under another name, until it was read back.
     ("lab/new_station/__init__.py", ".write_text"),
+    ("robots/controller/fmu.py", ".write_text"),  # a temporary folder, for the compiler
+    ("robots/controller/export.py", ".write_bytes"),  # by `whole_file`
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
     # Files in the output folder, by `whole_file`; and a dataset that the package generates.
     ("logs/dataset/dataset.py", ".save"), ("logs/dataset/dataset.py", 'open("wb'),
     ("logs/dataset/dataset.py", "np.save"), ("logs/dataset/dataset_files.py", ".write_text"),
     ("logs/dataset/dataset_files.py", ".write_bytes"),
-    ("logs/dataset/sample_dataset.py", ".write_text"),
     # A mark of one byte more.
     ("lab/studies/store.py", 'open("ab'),
     ("robots/changes.py", "json.dump"),  # to the process that asked

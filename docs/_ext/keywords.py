@@ -33,9 +33,12 @@ KEYWORDS = {
     "detection": {"the-threshold": "contact detection, threshold"},
     "logs": {
         "where-the-pose-is-and-how-noisy": "TCP, flange, tracker",
-        "bags": "ROS, rosbag, MCAP",
         "where-the-imu-is": "IMU, accelerometer",
         "from-an-excitation-to-the-load": "excitation",
+    },
+    "log-description": {
+        "bags": "ROS, rosbag, MCAP",
+        "fields": "unit, sign, axes, Euler angles",
     },
     "robot": {
         "the-load-in-the-robot-s-format": "Franka, UR, URScript, payload",
@@ -48,6 +51,7 @@ KEYWORDS = {
         "a-side-of-your-own": "LeafSystem",
         "ports": "port",
     },
+    "cluster": {"a-batch-script": "SLURM, HPC, array job, shard, merge"},
     "studies": {"how-long-it-takes": "Dask, cluster"},
     "wrench-not-zero": {"a-robot-s-log-after-eliminate": "tare, offset, drift"},
 }

@@ -2,8 +2,8 @@
 Clean wrench for robot learning
 ===============================
 
-A LeRobot dataset of five episodes at 30 frames a second. In one episode the wrench is turned by 90
-degrees and negated. The command names it, and writes the contact wrench of all episodes.
+A dataset of five episodes at 30 frames a second, each a table. In one episode the wrench is turned
+by 90 degrees and negated. The command names it, and writes the contact wrench of all episodes.
 """
 
 import tempfile
@@ -14,26 +14,25 @@ import numpy as np
 import polars as pl
 
 from drake_teleop.logs.dataset.dataset import dataset_command
-from drake_teleop.logs.dataset.sample_dataset import write_sample_dataset
+from drake_teleop.logs.sample import sample_episode
 
 folder = Path(tempfile.mkdtemp())
-
-
-def turned_and_negated(episode):
-    x, y, z, tx, ty, tz = episode.wrench.T
-    return episode._replace(wrench=np.stack([y, -x, -z, ty, -tx, -tz], axis=1))
-
-
-write_sample_dataset(folder / "demo", faults={3: turned_and_negated})
+(folder / "demo").mkdir()
+names = ["timestamp", "x", "y", "z", "qw", "qx", "qy", "qz", "fx", "fy", "fz", "tx", "ty", "tz"]
+for k in range(5):
+    t, position, quaternion, wrench, *_ = sample_episode(k)
+    if k == 3:
+        wrench = wrench[:, [1, 0, 2, 4, 3, 5]] * [1, -1, -1, 1, -1, -1]
+    frames = pl.DataFrame(np.column_stack([t, position, quaternion, wrench]), schema=names)
+    frames.write_parquet(folder / f"demo/episode_{k}.parquet")
 summary = dataset_command(folder / "demo", folder / "out", identify=True)
 
-table = pl.read_parquet(folder / "out/demo/data/chunk-000/file-000.parquet")
-episode = table.filter(pl.col("episode_index") == 3)
+episode = pl.read_parquet(folder / "out/demo/episode_3.parquet")
+contact = np.array(episode["observation.contact_wrench"].to_list())
 figure, axes = plt.subplots(2, sharex=True)
-for axis, name in zip(axes, ("observation.wrench", "observation.contact_wrench"), strict=True):
-    axis.plot(episode["timestamp"], np.array(episode[name].to_list())[:, :3])
-    axis.set_ylabel(f"{name}\n[N]")
-axes[1].fill_between(
-    episode["timestamp"], -15, 15, where=episode["observation.in_contact"], alpha=0.2
-)
+axes[0].plot(t, episode.select("fx", "fy", "fz"))
+axes[0].set_ylabel("recorded force [N]")
+axes[1].plot(t, contact[:, :3])
+axes[1].fill_between(t, -15, 15, where=episode["observation.in_contact"], alpha=0.2)
 axes[1].set_xlabel("time [s]")
+axes[1].set_ylabel("contact force [N]")

@@ -12,8 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import drake_teleop as dt
-from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
+from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.analysis.transparency import ideal_impedance
 from drake_teleop.lab.analysis.two_port import transmitted_impedance

@@ -10,7 +10,8 @@ import tempfile
 from pathlib import Path
 
 import drake_teleop as dt
-from drake_teleop.logs.detection import detect_log, draw_detection
+from drake_teleop.logs.pictures import draw_detection
+from drake_teleop.logs.processing import detect_log
 from drake_teleop.logs.sample import sample_log_command
 
 folder = Path(tempfile.mkdtemp())

@@ -209,8 +209,9 @@ def draw(found: Excitation) -> Figure:
         _draw_joints(joints, found)
         _draw_wrench(forces, torques, found)
         progress.step(*found.history.T, where="post", color=BLUE)
+        least = found.values.get(found.criterion, found.trajectory.period)  # --until: the period
         progress.set(
-            title=f"{found.criterion} down to {found.values[found.criterion]:.4g}",
+            title=f"{found.criterion} down to {least:.4g}",
             xlabel="evaluations",
             yscale="log",
         )

@@ -15,12 +15,6 @@ from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification, identified_object
 from drake_teleop.logs.contact import contacts_of
-from drake_teleop.logs.detection import (
-    DetectedLog,
-    detect_log,
-    draw_detection,
-    share_above_force,
-)
 from drake_teleop.logs.figures import (
     common_figures,
     contact_figures,
@@ -30,8 +24,15 @@ from drake_teleop.logs.figures import (
     object_notes,
     plain,
     rms_figures,
+    share_above_force,
 )
-from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
+from drake_teleop.logs.processing import (
+    DetectedLog,
+    EliminatedLog,
+    detect_log,
+    eliminate_log,
+    identify_log,
+)
 from drake_teleop.logs.read.canonical import WRENCH
 
 if TYPE_CHECKING:
@@ -222,6 +223,8 @@ def detect_command(
     }
     summary["notes"] += found.notes
     summary = plain(summary)
+    from drake_teleop.logs.pictures import draw_detection
+
     with output_folder(out):
         write_table(out / "detection.parquet", _detection_table(found))
         write_picture(out / "detection.png", draw_detection(found))

@@ -367,15 +367,56 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Remove the load from a live wrench.
 
-    SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for lines of JSON
-    on stdin, or replay:LOG; SINK is udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://, - for stdout,
-    or a .csv, .parquet or .mcap file. Invalid wrenches are zero, with a flag. --cutoff is causal
-    here. --delay is the delay of the motion behind the wrench; auto: the value in the load file.
+    SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, ros2://TOPIC, zenoh://HOST/TOPIC, - for
+    lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT, ros2://TOPIC,
+    zenoh://HOST/TOPIC, foxglove://, - for stdout, or a .csv, .parquet or .mcap file.
+    Invalid wrenches are zero, with a flag. --cutoff is causal here. --delay is the
+    delay of the motion behind the wrench; auto: the value in the load file.
     The command ends with the source or with Ctrl-C.
     """
     from drake_teleop.robots.compensate import compensate_command
 
     compensate_command(source, load, sink, **options)
+
+
+@cli.command()
+@click.argument("source")
+@click.argument("sink")
+@option.load(required=True)
+@option.sigma("Scale of the non-contact wrench.")
+@option.separate_sigmas
+@option.gamma
+@click.option("--rate", "rate_hz", type=option.POSITIVE, required=True, metavar="HZ",
+              help="Rate of the wrenches.")  # fmt: skip
+@click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
+@option.stream
+@option.out("ros2")
+@click.pass_context
+def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **options: Any) -> None:
+    """Remove the load from a live wrench, as a ROS 2 node.
+
+    SOURCE and SINK are ros2://TOPIC as for `compensate`. The node /drake_teleop has the services
+    tare, load and calibrate, and the parameters sigma, gamma, sigma_weight, sigma_inertia, load,
+    until and seconds. Flags are on /diagnostics. Calibrations are written to --out.
+    """
+    from drake_teleop.robots.ros2_node import ros2_command
+
+    def calibrate(until: str, seconds: float) -> list[str]:
+        words = ["calibrate", source, "--until", until, "--seconds", str(seconds), "--quiet"]
+        words += ["--out", str(out)]
+        given = {"--cutoff": "cutoff_hz", "--delay": "delay", "--model": "model"}
+        given |= {"--sensor-frame": "sensor_frame", "--motion": "motion"}
+        for name, parameter in given.items():
+            if (value := ctx.params[parameter]) is not None:
+                words += [name, str(value)]
+        for name, parameter in (("--range", "largest"), ("--sensor-pose", "sensor_pose")):
+            if (numbers := ctx.params[parameter]) is not None:
+                words += [name, *map(str, numbers)]
+        return words + [
+            x for path in ctx.params["package_paths"] for x in ("--package-path", str(path))
+        ]
+
+    ros2_command(source, load, sink, out, calibrate=calibrate, **options)
 
 
 @cli.command()
@@ -413,12 +454,16 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 _EXPORT_FORMATS = (
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
 )
+_CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
 
 
 @cli.command()
 @click.argument("identification", type=option.PATH)
 @click.option(
-    "--to", required=True, type=click.Choice(_EXPORT_FORMATS), help="Robot or file format."
+    "--to",
+    required=True,
+    type=click.Choice(_EXPORT_FORMATS + _CONTROLLER_FORMATS),
+    help="Robot or file format.",
 )
 @option.sensor_pose("Sensor in the flange [m, deg].  [default: values in the sensor's frame]")
 @click.option(
@@ -428,17 +473,42 @@ _EXPORT_FORMATS = (
     show_default=True,
     help="As in the log description: -1 if the sensor measures the wrench of the load on it.",
 )
-def export(identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str) -> None:
-    """Print a load in the format of a robot or model.
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=option.POSITIVE,
+    metavar="HZ",
+    help="Rate of the readings; required by c99.",
+)
+@option.cutoff
+@option.sensor_range
+@option.out("export")
+def export(
+    identification: Path,
+    to: str,
+    sensor_pose: tuple[float, ...] | None,
+    sign: str,
+    **loop: Any,
+) -> None:
+    """Write a load for a robot, model or controller.
 
-    Converts the load of an identification.json into the format, units and frame of a robot, a
-    compensation or a model. Values that are dropped or not identified are listed on stderr.
+    Prints the load of an identification.json in the format, units and frame of a robot, a
+    compensation or a model. c99 writes the compensation itself into --out, as code of a controller
+    with --rate, --cutoff and --range. Values that are dropped or not identified are listed on
+    stderr.
     """
     from drake_teleop.load.identification import Identification
-    from drake_teleop.robots.export import export as export_load
 
     found = Identification.load(identification)
-    text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
+    if to in _CONTROLLER_FORMATS:
+        from drake_teleop.robots.controller.export import export_controller
+
+        notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **loop)
+        text = ""
+    else:
+        from drake_teleop.robots.export import export as export_load
+
+        text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
     for note in notes:
         click.echo(f"warning: {note}", err=True)
     click.echo(text, nl=False)
@@ -515,9 +585,45 @@ def compare_passivity(
 
 
 @cli.command()
+@click.argument("scenario", type=option.SCENARIO)
+@click.option("--hands", type=option.Names(), help="Grips.  [default: light,firm]")
+@click.option("--walls", type=option.Names(), help="Stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option("--network", help="Preset of the network.  [default: of the scenario]")
+@click.option(
+    "--task",
+    type=click.Choice(["press", "touch", "insert"]),
+    default="press",
+    show_default=True,
+    help="Task; it sets the required margin.",
+)
+@option.jobs
+@option.out("tune")
+@option.quiet
+def tune(
+    scenario: str,
+    out: Path,
+    hands: tuple[str, ...] | None,
+    walls: tuple[str, ...] | None,
+    **options: Any,
+) -> None:
+    """Choose passivity method and force scales for a station.
+
+    SCENARIO is a shipped name or a YAML file. Finds the settings with the smallest detectable
+    contact force that are stable for these grips and walls. Writes tuned.yaml and report.html.
+    After an interruption the same command continues.
+    """
+    from drake_teleop.lab.tuning.tune import tune as tune_station
+
+    stiffnesses = [option.POSITIVE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
+    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffnesses, **options)
+
+
+@cli.command()
 @click.argument("study", type=option.STUDY)
 @option.jobs
 @option.cluster
+@click.option("--shard", metavar="K/N", help="Run part K of N, e.g. 3/8; see docs/cluster.md.")
+@click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
 @option.yes
 @option.out("study")
 @option.quiet

@@ -194,6 +194,14 @@ cutoff = click.option(
     metavar="HZ",
     help="Low-pass on all signals [Hz]; zero-phase for logs, causal for live streams.",
 )
+sensor_range = click.option(
+    "--range",
+    "largest",
+    type=POSITIVE,
+    nargs=2,
+    metavar="N NM",
+    help="Range of the sensor [N, N m]; readings at its limits are not used.",
+)
 delay = click.option(
     "--delay",
     type=Delay(),
@@ -295,14 +303,7 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
         delay,
         cutoff,
         click.option("--real-time", is_flag=True, help="Replay a log in real time."),
-        click.option(
-            "--range",
-            "largest",
-            type=POSITIVE,
-            nargs=2,
-            metavar="N NM",
-            help="Range of the sensor [N, N m]; readings at its limits are not used.",
-        ),
+        sensor_range,
         sensor_pose("Pose of the sensor in the frame of the streamed poses [m, deg]."),
         package_paths,
         sensor_frame(),

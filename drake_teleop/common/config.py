@@ -286,7 +286,10 @@ class FieldInfo:
 
 
 def settings(block: _Class) -> _Class:
-    """Make a dataclass reject unknown attributes, and list its fields in its docstring."""
+    """Make a dataclass reject unknown attributes, and list its fields in its docstring.
+
+    Its module must not postpone annotations: `yaml_load_typed` reads the types of the fields.
+    """
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.text) for entry in fields_of(block)]

@@ -110,3 +110,25 @@ def one_blas_thread() -> AbstractContextManager[object]:
 
     limits: AbstractContextManager[object] = threadpool_limits(1)
     return limits
+
+
+def runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the first index of each run of set flags (N,), and the one after its last, (k, 2)."""
+    ends = np.zeros(1, bool)
+    return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
+
+
+def narrowest_half(x: Array) -> tuple[Array, Array]:
+    """Return the widths (k,) of the narrowest half of samples x (N, k), and its centres (k,)."""
+    ordered = np.sort(x, axis=0)
+    half = len(ordered) // 2
+    widths = ordered[half:] - ordered[: len(ordered) - half]
+    start, channels = np.argmin(widths, axis=0), np.arange(x.shape[1])
+    centres = (ordered[start, channels] + ordered[start + half, channels]) / 2
+    return widths[start, channels], centres
+
+
+def parabola_minimum(left: float, middle: float, right: float) -> float:
+    """Return where a parabola through values at -1, 0 and 1 is least, limited to this interval."""
+    bend = left - 2.0 * middle + right
+    return float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0)) if bend > 0.0 else 0.0

@@ -19,11 +19,11 @@ from drake_teleop.lab.excitation.check import check
 from drake_teleop.lab.excitation.excite import criteria_of, excite
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.result import SimulationResult

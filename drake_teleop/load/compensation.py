@@ -23,19 +23,10 @@ from drake_teleop.load.regressor import wrench_of_load
 
 @register_jitable
 def wrench_of_scales(
-    wrench,
-    offsets,
-    s,
-    omega,
-    alpha,
-    phi_gripper,
-    phi_object,
-    sigma_gripper,
-    sigma_object,
-    gamma,
+    wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
 ):
     """Return force and torque of `scaled_wrench` as tuples, for scalars of any type."""
-    a, b = sigma_gripper - gamma, sigma_object - gamma
+    a, b = sigma_gr - gamma, sigma_obj - gamma
     phi = (
         a * phi_gripper[0] + b * phi_object[0],
         a * phi_gripper[1] + b * phi_object[1],
@@ -67,26 +58,15 @@ def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_ob
 
 @njit(cache=True)
 def scaled_wrench_into(
-    wrench,
-    offsets,
-    s,
-    omega,
-    alpha,
-    phi_gripper,
-    phi_object,
-    sigma_gripper,
-    sigma_object,
-    gamma,
-    out,
+    wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
     """Write F' (6,) of `scaled_wrench` into out, for one sample.
 
     For sigma = gamma the result does not depend on errors of the load parameters.
     """
     force, torque = wrench_of_scales(
-        wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gripper, sigma_object,
-        gamma,
-    )  # fmt: skip
+        wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
+    )
     out[0], out[1], out[2] = force
     out[3], out[4], out[5] = torque
 
@@ -111,20 +91,9 @@ def _add_weights(gravity, phi_gripper, phi_object, excess_gripper, excess_object
 def _scaled_wrenches(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
+    scales = phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
     for i in range(wrench.shape[0]):
-        scaled_wrench_into(
-            wrench[i],
-            offsets[i],
-            s[i],
-            omega[i],
-            alpha[i],
-            phi_gripper,
-            phi_object,
-            sigma_gr,
-            sigma_obj,
-            gamma,
-            out[i],
-        )
+        scaled_wrench_into(wrench[i], offsets[i], s[i], omega[i], alpha[i], *scales, out[i])
 
 
 def contact_wrench(
@@ -144,18 +113,9 @@ def contact_wrench(
             [SI].
         phi: (10,) load about So in S.
     """
-    return scaled_wrench(
-        wrench,
-        offsets,
-        s,
-        omega,
-        alpha,
-        checked("phi", phi, 10),
-        np.zeros(10),
-        sigma_gripper=0.0,
-        sigma_object=0.0,
-        gamma=1.0,
-    )
+    phis = checked("phi", phi, 10), np.zeros(10)
+    scales = {"sigma_gripper": 0.0, "sigma_object": 0.0, "gamma": 1.0}
+    return scaled_wrench(wrench, offsets, s, omega, alpha, *phis, **scales)
 
 
 def scaled_wrench(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -185,15 +185,14 @@ class Identification:
 
         if not isinstance(document["method"], str):
             raise DrakeTeleopError("is not a text", where=f"{path}:method")
-        optional: dict[str, Any] = {}
-        if (name := "weight_removed") in document:
-            if not isinstance(document[name], bool):
-                raise DrakeTeleopError("is not true or false", where=f"{path}:{name}")
-            optional[name] = document[name]
-        if (name := "degrees_of_freedom") in document:
-            optional[name] = _read_degrees(f"{path}:{name}", document[name])
-        if (name := "prior_dominated") in document:
-            optional[name] = _read_flags(f"{path}:{name}", document[name])
+        readers: dict[str, Callable[[str, Any], Any]] = {
+            "weight_removed": _read_flag,
+            "degrees_of_freedom": _read_degrees,
+            "prior_dominated": _read_flags,
+        }
+        optional = {
+            k: read(f"{path}:{k}", document[k]) for k, read in readers.items() if k in document
+        }
         phi = check_identified(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise DrakeTeleopError("has no mass", where=f"{path}:phi")
@@ -306,6 +305,12 @@ def _read_covariance(where: str, value: Any) -> Array:
     if (np.diag(covariance) < 0.0).any():
         raise DrakeTeleopError("has a negative variance", where=where)
     return np.where(unknown, np.inf, covariance)
+
+
+def _read_flag(where: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise DrakeTeleopError("is not true or false", where=where)
+    return value
 
 
 def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:

@@ -79,11 +79,7 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 
 
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
-    """Return the load phi (10,) with this pseudo-inertia J (4, 4).
-
-    Raises:
-        DrakeTeleopError: if J is not symmetric.
-    """
+    """Return the load phi (10,) with this pseudo-inertia J (4, 4)."""
     J = checked("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
         raise DrakeTeleopError("the pseudo-inertia is not symmetric", where="J")

@@ -10,31 +10,35 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtrc
 
-from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, checked_rows, number, positive
+from drake_teleop.common.numeric import Array, checked, number, positive
 from drake_teleop.load.identification import Identification, worth_stating
-from drake_teleop.load.regressor import regressor_into
+from drake_teleop.load.moments import (
+    Moments,
+    coefficients,
+    excited_columns,
+    normal_equations,
+    residual_covariance,
+)
 
-# Smallest relative eigenvalue of the scaled Gram, largest component of a determined parameter in
-# the null space, and smallest excitation of a column [m/s^2, rad/s^2].
-_MIN_EIGENVALUE, _MAX_NULL_COMPONENT, _MIN_EXCITATION = 1e-12, 1e-6, 1e-9
-# Number of blocks, smallest block length over the noise's correlation time, fewest degrees of
-# freedom of a usable variance.
-_MAX_BLOCKS, _MIN_CORRELATION_TIMES, _MIN_DEGREES = 1024, 4.0, 8.0
+# Smallest relative eigenvalue of the scaled Gram, and largest component of a determined parameter
+# in the null space.
+_MIN_EIGENVALUE, _MAX_NULL_COMPONENT = 1e-12, 1e-6
+# Smallest block length over the noise's correlation time, fewest degrees of freedom of a usable
+# variance.
+_MIN_CORRELATION_TIMES, _MIN_DEGREES = 4.0, 8.0
 # For noise that is weaker at low frequencies: fewest degrees of freedom, and smallest share of the
 # fit's degrees of freedom that the blocks contain.
 _MIN_DEGREES_LONGEST, _MIN_ABSORBED_SHARE = 20.0, 0.9
-_MIN_SAMPLES = 3
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE_M_S2, _F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
 _ROUNDING_RESIDUAL = 1e-6
-# Indices of the wrench and of the factors of [offset, phi] in x.
-_WRENCH, _MODEL = 1, np.array([0, *range(2, 12)])
+_WRENCH, _FORCE = slice(1, 7), slice(7, 10)
+"""Positions of wrench and specific force in the signals z of `Moments`."""
 
 
-class NormalEquations:
+class NormalEquations(Moments):
     """Least squares sums of a record, from which load and sensor offsets are solved.
 
     Samples are added in the order of time, because their noise may be correlated.
@@ -47,35 +51,12 @@ class NormalEquations:
     def __init__(
         self, noise: ArrayLike | None = None, *, resolution: tuple[float, float] | None = None
     ) -> None:
+        super().__init__()
         self._resolution = resolution
         self._weights = np.ones(6) if noise is None else positive("noise", noise, 6) ** -2.0
-        # Channel c: sum of x x^T, x = [1, wrench c, row c of V (10)], and its first row per block.
-        self._moments = np.zeros((6, 12, 12))
-        self._blocks = np.zeros((_MAX_BLOCKS, 6, 12))
-        # Index of the open block, samples of a full block.
-        self._state = np.array([0, 1])
-
-    @property
-    def samples(self) -> int:
-        """Number of samples."""
-        return int(self._moments[0, 0, 0])
-
-    def add(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Add N samples with arguments as for `identify`, or a single one, (6,) and (3,)."""
-        _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
-        _accumulate(*rows, self._moments, self._blocks, self._state)
 
     def solve(self, delay_s: float = 0.0) -> Identification:
-        """Return the least squares solution; `delay_s` [s] is only stored in it.
-
-        Raises:
-            DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
-        """
-        if self.samples < _MIN_SAMPLES:
-            raise DrakeTeleopError(
-                f"{self.samples} samples cannot determine a load",
-                remedy=f"give at least {_MIN_SAMPLES}, in different orientations",
-            )
+        """Return the least squares solution; `delay_s` [s] is only stored in it."""
         inverse, undetermined, condition_number = self._pseudo_inverse()
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
@@ -96,7 +77,7 @@ class NormalEquations:
             delay_s=number("delay_s", delay_s),
             residual_rms=np.sqrt(self.residual_squares(theta) / self.samples),
             method="batch least squares",
-            samples=self.samples,
+            samples=int(self.samples),
             degrees_of_freedom=degrees,
         )
 
@@ -131,22 +112,16 @@ class NormalEquations:
         `weights` (6,) of the channels are by default those of the noise.
         """
         weights = self._weights if weights is None else checked("weights", weights, 6)
-        gram, right = np.tensordot(weights, self._channel_grams(), 1), np.zeros(16)
-        for c, weight in enumerate(weights):
-            right[_columns(c)] += weight * self._moments[c, _MODEL, _WRENCH]
-        return gram, right
+        return normal_equations(self._sums, np.diag(weights))
 
     def _channel_grams(self) -> Array:
-        grams = np.zeros((6, 16, 16))
-        for c in range(6):
-            grams[c][np.ix_(_columns(c), _columns(c))] = self._moments[c][np.ix_(_MODEL, _MODEL)]
-        return grams
+        T = coefficients()
+        return np.asarray(T @ self._sums @ T.transpose(0, 2, 1))
 
     @property
     def unexcited(self) -> NDArray[np.bool_]:
         """Booleans (16,): True for parameters that do not influence the wrench."""
-        squares = np.diag(self.normal_equations(np.ones(6))[0]) / self.samples
-        return np.sqrt(squares) < _MIN_EXCITATION
+        return ~excited_columns(self.mean)
 
     @property
     def weights(self) -> Array:
@@ -155,12 +130,8 @@ class NormalEquations:
 
     def residual_squares(self, theta: ArrayLike) -> Array:
         """Return the sums (6,) of squared residuals of the channels for theta = [offsets; phi]."""
-        theta = checked("theta", theta, 16)
-        squares = np.empty(6)
-        for c in range(6):
-            x = np.concatenate([[-theta[c], 1.0], -theta[6:]])
-            squares[c] = max(0.0, x @ self._moments[c] @ x)
-        return squares
+        squares = np.diag(residual_covariance(self._sums, checked("theta", theta, 16)))
+        return np.maximum(squares, 0.0)
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
         """Return residual variances (6,) with correlation in time, and degrees of freedom (6,).
@@ -190,20 +161,17 @@ class NormalEquations:
         variances, degrees = self._unbiased(power, n, grams, grams, inverse)
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
-        wrench = self._moments[:, _WRENCH, _WRENCH]
+        wrench = np.diag(self._sums)[_WRENCH]
         found, slow = np.zeros(6, dtype=bool), np.zeros(6, dtype=bool)
         sample_absorbed = self._absorbed(grams, inverse)
         longest, longest_degrees = variances, degrees
-        blocks, length = self._blocks[: self._state[0] + 1], float(self._state[1])
+        last, length, filled = (int(number) for number in self._state)
         # An unfinished last block would have the weight of a full one.
-        blocks = blocks[: len(blocks) - (blocks[-1, 0, 0] < length)]
+        blocks = self._blocks[: last + (filled == length)]
         while len(blocks) > _MIN_DEGREES:
-            model = blocks[:, :, 0] * theta[:6] + blocks[:, :, 2:] @ theta[6:]
-            power = np.sum((blocks[:, :, _WRENCH] - model) ** 2, axis=0) / length
-            between = np.zeros((6, 16, 16))
-            for c in range(6):
-                means = blocks[:, c, _MODEL]
-                between[c][np.ix_(_columns(c), _columns(c))] = means.T @ means / length
+            rows = _rows(blocks)
+            power = np.sum((blocks[:, _WRENCH] - rows @ theta) ** 2, axis=0) / length
+            between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
             estimated, counted = self._unbiased(power, len(blocks), between, grams, inverse)
             usable = ~found & (counted >= _MIN_DEGREES)
             correlation = np.divide(estimated, of_samples, out=np.ones(6), where=of_samples > 0.0)
@@ -222,7 +190,7 @@ class NormalEquations:
             significant = correlation > 1.0 + 3.0 * np.sqrt(2.0 / np.maximum(counted, 1.0))
             slow = np.where(usable, significant & ~found, slow & ~found)
             even = len(blocks) // 2 * 2
-            blocks, length = blocks[0:even:2] + blocks[1:even:2], 2.0 * length
+            blocks, length = blocks[0:even:2] + blocks[1:even:2], 2 * length
         # The logarithm of an estimated variance is nearly normal, with deviation sqrt(2 / degrees).
         weaker = found & (longest * np.exp(3.0 * np.sqrt(2.0 / longest_degrees)) < variances)
         variances = np.where(weaker, longest, variances)
@@ -234,13 +202,11 @@ class NormalEquations:
         squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
         min_variance = np.array(self._resolution) ** 2 / 12.0
         blocks = self._blocks[: self._state[0] + 1]
-        count = blocks[:, 0, 0]
-        s = blocks[:, range(3), 2] / count[:, None]
+        count = blocks[:, 0]
+        s = blocks[:, _FORCE] / count[:, None]
         first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_M_S2).argmax(axis=1)
         groups = (np.unique(first)[:, None] == first).astype(float)
-        sums = groups @ (
-            blocks[:, :, _WRENCH] - blocks[:, :, 0] * theta[:6] - blocks[:, :, 2:] @ theta[6:]
-        )
+        sums = groups @ (blocks[:, _WRENCH] - _rows(blocks) @ theta)
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
         left, repeats = 3.0 * len(groups) - absorbed_sums, 3.0 * (self.samples - len(groups))
         within = np.maximum(squares - between, repeats * min_variance) / max(repeats, 1.0)
@@ -298,55 +264,8 @@ def identify(
     return equations.solve(delay_s)
 
 
-def _columns(channel: int) -> NDArray[np.int_]:
-    return np.array([channel, *range(6, 16)])
-
-
-@njit(cache=True)
-def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
-    """Add samples to the sums of x x^T, x = [1, wrench, row of V], per channel and per block.
-
-    A full table of blocks is halved by joining pairs.
-    """
-    V, x, part = np.empty((6, 10)), np.empty(12), np.zeros((6, 12, 12))
-    x[0] = 1.0
-    last, length = state[0], state[1]
-    remaining = length - int(blocks[last, 0, 0])
-    for i in range(wrench.shape[0]):
-        if remaining == 0:
-            _add_block(part, moments, blocks[last])
-            last += 1
-            if last == blocks.shape[0]:
-                last //= 2
-                length *= 2
-                for b in range(last):
-                    blocks[b] = blocks[2 * b] + blocks[2 * b + 1]
-                blocks[last:] = 0.0
-            remaining = length
-        remaining -= 1
-        regressor_into(s[i], omega[i], alpha[i], V)
-        for c in range(6):
-            size = 6 if c < 3 else 12
-            x[1] = wrench[i, c]
-            for k in range(size - 2):
-                x[2 + k] = V[c, k]
-            for j in range(size):
-                for k in range(j, size):
-                    part[c, j, k] += x[j] * x[k]
-    _add_block(part, moments, blocks[last])
-    state[0], state[1] = last, length
-
-
-@njit(cache=True)
-def _add_block(part, moments, block):
-    for c in range(6):
-        for j in range(12):
-            block[c, j] += part[c, 0, j]
-            moments[c, j, j] += part[c, j, j]
-            for k in range(j + 1, 12):
-                moments[c, j, k] += part[c, j, k]
-                moments[c, k, j] += part[c, j, k]
-    part[:] = 0.0
+def _rows(blocks: Array) -> Array:
+    return np.asarray(np.einsum("cjk,bk->bcj", coefficients(), blocks))
 
 
 def _pseudo_inverse(

@@ -1,22 +1,132 @@
-"""Log whose delay is removed, with the motion that best explains the wrench of a known load."""
+"""Motion of S at the sample times of a wrench, without delay, from splines, IMU or derivatives."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.common.numeric import Array, narrowest_half, one_blas_thread
 from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.logs.pose_motion.estimate import (
+    PoseEstimate,
+    PoseMotion,
+    estimate_from_poses,
+    motion_of_load,
+)
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
-from drake_teleop.logs.read.alignment import ends, low_pass, undelayed
+from drake_teleop.logs.read.alignment import delay_of, ends, low_pass, undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.spline_motion import clock_note, motion_of_known_load, use_spline_motion
+
+_MAX_DELAY_DEVIATION_S = 0.005  # s, standard deviation
+_EDGE_KNOTS = 2.0
+_Motion = TypeVar("_Motion", bound=PoseMotion)
+
+
+def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
+    """Return motion and load of a log with poses, and the source of its delay.
+
+    `delay` is that of the motion behind the wrench [s], or "auto".
+    """
+    return _with_delay(log, delay, lambda late: _estimate(log, late), 0.0, "undetermined")
+
+
+def motion_of_known_load(
+    log: Log, delay: str | float, load: Array, usual_s: float
+) -> tuple[PoseMotion, str] | None:
+    """Return the motion with which an identified load fits best, and the source of its delay.
+
+    None without positions, for a short record, and if an IMU disagrees with the poses.
+
+    Args:
+        delay: of the motion behind the wrench [s], or "auto".
+        load: (6, 16) from `drake_teleop.logs.pose_motion.rigid.load_coefficients`.
+        usual_s: delay for a record that does not determine it [s].
+    """
+    posed = log.posed
+    if posed is None or log.static:
+        return None
+    arrays = log.t, log.wrench, posed.poses, posed.gravity_W, load
+
+    def chosen(late: float | None) -> PoseMotion:
+        return motion_of_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
+
+    with suppress(DrakeTeleopError):  # too short
+        found, source = _with_delay(log, delay, chosen, usual_s, "load")
+        return (found, source) if found.imu_agrees else None
+    return None
+
+
+def _with_delay(
+    log: Log,
+    delay: str | float,
+    motion: Callable[[float | None], _Motion],
+    usual_s: float,
+    usual: str,
+) -> tuple[_Motion, str]:
+    known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
+    found = motion(known)
+    if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
+        return motion(usual_s), usual
+    return found, source
+
+
+def _estimate(log: Log, delay: float | None) -> PoseEstimate:
+    assert log.posed is not None
+    return estimate_from_poses(
+        log.t,
+        log.wrench,
+        log.posed.poses,
+        log.posed.gravity_W,
+        delay=delay,
+        gain=log.gain_std,
+        lost=log.bridged,
+        imu=log.posed.imu,
+    )
+
+
+def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
+    """Return the log with spline motion and without delay, and flags (N,).
+
+    Flags are True near ends and gaps of the poses, where the acceleration is noisy.
+    """
+    assert log.posed is not None
+    moved, splines = undelayed(log, found.delay_s), found.splines
+    t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
+    s, omega, alpha = splines.motion(t, gravity_W)
+    moved = replace(
+        moved,
+        specific_force=s,
+        angular_velocity=omega,
+        angular_acceleration=alpha,
+        gravity=splines.gravity(t, gravity_W),
+    )
+    stamps, margin = splines.poses.t, _EDGE_KNOTS * splines.spacing
+    gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
+    ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
+    change = np.zeros(len(t) + 1)
+    np.add.at(change, np.searchsorted(t, ends - margin), 1.0)
+    np.add.at(change, np.searchsorted(t, ends + margin), -1.0)
+    return moved, np.cumsum(change[:-1]) > 0.0
+
+
+def clock_note(found: PoseMotion) -> list[str]:
+    """Return a note if the clock rate of the poses differs from that of the wrench."""
+    if not found.clock_rate:
+        return []
+    side = "faster" if found.clock_rate > 0.0 else "slower"
+    return [
+        f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
+        " that of the wrench, which is taken out; to say so, multiply pose.time.scale (1 by"
+        f" default) by {1.0 / (1.0 + found.clock_rate):.6f}"
+    ]
 
 
 @dataclass(frozen=True)
@@ -56,9 +166,6 @@ def aligned_log(
         phi: (10,) identified load.
         usual_s: delay for a record that does not determine it [s].
         weight_removed: True if the wrench does not contain the weight of the load.
-
-    Raises:
-        DrakeTeleopError: if the weight is removed and the log has no orientation.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.free
@@ -102,11 +209,7 @@ def without_orientation(where: str) -> DrakeTeleopError:
 
 
 def accelerated(log: Log) -> Log:
-    """Return the log with the acceleration in place of the specific force.
-
-    Raises:
-        DrakeTeleopError: if the log has no orientation.
-    """
+    """Return the log with the acceleration in place of the specific force."""
     if log.gravity is None:
         raise without_orientation(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
@@ -115,6 +218,4 @@ def accelerated(log: Log) -> Log:
 def _spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
     log = aligned.log
     left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
-    left = np.sort(left[~aligned.edge], axis=0)
-    half = len(left) // 2
-    return float(np.log((left[half:] - left[: len(left) - half]).min(axis=0) + 1e-12).sum())
+    return float(np.log(narrowest_half(left[~aligned.edge])[0] + 1e-12).sum())

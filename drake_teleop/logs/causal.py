@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
+_ROOT_OF_2, _ROOT_4_OF_3 = math.sqrt(2.0), 3.0**0.25
 MODES = ("delayed", "predicted")
 
 
@@ -38,9 +40,6 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
         dt: sample time [s].
         cutoff_hz: frequency of half the amplitude; no filter for None or above the Nyquist rate.
         ahead_s: time over which the output is extrapolated by its slope [s].
-
-    Raises:
-        DrakeTeleopError: for an extrapolation without a filter.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -52,28 +51,45 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
         return x
     from scipy.signal import lfilter
 
-    b, a, settled = low_pass_coefficients(dt, cutoff_hz, ahead_s)
+    low_pass = low_pass_coefficients(dt, cutoff_hz, ahead_s)
+    b, a, settled = low_pass[:3], [1.0, *low_pass[3:5]], low_pass[5:]
     at_first = settled.reshape(2, *[1] * (x.ndim - 1)) * x[:1]
     return lfilter(b, a, x, axis=0, zi=at_first)[0]
 
 
-def low_pass_coefficients(
-    dt: float, cutoff_hz: float, ahead_s: float = 0.0
-) -> tuple[Array, Array, Array]:
-    """Return b (3,), a (3,) of `causal_low_pass`, and its state (2,) for a constant input 1."""
-    # Imported here, because the import takes longer than the rest of the command.
-    from scipy.signal import bilinear, lfilter_zi
+def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> Array:
+    """Return the low-pass (7,) of `design_low_pass`."""
+    low_pass = np.empty(7)
+    design_low_pass(dt, math.tan(math.pi * cutoff_hz * dt), ahead_s, low_pass)
+    return low_pass
 
-    w = _prewarped(cutoff_hz, dt)
-    b, a = bilinear([ahead_s * w * w, w * w], [1.0, math.sqrt(2.0) * w, w * w], 1.0 / dt)
-    return b, a, lfilter_zi(b, a)
+
+@njit(cache=True)
+def design_low_pass(dt, tangent, ahead_s, low_pass):
+    """Write the coefficients b, a_1, a_2 and the steady-state memory at input 1 to low_pass (7,).
+
+    Args:
+        tangent: tan(pi cutoff dt), for the bilinear transform.
+        ahead_s: see `causal_low_pass`.
+    """
+    k = 2.0 / dt
+    w = k * tangent / _ROOT_4_OF_3
+    square, damping = w * w, _ROOT_OF_2 * w * k
+    a = k * k + damping + square
+    low_pass[0] = (square + ahead_s * square * k) / a
+    low_pass[1] = (square + square) / a
+    low_pass[2] = (square - ahead_s * square * k) / a
+    low_pass[3] = 2.0 * (square - k * k) / a
+    low_pass[4] = (k * k - damping + square) / a
+    low_pass[6] = low_pass[2] - low_pass[4]
+    low_pass[5] = low_pass[6] + low_pass[1] - low_pass[3]
 
 
 def filter_lag(dt: float, cutoff_hz: float | None) -> float:
     """Return the delay of `causal_low_pass` for slow signals [s]."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
-    return math.sqrt(2.0) / _prewarped(cutoff_hz, dt)
+    return _ROOT_OF_2 / _prewarped(cutoff_hz, dt)
 
 
 def causal_wrenches(
@@ -87,9 +103,6 @@ def causal_wrenches(
         cutoff_hz: cut-off of the low-pass; None: no filter.
         delay_s: delay of the motion behind the wrench [s], rounded up to a full sample.
         mode: "delayed" keeps the lag, "predicted" extrapolates over it.
-
-    Raises:
-        DrakeTeleopError: for another mode, or a prediction without a low-pass.
     """
     if mode not in MODES:
         raise DrakeTeleopError(
@@ -108,4 +121,4 @@ def causal_wrenches(
 
 
 def _prewarped(cutoff_hz: float, dt: float) -> float:
-    return 2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / 3.0**0.25
+    return 2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / _ROOT_4_OF_3

@@ -9,15 +9,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array
-from drake_teleop.load.contact.detection import RARE, ContactDetector, statistics, wrench_axis
-from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, statistic_index
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.common.numeric import Array, narrowest_half, runs
+from drake_teleop.load.contact.detection import (
+    RARE,
+    ContactDetector,
+    fit_noise_floor,
+    statistics,
+    wrench_axis,
+)
+from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, Samples, statistic_index
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
@@ -38,26 +43,6 @@ _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.
 _MAX_CONTACT_SHARE, _MAX_NOISE_RATIO = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
 _CONTACT_SHARE_OF_SHIFT = 0.2
-
-
-class Samples(NamedTuple):
-    """Input of the contact detector, low-passed.
-
-    Attributes:
-        contact: (N, 6) contact wrench F_c [N, N m].
-        s, omega, alpha: (N, 3) specific force, angular velocity and acceleration of S [SI].
-        acceleration: (N, 3) acceleration without gravity [m/s^2].
-    """
-
-    contact: Array
-    s: Array
-    omega: Array
-    alpha: Array
-    acceleration: Array
-
-    def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
-        """Return the samples in `rows`."""
-        return Samples(*(x[rows] for x in self))
 
 
 @dataclass(frozen=True)
@@ -121,9 +106,6 @@ def detect_contact(
         edge: (N,) True for further samples that are not judged.
         free: samples of a log of free motion, and its sample time [s].
         statistic: "level", "cusum" or "glr".
-
-    Raises:
-        DrakeTeleopError: for an unknown statistic, or too little free motion.
     """
     period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
     inner = _judged_samples(rows, dt, period, edge)
@@ -220,7 +202,7 @@ def _extrapolated(values: Array, block: int, samples: int) -> float:
 
 
 def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
-    for _, stop in _spans(touched):
+    for _, stop in runs(touched):
         if stop < len(touched):
             touched[stop - hold : stop] = False
     return touched
@@ -229,13 +211,9 @@ def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
 def _remove_marginal(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
-    for start, stop in _spans(touched):
+    for start, stop in runs(touched):
         if 2 * (stop - start) < hold and values[start:stop].max() < MARGIN * threshold:
             touched[start:stop] = False
-
-
-def _spans(touched: NDArray[np.bool_]) -> NDArray[np.intp]:
-    return np.flatnonzero(np.diff(np.concatenate([[False], touched, [False]]))).reshape(-1, 2)
 
 
 def _detection_notes(
@@ -276,12 +254,8 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
     `residual` (N, 6) is the wrench without that of the load [N, N m].
     """
-    ordered = np.sort(residual, axis=0)
-    half = len(ordered) // 2
-    widths = ordered[half:] - ordered[: len(ordered) - half]
-    start, channels = np.argmin(widths, axis=0), np.arange(6)
-    offsets = (ordered[start, channels] + ordered[start + half, channels]) / 2
-    agrees = np.zeros(len(residual), bool)
+    offsets = narrowest_half(residual)[1]
+    agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):
         distance = np.abs(residual - offsets)
         # 1.4826 * median |x| is the standard deviation of a normal x.
@@ -295,9 +269,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 def noise_floor(contact: Array) -> Array:
     """Return the noise (6,) of a contact wrench (N, 6), calm for half of the record, Eq. (T12)."""
-    ordered = np.sort(contact, axis=0)
-    half = len(ordered) // 2
-    floor = (ordered[half:] - ordered[: len(ordered) - half]).min(axis=0) / 1.349
+    floor = narrowest_half(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
         before = quiet
@@ -315,7 +287,7 @@ def _quiet(contact: Array, floor: Array) -> NDArray[np.bool_]:
 def contacts_of(t: Array, contact: Array, touched: NDArray[np.bool_]) -> list[dict[str, Any]]:
     """Return times [s], peaks [N, N m], direction and point (in S) of each contact."""
     rows = []
-    for start, stop in _spans(touched):
+    for start, stop in runs(touched):
         wrench = contact[start:stop]
         forces = np.linalg.norm(wrench[:, :3], axis=1)
         direction, point, _ = wrench_axis(wrench[np.argmax(forces)])

@@ -1,24 +1,215 @@
-"""Search for causes of a misfit in a log, and the load that results with these causes."""
+"""Causes of a misfit in a log, the lines that correct them, and the resulting load."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import rotation_matrices
+from drake_teleop.common.texts import yaml_data
 from drake_teleop.load.identification import Identification, worth_stating
-from drake_teleop.logs.cause_lines import with_lines
-from drake_teleop.logs.causes.cause import Cause
+from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
 from drake_teleop.logs.read.alignment import undelayed
+from drake_teleop.logs.read.auto_frames import log_instants
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.gravity import log_instants
-from drake_teleop.logs.read.rotations import rotation_matrices
+from drake_teleop.logs.read.description import NO_YAML, Description
+from drake_teleop.logs.read.description_fields import UNITS
+from drake_teleop.logs.read.table_files import FORMATS
+
+Fields = dict[str, Any]
+"""Values of the correctable fields, by their names in a description."""
+_MAX_MASS_KG = 1000.0
+_SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
+_FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
+_FORCE_UNIT, _TORQUE_UNIT = "wrench.force.unit", "wrench.torque.unit"
+# Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
+_FORCE_UNITS = ("N", "kgf", "lbf")
+_TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
+_SAME_RATIO = 1e-3
+_POSITIONS = ("pose.position_in_sensor", "imu.position")
+_ROTATIONS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
+_DIGITS = {_GRAVITY: 4, _POSITIONS[0]: 5, _POSITIONS[1]: 5}
+_OTHER_REMEDIES = {
+    "axes": "correct the columns of wrench.force and wrench.torque",
+    "sensor rotation": "correct the mounting or the frame of the pose",
+    "pose frame": "add the position to pose, or an accelerometer",
+}
+
+
+def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
+    """Return the causes; their messages now end in the description lines that correct them.
+
+    `by_pose` is True if the acceleration is from poses, not from an IMU.
+    """
+    _, texts, corrected = _correct_fields(causes, log, by_pose)
+    return tuple(
+        replace(cause, message=f"{cause.message}; {text}", fields=fields) if text else cause
+        for cause, text, fields in zip(causes, texts, corrected, strict=True)
+    )
+
+
+def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
+    """Return a message with the units to correct if a mass [kg] is above 1000 kg, or None."""
+    if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
+        return None
+    fields = _correct_fields(causes, log, by_pose=True)[0]
+    ratio = fields[_TORQUE] / fields[_FORCE]
+    text = _yaml_value(_TORQUE, ratio)
+    return (
+        f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
+        f" {log.described.wrench.force.unit}; set {_FORCE} to the value of one unit of the file"
+        f" (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
+        f" and {_TORQUE} to {text} times that{_no_yaml_note(log)}"
+    )
+
+
+def _correct_fields(
+    causes: Sequence[Cause], log: Log, by_pose: bool
+) -> tuple[Fields, list[str], list[Fields]]:
+    """Return all corrected fields, and the remedy and the corrected fields of each cause."""
+    assert log.described is not None
+    fields = _fields(log.described, by_pose)
+    column = _columns(fields[_FRAME])
+    touched: list[list[str]] = []
+    for cause in causes:
+        before = {name: _yaml_value(name, value) for name, value in fields.items()}
+        if cause.name == "gain":
+            _gain(fields, cause.values, column)
+        elif cause.name in _CORRECTIONS:
+            _CORRECTIONS[cause.name](fields, cause.values)
+        touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
+    texts, corrected = [], []
+    for cause, names in zip(causes, touched, strict=True):
+        corrected.append({name: yaml_data(_yaml_value(name, fields[name]), name) for name in names})
+        lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
+        otherwise = _OTHER_REMEDIES.get(cause.name, "")
+        texts.append(f"set {lines}{_no_yaml_note(log)}" if lines else otherwise)
+    return fields, texts, corrected
+
+
+def _no_yaml_note(log: Log) -> str:
+    return f" ({NO_YAML})" if Path(log.source).suffix.lower() in FORMATS else ""
+
+
+def _fields(description: Description, by_pose: bool) -> Fields:
+    wrench, imu, pose = description.wrench, description.imu, description.pose
+    assert wrench is not None
+    frame: Any = np.eye(3) if wrench.frame == "sensor" else wrench.frame
+    weight: Any = (0.0, 0.0, 0.0, 0.0) if wrench.weight is None else wrench.weight
+    out: Fields = {
+        _SIGN: wrench.sign,
+        _FRAME: frame if isinstance(frame, str) else np.array(frame),
+        _FORCE: np.array(wrench.force.scale),
+        _TORQUE: np.array(wrench.torque.scale),
+        _FORCE_UNIT: wrench.force.unit,
+        _TORQUE_UNIT: wrench.torque.unit,
+        _WEIGHT: weight if isinstance(weight, str) else np.array(weight),
+        _GRAVITY: description.gravity_W,
+    }
+    if imu is not None and imu.specific_force is not None and not by_pose:
+        out["imu.position"] = np.array(imu.position)
+    elif pose is not None and pose.position is not None:
+        out["pose.position_in_sensor"] = np.array(pose.position_in_sensor)
+    if wrench.frame == "base":
+        return out
+    if pose is not None:
+        name = "rotation_in_sensor" if pose.frame == "sensor" else "frame"
+        out[f"pose.{name}"] = np.eye(3) if pose.R_SP is None else pose.R_SP
+    if imu is not None and imu.frame != "base":
+        out["imu.frame"] = np.eye(3) if imu.frame == "sensor" else np.array(imu.frame)
+    return out
+
+
+def _columns(frame: Any) -> list[int] | None:
+    if isinstance(frame, str) or (np.abs(frame).max(axis=1) < 1.0 - 1e-6).any():
+        return None
+    return [int(j) for j in np.abs(frame).argmax(axis=1)]
+
+
+def _yaml_value(name: str, value: Any) -> str:
+    if isinstance(value, (str, int)):
+        return str(value)
+    if name in (_FRAME, "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
+        return "sensor"
+    if name in (_FORCE, _TORQUE):
+        factors = [f"{x:.6g}" for x in value]
+        return factors[0] if len(set(factors)) == 1 else f"[{', '.join(factors)}]"
+    exact = np.round(value, _DIGITS.get(name, 6)) + 0.0
+    return str((exact.astype(int) if (exact == np.round(exact)).all() else exact).tolist())
+
+
+def _axes(fields: Fields, values: dict[str, Any]) -> None:
+    Q = np.array(values["matrix"])
+    sign = 1 if np.linalg.det(Q) > 0.0 else -1
+    base = isinstance(fields[_FRAME], str)
+    if base and not (sign * np.eye(3) == Q).all():
+        return
+    fields[_SIGN] = sign * fields[_SIGN]
+    if not base:
+        fields[_FRAME] = sign * Q.T @ fields[_FRAME]
+
+
+def _rotation(fields: Fields, values: dict[str, Any]) -> None:
+    R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
+    for name in {*_ROTATIONS, *_POSITIONS} & set(fields):
+        fields[name] = R @ fields[name]
+
+
+def _gravity(fields: Fields, values: dict[str, Any]) -> None:
+    true = np.array(values["gravity"])
+    fields[_GRAVITY] = true * np.linalg.norm(fields[_GRAVITY]) / np.linalg.norm(true)
+
+
+def _weight(fields: Fields, values: dict[str, Any]) -> None:
+    fields[_WEIGHT] = "removed"
+
+
+def _factor(fields: Fields, values: dict[str, Any]) -> None:
+    force, torque = UNITS[fields[_FORCE_UNIT]], UNITS[fields[_TORQUE_UNIT]]
+    ratios = [(torque / UNITS[unit], _TORQUE_UNIT, unit) for unit in _TORQUE_UNITS]
+    ratios += [(UNITS[unit] / force, _FORCE_UNIT, unit) for unit in _FORCE_UNITS]
+    for ratio, name, unit in ratios:
+        if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _SAME_RATIO:
+            fields[name] = unit
+            return
+    fields[_TORQUE] = fields[_TORQUE] / values["factor"]
+
+
+def _gain(fields: Fields, values: dict[str, Any], column: list[int] | None) -> None:
+    if column is None:
+        return
+    c = CHANNELS.index(values["channel"])
+    scale = fields[_FORCE if c < 3 else _TORQUE] = fields[_FORCE if c < 3 else _TORQUE].copy()
+    scale[column[c % 3]] /= values["gain"]
+
+
+def _frame(fields: Fields, values: dict[str, Any]) -> None:
+    for name in _POSITIONS:
+        if name in fields:
+            fields[name] = fields[name] + values["position_in_sensor"]
+
+
+_CORRECTIONS: dict[str, Callable[[Fields, dict[str, Any]], None]] = {
+    "axes": _axes,
+    "sensor rotation": _rotation,
+    "gravity direction": _gravity,
+    "weight removed": _weight,
+    "payload configured": _weight,  # an estimated payload would count as exact
+    "torque factor": _factor,
+    "pose frame": _frame,
+}
+
 
 _MARGIN_KNOTS = 2.0  # knots, at either end
 _MIN_ROWS = 100

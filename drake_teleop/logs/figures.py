@@ -161,6 +161,21 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     return figures
 
 
+def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
+    """Return the share of samples with |F| > `threshold` [N], for raw and corrected wrenches."""
+    wrenches = {
+        "raw": found.measured - found.measured[0],
+        "gravity_only": found.gravity_only,
+        "eliminated": found.contact,
+    }
+    return {
+        name: None
+        if wrench is None
+        else (np.linalg.norm(wrench[~found.edge, :3], axis=1) > threshold).mean()
+        for name, wrench in wrenches.items()
+    }
+
+
 def _reduced(
     name: str, suffix: str, wrench: Array | None, reduce: Callable[[Array], Array]
 ) -> dict[str, Any]:

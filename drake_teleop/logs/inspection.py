@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, runs
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
-from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.processing import check_log
+from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import seconds, shortest_gap
@@ -33,15 +33,11 @@ MIN_REPEATED_SHARE = 0.05
 MIN_REPEATED_BLOCK = 5
 _MAX_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
+_CANONICAL = {"f_x", "tau_x"}
+_CANONICAL = {"f_x", "tau_x"}
 _QUANTITIES = (
-    "force",
-    "torque",
-    "specific_force",
-    "angular_velocity",
-    "angular_acceleration",
-    "orientation",
-    "position",
-    "gravity",
+    *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
+    *("orientation", "position", "gravity"),
 )
 
 
@@ -58,25 +54,13 @@ def inspect_command(
 
     Returns:
         the summary.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be read.
     """
-    summary: dict[str, Any] = {
-        "log": str(log),
-        "kind": "description",
-        "topics": {},
-        "streams": {},
-        "findings": [],
-        "fit": None,
-        "mounting": None,
-        "delay_s": None,
-        "draft": None,
-    }
+    summary: dict[str, Any] = {"log": str(log), "kind": "description", "topics": {}, "streams": {}}
+    summary |= {"findings": [], "fit": None, "mounting": None, "delay_s": None, "draft": None}
     make_folder(out)
     if not others and log.suffix.lower() in (".yaml", ".yml"):
         _inspect(load_description(log), str(log), {}, summary)
-    elif not others and not is_bag(log) and _is_canonical(table := read_table(log)):
+    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _CANONICAL:
         summary["kind"] = "canonical"
         _inspect(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
@@ -88,10 +72,6 @@ def inspect_command(
     if not quiet:
         _print(summary)
     return summary
-
-
-def _is_canonical(table: Table) -> bool:
-    return "f_x" in table.columns and "tau_x" in table.columns
 
 
 def _describe_canonical(log: Path, table: Table) -> Description:
@@ -227,13 +207,11 @@ def _stream(
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest(~good)
     if not good.all():
         first = table.line(int(np.argmin(good)))
-        findings.append(
-            Finding(
-                "nan",
-                f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
-                f" the longest block {figures['nan_longest']} rows; cut or repair them",
-            )
+        text = (
+            f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
+            f" the longest block {figures['nan_longest']} rows; cut or repair them"
         )
+        findings.append(Finding("nan", text))
     same = np.zeros(len(values), bool)
     same[1:] = (values[1:] == values[:-1]).all(axis=1)
     figures["repeated_rows"] = int(same.sum())
@@ -254,13 +232,11 @@ def _stream(
             "saturated": saturated,
         }
         if saturated:
-            findings.append(
-                Finding(
-                    "saturation",
-                    f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
-                    f" {finite.max():.4g}) for {saturated} samples; cut them or move slower",
-                )
+            text = (
+                f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
+                f" {finite.max():.4g}) for {saturated} samples; cut them or move slower"
             )
+            findings.append(Finding("saturation", text))
     rows = np.flatnonzero(~(good & usable if time is not None else good))
     return figures, findings, rows if table.kept is None else table.kept[rows]
 
@@ -322,23 +298,19 @@ def _clock(
     findings = []
     if gaps:
         where = float(t[int(np.argmax(steps))] - t[0])
-        findings.append(
-            Finding(
-                "gap",
-                f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
-                " missing or the clock jumped; the motion there is not used",
-            )
+        text = (
+            f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
+            " missing or the clock jumped; the motion there is not used"
         )
+        findings.append(Finding("gap", text))
     if back:
         row = table.line(np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1])
-        findings.append(
-            Finding(
-                "clock jump",
-                f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
-                " rows with equal stamps are omitted or spread evenly; a log with decreasing"
-                " stamps is refused: cut it there, or give time.rate",
-            )
+        text = (
+            f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
+            " rows with equal stamps are omitted or spread evenly; a log with decreasing"
+            " stamps is refused: cut it there, or give time.rate"
         )
+        findings.append(Finding("clock jump", text))
     return findings, usable
 
 
@@ -351,8 +323,7 @@ def _labels(columns: Sequence[str], table: Table) -> list[str]:
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
+    return int(np.diff(runs(flags)).max(initial=0))
 
 
 def _saturated(x: Array, same: NDArray[np.bool_]) -> int:

@@ -26,8 +26,9 @@ from drake_teleop.common.style import (
     shade_contact,
 )
 from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
-from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
+from drake_teleop.logs.processing import DetectedLog, EliminatedLog, IdentifiedLog
 from drake_teleop.logs.read.canonical import Log
 
 _CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
@@ -80,19 +81,11 @@ def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
     Welch's method; x (N, k) are samples with sample time `dt` [s], densities in unit of x /
     sqrt(Hz).
     """
+    from scipy.signal import welch
+
     length = min(len(x), max(16, len(x) // 8), _MAX_WINDOW)
-    window = np.hanning(length + 1)[:-1, None]
-    starts = range(0, len(x) - length + 1, max(1, length // 2))
-    power = np.mean(
-        [
-            np.abs(np.fft.rfft(window * (part - part.mean(axis=0)), axis=0)) ** 2
-            for part in (x[start : start + length] for start in starts)
-        ],
-        axis=0,
-    )
-    density = np.asarray(np.sqrt(2.0 * dt * power / np.sum(window**2)), np.float64)
-    rates = np.asarray(np.fft.rfftfreq(length, dt), np.float64)
-    return rates[1:], density[1:]
+    rates, power = welch(x, 1.0 / dt, nperseg=length, axis=0)
+    return rates[1:], np.sqrt(power[1:])
 
 
 def _fit_into(figure: Any, found: IdentifiedLog) -> None:
@@ -212,6 +205,38 @@ def draw_elimination(found: EliminatedLog) -> Figure:
             axis.set_title(_CHANNELS[i])
             shade_contact(axis, t, touched)
         _finish(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
+    return figure
+
+
+def draw_detection(found: DetectedLog) -> Any:
+    """Draw |F| before and after removal of the load, and the statistic with its threshold."""
+    eliminated = found.eliminated
+    inner = ~eliminated.edge
+    t = eliminated.log.t[inner]
+    with plot_style():
+        figure = Picture(figsize=(10, 6))
+        top, below = figure.subplots(2, 1, sharex=True)
+        raw = np.linalg.norm((eliminated.measured - eliminated.measured[0])[inner, :3], axis=1)
+        top.plot(t, raw, color=_MEASURED, label="measured, tared at the start")
+        if eliminated.gravity_only is not None:
+            weightless = np.linalg.norm(eliminated.gravity_only[inner, :3], axis=1)
+            top.plot(t, weightless, color=ORANGE, label="static weight removed")
+        contact = np.linalg.norm(eliminated.contact[inner, :3], axis=1)
+        top.plot(t, contact, color=BLUE, label="contact")
+        top.axhline(found.force_threshold, color=BLACK, linewidth=0.8, linestyle=":")
+        top.set_yscale("symlog", linthresh=1.0)
+        top.set_ylim(bottom=0.0)
+        top.set_ylabel("$|F|$ [N]")
+        top.set_title("dotted: the same threshold for all motions")
+        below.plot(t, found.statistics[inner, STATISTICS.index(found.statistic)], color=BLUE)
+        below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
+        below.set_ylabel(f"{found.statistic} [standard deviations]")
+        below.set_xlabel("time [s]")
+        below.set_title(f"above the threshold {100 * found.above.mean():.2g} % of the time")
+        for axis in (top, below):
+            shade_contact(axis, t, found.touched[inner])
+        figure.legend(loc="outside lower center", ncols=3)
+        figure.suptitle(Path(eliminated.log.source).name, x=0.01, ha="left", fontsize=11)
     return figure
 
 

@@ -14,6 +14,7 @@ from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.aligned_log import clock_note, motion_and_load, use_spline_motion
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import pose_finding, usable
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -21,7 +22,6 @@ from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, wid
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import NO_YAML
 from drake_teleop.logs.read.table_files import FORMATS
-from drake_teleop.logs.spline_motion import clock_note, motion_and_load, use_spline_motion
 
 ROBUST = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
@@ -66,7 +66,8 @@ def fit_posed(
     found, source = motion_and_load(log, delay)
     finding = None if log.free else pose_finding(found, log)
     if log.posed.imu is not None:
-        if not found.imu_agrees or (finding is not None and not _is_sensor_rotated(found)):
+        rotated = found.frame.turned and not found.frame.shifted
+        if not found.imu_agrees or (finding is not None and not rotated):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
@@ -83,10 +84,6 @@ def fit_posed(
             finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
-
-
-def _is_sensor_rotated(found: PoseEstimate) -> bool:
-    return found.frame.turned and not found.frame.shifted
 
 
 def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:

@@ -1,9 +1,9 @@
-"""Identification of the load, and its removal, for log files (long: two commands)."""
+"""Identification of the load, and its removal, for log files (long: three commands)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,6 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.cause_lines import implausible_mass_message
 from drake_teleop.logs.causes.cause import EVENTS, Cause, Stretch
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
@@ -39,6 +38,7 @@ from drake_teleop.logs.check.conventions import (
 )
 from drake_teleop.logs.check.corrections import EFFECTS, Finding
 from drake_teleop.logs.contact import (
+    MIN_SAMPLES,
     Detection,
     detect_contact,
     noise_floor,
@@ -46,11 +46,16 @@ from drake_teleop.logs.contact import (
     robust_offsets,
     samples_of,
 )
-from drake_teleop.logs.explained_log import explain_log, explained_load, named_frame, removed_note
+from drake_teleop.logs.explained_log import (
+    explain_log,
+    explained_load,
+    implausible_mass_message,
+    named_frame,
+    removed_note,
+)
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
-from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
+from drake_teleop.logs.read.alignment import delay_of, low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
 _GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
@@ -266,9 +271,6 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     Args:
         path: canonical table or log description.
         checks: result of `check_file` for this log, if known.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be read.
     """
     checks = check_file(path) if checks is None else checks
     try:
@@ -376,21 +378,15 @@ def eliminate_log(
         raise DrakeTeleopError("contains poses at rest, which have no contact", where=source)
     if found.log.static:
         return found
-    detection = detect_contact(
-        samples_of(found.log, found.contact, cutoff_hz),
-        found.log.dt,
-        cutoff_hz,
-        finite_covariance(found.phi, identification.covariance, tared=tare),
-        identification.residual_rms,
-        edge=found.edge,
-        free=None
-        if free_motion is None
-        else (
-            samples_of(free_motion.log, free_motion.contact, cutoff_hz).at(~free_motion.edge),
-            free_motion.log.dt,
-        ),
-        statistic=statistic,
-    )
+    samples = samples_of(found.log, found.contact, cutoff_hz)
+    reference = None
+    if free_motion is not None:
+        free_samples = samples_of(free_motion.log, free_motion.contact, cutoff_hz)
+        reference = free_samples.at(~free_motion.edge), free_motion.log.dt
+    covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
+    options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
+    usual = identification.residual_rms
+    detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
     if free_motion is not None and tare and detection is not None:
         notes = offset_shift_note(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
@@ -599,3 +595,50 @@ def _scales(
         )
     sigma_gripper, kept, gamma = scales_from_eta(eta)
     return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}
+
+
+@dataclass(frozen=True)
+class DetectedLog(Detection):
+    """Contacts of a log, and the log after removal of the load's wrench (`eliminated`)."""
+
+    eliminated: EliminatedLog = field(kw_only=True)
+
+
+def detect_log(
+    path: str | Path,
+    load: str | Path | Identification | None = None,
+    *,
+    free: str | Path | None = None,
+    statistic: str = "level",
+    cutoff_hz: float = 30.0,
+    delay: str | float = "auto",
+) -> DetectedLog:
+    """Find contact in a log, after a zero-phase low-pass.
+
+    Args:
+        path: canonical table or log description.
+        load: identification.json or its content; None: load identified from the log itself.
+        free: log of equally fast free motion with the same load; None: calm parts of the log
+            itself.
+        statistic: "level", "cusum" or "glr".
+        cutoff_hz: cut-off of the low-pass.
+        delay: delay of the motion behind the wrench [s], or "auto".
+    """
+    if load is None:
+        load = identify_log(path, cutoff_hz=cutoff_hz, delay=delay).identification
+    elif not isinstance(load, Identification):
+        load = Identification.load(load)
+    found = eliminate_log(
+        path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
+    )
+    if found.log.static:
+        raise DrakeTeleopError(
+            "contains poses at rest, which have no contact", where=found.log.source
+        )
+    if found.detection is None:
+        raise DrakeTeleopError(
+            f"{len(found.log)} samples are too few to separate contact from noise",
+            where=found.log.source,
+            remedy=f"give a record of more than {MIN_SAMPLES} samples",
+        )
+    return DetectedLog(**vars(found.detection), eliminated=found)

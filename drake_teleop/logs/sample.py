@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.common.files import output_folder, write_json, write_table, write_text
 from drake_teleop.common.numeric import Array
@@ -50,6 +51,8 @@ _DH = np.array(
 HOME = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
 _SIZE = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # amplitudes of the joints [rad]
 _HARMONICS = 6
+PHI = phi_from_mass_com_inertia(MASS, COM, INERTIA_COM)
+"""Load phi (10,) of the gripper."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,7 @@ def _truth() -> dict[str, Any]:
         "mass": MASS,
         "com": COM,
         "inertia_com": INERTIA_COM,
-        "phi": phi_from_mass_com_inertia(MASS, COM, INERTIA_COM),
+        "phi": PHI,
         "offsets": OFFSETS[0],
         "offsets_touched": OFFSETS[1],
         "delay_s": POSE_DELAY_S,
@@ -230,8 +233,7 @@ def _write_wrench(
 ) -> None:
     t = _clock(WRENCH_HZ, random)
     s, omega, alpha, R_WS, _ = motion.at(t)
-    phi = phi_from_mass_com_inertia(MASS, COM, INERTIA_COM)
-    wrench = non_contact_wrench(s, omega, alpha, phi) + offsets
+    wrench = non_contact_wrench(s, omega, alpha, PHI) + offsets
     for touch in touches:
         push_S = np.einsum("nji,nj->ni", R_WS, touch.force(t))
         # The push reduces the wrench of the sensor on the load.
@@ -255,3 +257,66 @@ def _write(path: Path, names: str, columns: list[Array], digits: int) -> None:
 
     table = np.round(np.column_stack(columns), digits)
     write_table(path, pl.DataFrame(table, schema=names.split()), float_precision=digits)
+
+
+_POSE_NOISE = np.repeat([5e-5, 2e-4], 3)  # m, rad
+_EPISODE_HARMONICS, _EPISODE_REST_S = 5, 0.2
+_MIN_CONTACT_N = 0.5
+
+
+class SampleEpisode(NamedTuple):
+    """Frames of one episode: times, pose of S, reported wrench; true wrench and contact."""
+
+    t: Array
+    position: Array
+    quaternion: Array
+    wrench: Array
+    contact_wrench: Array
+    in_contact: NDArray[np.bool_]
+
+
+def sample_episode(
+    number: int,
+    *,
+    fps: float = 30.0,
+    duration_s: float = 6.0,
+    seed: int = 0,
+    phi: Array = PHI,
+    contacts: int = 2,
+    lag_frames: float = 0.0,
+) -> SampleEpisode:
+    """Return an episode whose motion, contacts and noise follow from its number and the seed.
+
+    Args:
+        phi: (10,) load.
+        lag_frames: delay of the poses behind the wrench [frames].
+    """
+    from scipy.spatial.transform import Rotation
+
+    random = np.random.default_rng([2026, seed, number])
+    t = np.arange(round(duration_s * fps)) / fps
+    period = duration_s - 2 * _EPISODE_REST_S
+    sine, cosine = random.normal(size=(2, 6, _EPISODE_HARMONICS - 1)) * 0.35 * _SIZE[:, np.newaxis]
+    path = FourierTrajectory.at_rest(HOME, sine, cosine, 1 / period)
+
+    def motion(at: Array) -> tuple[Array, ...]:
+        return sensor_motion(*path.evaluate(np.clip(at - _EPISODE_REST_S, 0, period)))
+
+    s, omega, alpha, R_WS, _ = motion(t)
+    contact = np.zeros((len(t), 6))
+    starts = np.sort(random.uniform(0.15, 0.75, contacts)) * duration_s
+    for start in starts:
+        push = random.normal(size=3)
+        push *= random.uniform(5, 15) / np.linalg.norm(push)
+        touch = Touch(start, start + random.uniform(0.4, 0.9), tuple(push))
+        f = np.einsum("nji,nj->ni", R_WS, -touch.force(t))
+        contact += np.hstack([f, np.cross(TIP_S, f)])
+    offsets = OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
+    wrench = non_contact_wrench(s, omega, alpha, phi) + contact + offsets
+    wrench += NOISE * random.normal(size=wrench.shape)
+    *_, R_late, p_late = motion(t - lag_frames / fps)
+    noise = _POSE_NOISE * random.normal(size=(len(t), 6))
+    turned = Rotation.from_matrix(R_late) * Rotation.from_rotvec(noise[:, 3:])
+    quaternion = turned.as_quat()[:, [3, 0, 1, 2]]
+    touched = np.linalg.norm(contact[:, :3], axis=1) > _MIN_CONTACT_N
+    return SampleEpisode(t, p_late + noise[:, :3], quaternion, wrench, contact, touched)

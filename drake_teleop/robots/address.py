@@ -9,11 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:
-    """Parsed address with the parameters `allowed`; defaults: `port` and `host`.
-
-    Raises:
-        DrakeTeleopError: if host, port or a parameter name is invalid.
-    """
+    """Parsed address with the parameters `allowed`; defaults: `port` and `host`."""
 
     def __init__(
         self, text: str, port: int | None, allowed: tuple[str, ...], *, host: str = ""
@@ -42,11 +38,7 @@ class Address:
         return self._parameters.get(name)
 
     def numbers(self, name: str, count: int) -> list[float] | None:
-        """Return a parameter of `count` positive numbers; None if it is absent.
-
-        Raises:
-            DrakeTeleopError: for any other value.
-        """
+        """Return a parameter of `count` positive numbers; None if it is absent."""
         text = self._parameters.get(name)
         if text is None:
             return None

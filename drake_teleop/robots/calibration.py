@@ -102,20 +102,19 @@ def evaluate_record(
         if load.mass > 0.0:
             phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _INITIAL_NOISE)
     known = sure & (previous is not None and previous.sure)
-    if log is not None and sure.all():
-        return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, "")
     changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGES] if found else []
-    if log is not None and changes:
-        advice = _START_AGAIN.format(t=min(changes))
-        return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
-    try:
+    with suppress(DrakeTeleopError):  # too few samples
         log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
-    except DrakeTeleopError:  # too few samples
-        return Evaluation(
-            0.0, found, why, half, sure, known, doubts, _MOTIONS[0][0].format(axis="x")
-        )
-    advice = best_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
-    return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
+    if log is None:
+        advice = _MOTIONS[0][0].format(axis="x")
+    elif sure.all():
+        advice = ""
+    elif changes:
+        advice = _START_AGAIN.format(t=min(changes))
+    else:
+        advice = best_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
+    t = 0.0 if log is None else float(log.t[-1])
+    return Evaluation(t, found, why, half, sure, known, doubts, advice)
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:

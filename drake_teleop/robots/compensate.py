@@ -121,6 +121,7 @@ def compensate_command(
     watch: bool = False,
     free: Path | None = None,
     control: int | None = None,
+    serve: Callable[[Callable[[Identification], Compensator]], Any] | None = None,
     **stream: Any,
 ) -> None:
     """Run the command `compensate`; messages go to stderr.
@@ -130,27 +131,29 @@ def compensate_command(
         largest: range of the sensor: force [N], torque [N m].
         free: log of free motion, see `Detector`.
         control: UDP port of `Control`.
+        serve: function from a maker of compensators to an object that is used as a compensator.
         stream: options of `open_source`.
-
-    Raises:
-        DrakeTeleopError: if an argument cannot be used.
     """
     found = Identification.load(load)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)
-    compensator = Compensator(
-        found,
-        readings.dt,
-        sigma=sigma,
-        gamma=gamma,
-        sigma_weight=sigma_weight,
-        sigma_inertia=sigma_inertia,
-        cutoff_hz=cutoff_hz,
-        wait=getattr(readings, "wait", 0),
-        predicted=predicted,
-        largest=None if largest is None else np.repeat(largest, 3),
-        watch=Watch(found, readings.dt, cutoff_hz) if watch else None,
-        detector=None if free is None else Detector(found, free, readings.dt, cutoff_hz),
-    )
+
+    def make(load: Identification) -> Compensator:
+        return Compensator(
+            load,
+            readings.dt,
+            sigma=sigma,
+            gamma=gamma,
+            sigma_weight=sigma_weight,
+            sigma_inertia=sigma_inertia,
+            cutoff_hz=cutoff_hz,
+            wait=getattr(readings, "wait", 0),
+            predicted=predicted,
+            largest=None if largest is None else np.repeat(largest, 3),
+            watch=Watch(load, readings.dt, cutoff_hz) if watch else None,
+            detector=None if free is None else Detector(load, free, readings.dt, cutoff_hz),
+        )
+
+    compensator = make(found) if serve is None else serve(make)
 
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)

@@ -8,6 +8,11 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.load.compensation import add_weight_into, scaled_wrench_into
 
 NOT_FINITE, TOO_LARGE, AT_RANGE = 1, 2, 4
+MOVES, VARIES, TOO_FAR = 1, 2, 3
+"""Reasons to refuse a tare: motion, contact, or more than the drift of offsets."""
+MAX_FORCE_DRIFT, MAX_TORQUE_DRIFT = 5.0, 0.25
+"""Maximum drift of the offsets [N], [N m]."""
+_MAX_REST_FORCE, _MAX_REST_RATE = 0.1, 0.02  # rms at rest [m/s^2], [rad/s]
 
 
 @njit(cache=True)
@@ -75,6 +80,51 @@ def eliminate_into(values, gravity, offsets, phi, nothing, scales, low_pass, mem
     rest[at, 15:] = contact
     if len(low_pass) > 0:
         low_pass_into(out, low_pass, memory)
+
+
+@njit(cache=True)
+def scales_into(sigma_weight, sigma_inertia, gamma, scales):
+    """Write the scales (4,) of `eliminate_into`."""
+    scales[0], scales[1], scales[2] = sigma_inertia, sigma_inertia, gamma
+    scales[3] = sigma_weight - sigma_inertia
+
+
+@njit(cache=True)
+def add_to_statistics(row, count, mean, squares):
+    """Add a row to the mean and the sum of squared deviations of `count` rows with it.
+
+    The update is that of Welford (1962). `row`, `mean` and `squares` have one size.
+    """
+    for i in range(len(row)):
+        step = row[i] - mean[i]
+        mean[i] += step / count
+        squares[i] += step * (row[i] - mean[i])
+
+
+@njit(cache=True)
+def tare_into(count, mean, squares, noise_limits, offsets):
+    """Add the mean contact wrench to the offsets (6,); return 0, or the reason of a refusal.
+
+    Args:
+        count: number of rows.
+        mean, squares: (21,) statistics of reading and unfiltered contact wrench.
+        noise_limits: (6,) maximum standard deviations of the contact wrench.
+    """
+    for i in range(6, 9):
+        if squares[i] > count * (_MAX_REST_FORCE * _MAX_REST_FORCE):
+            return MOVES
+    for i in range(9, 12):
+        if squares[i] + count * (mean[i] * mean[i]) > count * (_MAX_REST_RATE * _MAX_REST_RATE):
+            return MOVES
+    for i in range(6):
+        if squares[15 + i] > count * (noise_limits[i] * noise_limits[i]):
+            return VARIES
+    for i in range(3):
+        if abs(mean[15 + i]) > MAX_FORCE_DRIFT or abs(mean[18 + i]) > MAX_TORQUE_DRIFT:
+            return TOO_FAR
+    for i in range(6):
+        offsets[i] += mean[15 + i]
+    return 0
 
 
 @njit(cache=True)

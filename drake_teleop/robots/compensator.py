@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +20,18 @@ from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import removed_weight, usable_phi
 from drake_teleop.robots.compensation_step import (
     AT_RANGE,
+    MAX_FORCE_DRIFT,
+    MAX_TORQUE_DRIFT,
+    MOVES,
     NOT_FINITE,
+    TOO_FAR,
     TOO_LARGE,
+    VARIES,
+    add_to_statistics,
     clip,
     eliminate_into,
+    scales_into,
+    tare_into,
     value_problem,
 )
 from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Flag, Reading
@@ -38,7 +47,7 @@ RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, measured over `_RATE_READINGS` and `_RATE_S`."""
 TARE_S = 0.5
 """Time at rest before a tare [s]."""
-MAX_OFFSET_DRIFT = np.repeat([5.0, 0.25], 3)
+MAX_OFFSET_DRIFT = np.repeat([MAX_FORCE_DRIFT, MAX_TORQUE_DRIFT], 3)
 """Maximum drift of the offsets [N, N m]."""
 _RATE_READINGS, _RATE_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_S = 1e12  # [s]
@@ -53,9 +62,8 @@ _PROBLEM_FLAGS = {
     TOO_LARGE: Flag.OUT_OF_RANGE,
     AT_RANGE: Flag.SATURATED,
 }
-# Maximum rms at rest: specific force [m/s^2], angular velocity [rad/s]; wrench, as a multiple of
-# the residual of the identification, and at least [N, N m].
-_MAX_REST_FORCE, _MAX_REST_RATE = 0.1, 0.02
+# Maximum rms of the wrench at rest, as a multiple of the residual of the identification, and at
+# least [N, N m].
 _MAX_NOISE_RATIO, _MIN_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
 
 
@@ -113,17 +121,15 @@ class Compensator:
         detector: Detector | None = None,
     ) -> None:
         self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
-        weight = sigma if sigma_weight is None else sigma_weight
-        inertia = sigma if sigma_inertia is None else sigma_inertia
-        if weight != inertia and load.weight_removed:
-            raise removed_weight("load")
-        self._scales, self._dt = np.array([inertia, inertia, gamma, weight - inertia], float), dt
+        self._weight_removed, self._dt = load.weight_removed, dt
+        self._scales = np.empty(4)
+        self.set_scales(sigma, gamma, sigma_weight, sigma_inertia)
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
         self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
         if cutoff_hz is not None and cutoff_hz < 0.5 / dt:
-            b, a, settled = low_pass_coefficients(dt, cutoff_hz, self.lag_s if predicted else 0.0)
-            self._low_pass = np.concatenate([b, a[1:], settled])
+            ahead = self.lag_s if predicted else 0.0
+            self._low_pass = low_pass_coefficients(dt, cutoff_hz, ahead)
         self._range = np.full(6, np.inf) if largest is None else np.array(largest, float)
         self._largest = np.concatenate(
             [np.minimum(_MAX_VALUES[:6], 2.0 * self._range), _MAX_VALUES[6:]]
@@ -140,8 +146,36 @@ class Compensator:
         # Load compiled code now; otherwise the first readings would be stale.
         value_problem(np.zeros(VALUES), self._largest, self._range)
         clip(self._eliminate(np.zeros(VALUES), np.zeros(3)), self._range)
+        self._tare_result()
         self._reset_filters()
         self.good_count = 0
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Values of `wrench_compensator_settings` of the exported C code, by name."""
+        low_pass = self._low_pass if len(self._low_pass) else np.zeros(7)
+        return {
+            "phi": self._phi,
+            "offsets": self.offsets,
+            "low_pass": low_pass,
+            "low_pass_count": len(self._low_pass),
+            "range": np.minimum(self._range, np.finfo(float).max),
+            "largest": self._largest,
+            "noise_limits": self._noise_limit,
+            # Readings after which more than STALE_S has passed, by the tolerance of rounding.
+            "stale_steps": math.floor(STALE_S / self._dt + 1e-9) - 1,
+            "tare_steps": len(self._tare_rows),
+        }
+
+    def set_scales(
+        self, sigma: float, gamma: float, sigma_weight: float | None, sigma_inertia: float | None
+    ) -> None:
+        """Set the scales from the next reading on; raise DrakeTeleopError if they are unusable."""
+        weight = sigma if sigma_weight is None else sigma_weight
+        inertia = sigma if sigma_inertia is None else sigma_inertia
+        if weight != inertia and self._weight_removed:
+            raise removed_weight("load")
+        scales_into(float(weight), float(inertia), float(gamma), self._scales)
 
     def step(self, reading: Reading, now: float) -> Compensated:
         """Return the output for a reading received at `now` [s] of a monotonic clock."""
@@ -179,26 +213,32 @@ class Compensator:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_count < len(self._tare_rows):
             return f"refused: fewer than {TARE_S:g} s of good readings so far"
-        spread = self._tare_rows.std(axis=0)
-        turning = float(np.abs(self._tare_rows[:, 9:12]).mean(axis=0).max())
-        if spread[6:9].max() > _MAX_REST_FORCE or turning > _MAX_REST_RATE:
+        problem, step, offsets = self._tare_result()
+        if problem == MOVES:
             return "refused: the sensor moves"
-        if (spread[VALUES:] > self._noise_limit).any():
+        if problem == VARIES:
             return "refused: the wrench varies, as in contact"
-        step = self._tare_rows[:, VALUES:].mean(axis=0)
-        if (np.abs(step) > MAX_OFFSET_DRIFT).any():
+        if problem == TOO_FAR:
             force, torque = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             return (
                 f"refused: {force:.3g} N and {torque:.3g} N m exceed the drift of offsets:"
                 " contact, or another load"
             )
-        self.offsets = self.offsets + step
+        self.offsets = offsets
         if self._watch is not None:
             self._watch.restart(self.offsets)
         if self._detector is not None:
             self._detector.restart()
         self.good_count = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
+
+    def _tare_result(self) -> tuple[int, Array, Array]:
+        """Return the reason of a refusal or 0, the change of the offsets, and the new offsets."""
+        mean, squares, offsets = np.zeros(VALUES + 6), np.zeros(VALUES + 6), self.offsets.copy()
+        for number, row in enumerate(self._tare_rows, 1):
+            add_to_statistics(row, float(number), mean, squares)
+        count = float(len(self._tare_rows))
+        return tare_into(count, mean, squares, self._noise_limit, offsets), mean[VALUES:], offsets
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
         flags = reading.flags

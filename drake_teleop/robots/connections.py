@@ -18,24 +18,23 @@ from drake_teleop.robots.assembly import (
     SensorPoseOfJoints,
     pose_from_rpy,
 )
-from drake_teleop.robots.lines import LineSink, LineSource
+from drake_teleop.robots.lines import LineSink, LineSource, TableSink
 from drake_teleop.robots.recording import PartRecorder, Recorder, Records
 from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
-from drake_teleop.robots.table import TableSink
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
 _SOURCES = (
-    "udp://:PORT, posed://:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for stdin, or"
-    " replay:LOG"
+    "udp://:PORT, posed://:PORT, rtde://HOST, netft://HOST, ros2://TOPIC, zenoh://HOST/TOPIC,"
+    " - for stdin, or replay:LOG"
 )
 _SINKS = (
-    "udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://[HOST][:PORT], -, or a .csv, .parquet or"
-    " .mcap file"
+    "udp://HOST:PORT, ros2://TOPIC, zenoh://HOST/TOPIC, foxglove://[HOST][:PORT], -,"
+    " or a .csv, .parquet or .mcap file"
 )
 _REPLAY = "replay:"
 _UNUSED_RATE_HZ = 1000.0
-_PART_KINDS = ("posed", "rtde", "netft", "zenoh")
+_PART_KINDS = ("posed", "rtde", "netft", "ros2", "zenoh")
 
 
 def open_source(
@@ -60,9 +59,6 @@ def open_source(
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
         arm: kinematics for joint positions.
-
-    Raises:
-        DrakeTeleopError: for an invalid address, a missing rate, or an error of the source.
     """
     kind = _kind(address)
     if kind in _PART_KINDS:
@@ -133,6 +129,10 @@ def open_sink(address: str) -> Sink:
     if kind == "udp":
         return UdpSink(address)
     if kind == "zenoh":
+        from drake_teleop.robots.ros2_zenoh import ZenohSink
+
+        return ZenohSink(address)
+    if kind == "ros2":
         from drake_teleop.robots.ros2 import Ros2Sink
 
         return Ros2Sink(address)
@@ -174,11 +174,15 @@ def _open_part_source(
 
         return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
     if kind == "zenoh":
+        from drake_teleop.robots.ros2_zenoh import ZenohSource
+
+        return ZenohSource(address, _period(rate_hz, address), joints)
+    if kind == "ros2":
         from drake_teleop.robots.ros2 import Ros2Source
 
         return Ros2Source(address, _period(rate_hz, address), joints)
     raise DrakeTeleopError(
-        "delivers no motion", where=address, remedy="rtde://HOST or zenoh://HOST"
+        "delivers no motion", where=address, remedy="rtde://HOST or ros2://TOPIC"
     )
 
 

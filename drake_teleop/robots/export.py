@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
@@ -77,33 +78,19 @@ def export(
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame F of the export,
             as in a URDF; None: F is S.
         sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
-
-    Raises:
-        DrakeTeleopError: for an unknown format, an inconsistent load, or, if the format is in the
-            sensor's frame, a `sensor_pose` or a wrench without the load's weight.
     """
     if to not in FORMATS:
         raise DrakeTeleopError(
             f"{to!r} is not a target", where="export", remedy=f"one of {', '.join(FORMATS)}"
         )
     format = FORMATS[to]
-    if found.weight_removed and format.of_sensor:
-        raise DrakeTeleopError(
-            f"the robot has removed the load's weight from the wrench, and {to} would subtract it"
-            " once more",
-            where="export",
-            remedy="use a wrench without the robot's payload compensation, or `compensate`",
-        )
+    if format.of_sensor:
+        refuse_removed_weight(found, to)
     if sensor_pose is not None and format.of_sensor:
-        raise DrakeTeleopError(
-            f"{to} takes its values in the sensor's frame",
-            where="export",
-            remedy="remove the sensor's pose",
-        )
-    R_FS, p_FoSo_F = np.eye(3), np.zeros(3)
-    if sensor_pose is not None:
-        R_FS, p_FoSo_F = rotation_rpy(sensor_pose[3:]), np.array(sensor_pose[:3])
-    phi = transform_phi(found.phi, R_FS, p_FoSo_F)
+        raise in_sensor_frame(to)
+    x, y, z, *angles = [0.0] * 6 if sensor_pose is None else sensor_pose
+    R_FS = rotation_matrices(np.radians([angles]), "euler", "xyz")[0]
+    phi = transform_phi(found.phi, R_FS, [x, y, z])
     if found.mass <= 0.0 or (format.body and not is_physically_consistent(phi)):
         raise DrakeTeleopError(
             f"the load is not physically consistent (mass {found.mass:.4g} kg), as {to} requires",
@@ -117,19 +104,24 @@ def export(
     return notes + format.write(load), warnings
 
 
-def _rotation_about(axis: int, angle: float) -> Array:
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R = np.eye(3)
-    R[i, i] = R[j, j] = np.cos(angle)
-    R[j, i] = np.sin(angle)
-    R[i, j] = -R[j, i]
-    return R
+def in_sensor_frame(to: str) -> DrakeTeleopError:
+    """Return the error for a sensor's pose and a format in the sensor's frame."""
+    return DrakeTeleopError(
+        f"{to} takes its values in the sensor's frame",
+        where="export",
+        remedy="remove the sensor's pose",
+    )
 
 
-def rotation_rpy(angles: Sequence[float]) -> Array:
-    """Return the rotation matrix of roll, pitch, yaw [deg] about fixed axes, as in a URDF."""
-    roll, pitch, yaw = np.radians(angles)
-    return _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
+def refuse_removed_weight(found: Identification, to: str) -> None:
+    """Raise DrakeTeleopError for a load that was identified from a wrench without its weight."""
+    if found.weight_removed:
+        raise DrakeTeleopError(
+            f"the robot has removed the load's weight from the wrench, and {to} would subtract it"
+            " once more",
+            where="export",
+            remedy="use a wrench without the robot's payload compensation, or `compensate`",
+        )
 
 
 def _warnings(found: Identification, to: str, format: Format) -> list[str]:

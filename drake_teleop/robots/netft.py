@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.logs.read.description_fields import UNITS
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Flag, Part
 
@@ -27,13 +28,7 @@ _SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
 _REQUEST_PERIOD_S, _MAX_UNCHANGED_S = 0.1, 0.05
 _MAX_RECORDS = 256  # records per call
 _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
-# Units of the box's page in N or N m.
-_UNITS = {
-    "lbf": 4.4482216152605, "N": 1.0, "klbf": 4448.2216152605, "kN": 1e3,
-    "kgf": 9.80665, "gf": 9.80665e-3,
-    "lbf-in": 0.1129848290276, "lbf-ft": 1.3558179483314, "N-m": 1.0, "N-mm": 1e-3,
-    "kgf-cm": 0.0980665, "kN-m": 1e3,
-}  # fmt: skip
+_UNITS = UNITS | {"klbf": 1e3 * UNITS["lbf"]}
 
 
 class Record(NamedTuple):
@@ -54,11 +49,7 @@ def unpack_record(packet: bytes) -> Record | None:
 
 
 class NetFtSource:
-    """Source at netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m.
-
-    Raises:
-        DrakeTeleopError: if the address is invalid, or netftapi2.xml of the NetBox cannot be read.
-    """
+    """Source at netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m."""
 
     streams: tuple[str, ...] = (WRENCH,)
 
@@ -160,7 +151,10 @@ def parse_page(content: bytes) -> list[float]:
     from xml.etree import ElementTree
 
     text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}
-    counts = [float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"]] for kind in ("f", "t")]
+    counts = [
+        float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"].replace("-", " ")]
+        for kind in ("f", "t")
+    ]
     values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
         raise ValueError("not positive numbers")

@@ -15,19 +15,22 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_table, write_text
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.compensator import JUMP_S
 from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, Reading
 
 _INVALID_FLAGS = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
-_COLUMNS = {
-    WRENCH: canonical.WRENCH,
-    POSE: (*canonical.ORIENTATION, *canonical.POSITION),
-    IMU: (*canonical.SPECIFIC_FORCE, *canonical.ANGULAR_VELOCITY),
+_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
+    WRENCH: {"force": canonical.WRENCH[:3], "torque": canonical.WRENCH[3:]},
+    POSE: {"orientation": canonical.ORIENTATION, "position": canonical.POSITION},
+    IMU: {
+        "specific_force": canonical.SPECIFIC_FORCE,
+        "angular_velocity": canonical.ANGULAR_VELOCITY,
+    },
 }
 _GRAVITY = 9.81  # as in `compensate`
 _NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
@@ -117,7 +120,7 @@ class PartRecorder(Records[tuple[Part, float]]):
     """
 
     file = "log.yaml"
-    files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _COLUMNS))
+    files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _FIELDS))
 
     def __init__(self, parts: Parts, largest: Array | None, X_FS: Array) -> None:
         super().__init__({WRENCH: largest, parts.motion_stream: None})
@@ -145,7 +148,7 @@ class PartRecorder(Records[tuple[Part, float]]):
             (WRENCH, wrench, -start),
             (self._motion_stream, motion, behind - start),
         ):
-            names = _COLUMNS[stream]
+            names = [name for columns in _FIELDS[stream].values() for name in columns]
             t, values = samples.table(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
@@ -162,16 +165,6 @@ class PartRecorder(Records[tuple[Part, float]]):
             found[POSE]["position_in_sensor"] = (-R_SF @ self._p_FS).tolist()
             found[POSE]["rotation_in_sensor"] = R_SF.tolist()
         return found
-
-
-_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
-    WRENCH: {"force": canonical.WRENCH[:3], "torque": canonical.WRENCH[3:]},
-    POSE: {"orientation": canonical.ORIENTATION, "position": canonical.POSITION},
-    IMU: {
-        "specific_force": canonical.SPECIFIC_FORCE,
-        "angular_velocity": canonical.ANGULAR_VELOCITY,
-    },
-}
 
 
 class _Samples:

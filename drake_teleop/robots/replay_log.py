@@ -12,8 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import accelerated
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.logs.read.alignment import measured, undelayed
-from drake_teleop.logs.read.delay import delay_of
+from drake_teleop.logs.read.alignment import delay_of, measured, undelayed
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.streams import Flag, Reading, Source
 
@@ -27,9 +26,6 @@ class LogSource(Source[Reading]):
         cutoff_hz, delay: see `eliminate_log`.
         real_time: replay in real time; else as fast as possible.
         chunk: maximum number of readings per call.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be used, or contains static poses.
     """
 
     def __init__(

@@ -25,11 +25,7 @@ _BLOCK_BYTES = 65536
 
 
 class RtdeSource:
-    """Source of wrench, TCP pose and tool acceleration at rtde://HOST[?sign=-1], 500 or 125 Hz.
-
-    Raises:
-        DrakeTeleopError: if the address is invalid, ur_rtde is missing, or no robot answers.
-    """
+    """Source of wrench, TCP pose and tool acceleration at rtde://HOST[?sign=-1], 500 or 125 Hz."""
 
     streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
 

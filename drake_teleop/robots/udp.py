@@ -158,11 +158,7 @@ class UdpSink:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, out: Compensated) -> None:
-        """Send a wrench; drop it if it cannot be sent now.
-
-        Raises:
-            DrakeTeleopError: if the host is unknown.
-        """
+        """Send a wrench; drop it if it cannot be sent now."""
         try:
             self._socket.sendto(pack_wrench(out), self._to)
         except OSError as error:

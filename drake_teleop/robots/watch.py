@@ -14,9 +14,8 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.contact.detection import RARE, ContactDetector, flag_update
+from drake_teleop.load.contact.detection import RARE, ContactDetector, fit_noise_floor, flag_update
 from drake_teleop.load.contact.noise_floor import finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.watched import (
@@ -94,9 +93,6 @@ class Detector:
     Args:
         free: log of free motion of the load, at the rate of the stream.
         delay: delay of the log, see `eliminate_log`.
-
-    Raises:
-        DrakeTeleopError: for an unreadable log, another rate, too little motion, or no low-pass.
     """
 
     def __init__(
@@ -116,7 +112,7 @@ class Detector:
                 where=str(free),
                 remedy="use the log that `calibrate` wrote from this stream",
             )
-        self._fast, self._slow = (_low_pass(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
+        self._fast, self._slow = (low_pass_coefficients(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
@@ -161,11 +157,6 @@ class Detector:
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
         return int(Flag.IN_CONTACT) if touched else 0
-
-
-def _low_pass(dt: float, cutoff_hz: float) -> Array:
-    b, a, settled = low_pass_coefficients(dt, cutoff_hz)
-    return np.concatenate([b, a[1:], settled])
 
 
 @njit(cache=True)

@@ -63,7 +63,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             _limit_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
-            scenario.force_scaling.force_scale,
+            _contact_scale(scenario),
             start_pose(scenario.slave),
             1 / scenario.rates.hand_hz,
             scenario.simulation.seed,
@@ -124,8 +124,14 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def power_scale(scenario: Scenario) -> Array:
     """Return the master's power over the slave's (2,), for translation and rotation.
 
-    It is force scale over motion scale, where a motion scale of 0 counts as 1.
+    It is the contact's scale over motion scale, where a motion scale of 0 counts as 1.
     """
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    return scenario.force_scaling.force_scale / np.where(scales > 0.0, scales, 1.0)
+    return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
+
+
+def _contact_scale(scenario: Scenario) -> float:
+    """Return force scale times gamma; a gamma of 0, which displays no contact, counts as 1."""
+    scaling = scenario.force_scaling
+    return scaling.force_scale * (scaling.scales().gamma or 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -93,3 +94,12 @@ def remove_explained(times: Array, causes: Array, near: float) -> Array:
 def split_at_gaps(times: Array, longest: float) -> list[Array]:
     """Return series of times in which none is more than `longest` [s] after the previous one."""
     return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
+
+
+def fast_part(t: Array, signal: Array, corner: float = 5.0) -> Array:
+    """Return the part of `signal` (N, k) above the frequency `corner` [Hz].
+
+    It is the signal minus its mean over one period of `corner`, for evenly spaced times `t` (N,).
+    """
+    rows = max(round(1.0 / (corner * (t[1] - t[0]))), 1) if len(t) > 1 else 1
+    return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")

@@ -38,7 +38,7 @@ from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import POSE_OF
-from drake_teleop.station.slave.meshes import AddSkeleton
+from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,

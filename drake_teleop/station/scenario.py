@@ -8,7 +8,7 @@ import dataclasses
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
@@ -45,6 +45,7 @@ from drake_teleop.station.slave.joint_control import JointControlConfig, default
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
+_T = TypeVar("_T")
 #: Types of objects in `environment`.
 Thing: TypeAlias = (
     Wall
@@ -217,18 +218,34 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
     Raises:
         DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
     """
-    expect((str, Path), name_or_path, "scenario")
-    path, names = scenarios_dir() / f"{name_or_path}.yaml", ScenarioNames()
-    if str(name_or_path) not in names:
-        path = Path(name_or_path)
-    if not os.path.isfile(path):  # False also for invalid file names
-        raise DrakeTeleopError(
-            f"there is no scenario '{name_or_path}'",
-            remedy=suggestion(
-                name_or_path, names, f"give a YAML file or one of {', '.join(names)}"
-            ),
-        )
+    path = shipped_file("scenario", name_or_path, scenarios_dir())
     return read_yaml(path, tagged=True), str(path)
+
+
+def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
+    """Return the YAML file of this name in a folder of shipped files, or else the given path.
+
+    Raises:
+        DrakeTeleopError: if neither is a file; `kind` is its name in the message.
+    """
+    expect((str, Path), name_or_path, kind)
+    names = sorted(path.stem for path in folder.glob("*.yaml"))
+    path = folder / f"{name_or_path}.yaml" if str(name_or_path) in names else Path(name_or_path)
+    if not os.path.isfile(path):  # False also for invalid file names
+        remedy = suggestion(name_or_path, names, f"give a YAML file or one of {', '.join(names)}")
+        raise DrakeTeleopError(f"there is no {kind} '{name_or_path}'", remedy=remedy)
+    return path
+
+
+def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | None = None) -> _T:
+    """Return settings from parsed YAML data; their ranges are not checked.
+
+    Raises:
+        DrakeTeleopError: for an unknown field, or a value of the wrong type.
+    """
+    check_structure(schema, data, where)
+    text = yaml_dump(data)
+    return yaml_load_typed(schema=schema, data=text, defaults=defaults or schema())
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
@@ -237,13 +254,13 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     Raises:
         DrakeTeleopError: with the invalid field.
     """
-    check_structure(Scenario, data, where)
+    check_structure(Scenario, data, where)  # before the presets are read
     defaults = Scenario(
         wrist_sensor=preset_of(data.get("wrist_sensor")),
         master=Master(figures=figures_of(data.get("master"))),
         joint_control=JointControlConfig(interface=default_interface(data.get("joint_control"))),
     )
-    scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
+    scenario = settings_from_data(Scenario, data, where, defaults)
     scenario.check(where)
     return scenario
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +61,16 @@ def _all_texts(value: Any) -> list[str]:
     return [str(value)] if isinstance(value, (str, Path)) and str(value) else []
 
 
-def write_scenario(path: Path, scenario: Scenario) -> None:
+def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) -> None:
     """Write every field of a scenario to a YAML file, for `LoadScenario`.
+
+    `heading`: lines of a comment at the top.
 
     Raises:
         DrakeTeleopError: if reading the file would not give the same scenario, or the file cannot
             be written.
     """
-    text, where = commented(scenario), str(path)
+    text, where = "".join(f"# {line}\n" for line in heading) + commented(scenario), str(path)
     found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)

@@ -14,8 +14,7 @@ from drake_teleop.lab.analysis.linearization import (
     linearize_station,
 )
 from drake_teleop.lab.analysis.one_axis import device_impedance
-from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
+from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.analysis.two_port import hybrid
 from drake_teleop.lab.identification import slave_arm

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from registers import growth_rate
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.cut_loop import cut_loop
 from drake_teleop.lab.analysis.maps import StabilityMap, distortion, stability_map
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.sampled_loop import growth_rate, sampled_loop
 from drake_teleop.station.operator.operator import GRIPS
 
 JR3 = Sampling(low_pass_hz=500.0)
@@ -65,7 +65,7 @@ def grows(axis: OneAxis, sampling: Sampling, **values: float) -> bool:
         joint_control_hz=factor * sampling.joint_control_hz,
         sensor_hz=factor * sampling.sensor_hz,
     )
-    return growth_rate(sampled_loop(replace(axis, **values), faster)) > 1e-6
+    return growth_rate(replace(axis, **values), faster) > 1e-6
 
 
 @pytest.mark.slow

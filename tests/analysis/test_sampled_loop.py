@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-import control
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from registers import growth_rate, multipliers
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.cut_loop import (
@@ -20,18 +20,23 @@ from drake_teleop.lab.analysis.cut_loop import (
     cut_loop,
     delay_margin,
     dominant_multiplier,
+    gain_and_phase_margin,
     loop_response,
     unstable_multipliers,
 )
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.lab.analysis.period_map import Sampling, _held_response, delay_steps
-from drake_teleop.lab.analysis.sampled_loop import (
-    growth_rate,
-    multipliers,
-    sampled_loop,
+from drake_teleop.lab.analysis.period_map import (
+    SAMPLE,
+    V_M,
+    V_S,
+    X_M,
+    X_S,
+    Sampling,
+    _held_response,
+    delay_steps,
+    period_map,
     sampled_two_port,
 )
-from drake_teleop.lab.analysis.two_port import from_control
 from drake_teleop.station.operator.operator import GRIPS
 
 STATION = Sampling()
@@ -93,14 +98,15 @@ def test_loop_agrees_with_a_simulation_with_small_steps(
     )  # fmt: skip
     start = np.array([1e-3, 0.1, 2e-3, -0.05])
     simulated = bench.simulate(axis, sampling, start, 0.1, 20)
-    loop = sampled_loop(axis, sampling)
-    state = np.zeros(len(loop.states))
-    state[[loop.states.index(name) for name in ("x_m", "v_m", "x_s", "v_s")]] = start
-    simulated = simulated[:: round(loop.period * sampling.hand_hz)]
+    M, periods = period_map(axis, sampling, steps, cut=False)
+    n = len(M) - 3
+    state = np.zeros(n)
+    state[[X_M, V_M, X_S, V_S]] = start
+    simulated = simulated[::periods]
     outputs = np.empty_like(simulated)
     for row in outputs:
-        row[:] = loop.C @ state
-        state = loop.A @ state
+        row[:] = state[[X_M, V_M, X_S, V_S, n - 1 if steps else SAMPLE]]
+        state = M[:n, :n] @ state
     np.testing.assert_allclose(
         outputs / np.abs(simulated).max(axis=0),
         simulated / np.abs(simulated).max(axis=0),
@@ -172,10 +178,13 @@ def test_two_port_agrees_with_loop_without_hand_and_wall(sampling: Sampling, del
     w = 2 * np.pi * np.geomspace(1.0, 900.0, 20)
     H = sampled_two_port(axis, sampling, w)
     bare = replace(axis, hand_mass=0.0, hand_damping=0.0, hand_stiffness=0.0, wall_stiffness=0.0)
-    response = from_control(sampled_loop(bare, sampling).to_control(), w)
+    M, _ = period_map(bare, sampling, delay_steps(bare, sampling), cut=False)
+    n = len(M) - 3
+    inner = np.exp(1j * w / 2e3)[:, None, None] * np.eye(n) - M[:n, :n]
+    response = np.linalg.solve(inner, np.broadcast_to(M[:n, n : n + 2], (len(w), n, 2)))
     hold = (1 - np.exp(-1j * w / 2e3)) / (1j * w / 2e3)
     for force in range(2):
-        v_m, v_s = response[:, 1, force] / hold, response[:, 3, force] / hold
+        v_m, v_s = response[:, V_M, force] / hold, response[:, V_S, force] / hold
         F = np.array([1 - force, force])
         np.testing.assert_allclose(H[:, 0, 0] * v_m + H[:, 0, 1] * F[1], F[0], atol=1e-9)
         np.testing.assert_allclose((H[:, 1, 0] * v_m + H[:, 1, 1] * F[1]) / v_s, -1.0, atol=1e-9)
@@ -188,7 +197,7 @@ def test_argument_principle_agrees_with_eigenvalues(
 ) -> None:
     sampling = JR3 if low_pass else STATION
     delay = steps / sampling.hand_hz
-    size = np.abs(multipliers(sampled_loop(replace(axis, delay=delay), sampling)))
+    size = np.abs(multipliers(replace(axis, delay=delay), sampling))
     if np.abs(size - 1).min() > 1e-9:  # a multiplier on the circle has no count
         count = unstable_multipliers(cut_loop(axis, sampling), delay)
         assert count == (size > 1).sum()
@@ -201,7 +210,7 @@ def test_the_dominant_multiplier_is_the_largest_eigenvalue(
 ) -> None:
     sampling = JR3 if low_pass else STATION
     delay = steps / sampling.hand_hz
-    values = multipliers(sampled_loop(replace(axis, delay=delay), sampling))
+    values = multipliers(replace(axis, delay=delay), sampling)
     largest = np.abs(values).max()
     # Any of several equally large ones is valid; a double one has half the digits.
     alike = values[np.abs(values) > largest - 1e-7]
@@ -218,7 +227,7 @@ def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
     assert found.shape == (2, 2)
     back = 1 - np.prod((found[..., None] - loop.closed) / (found[..., None] - loop.open), axis=-1)
     np.testing.assert_allclose(back * found ** -np.rint(2 * delay * 2e3), 1.0, atol=1e-8)
-    one = growth_rate(sampled_loop(OneAxis(delay=0.02), STATION))
+    one = growth_rate(OneAxis(delay=0.02), STATION)
     assert np.log(abs(found[0, 0])) * 2e3 == pytest.approx(one, rel=1e-6)
     assert ((np.abs(found) > 1) == (unstable_multipliers(loop, delay) > 0)).all()
 
@@ -260,10 +269,31 @@ def test_a_multiplier_leaves_the_circle_at_the_margin(axis: OneAxis, sampling: S
     steps = int(margin / 2 * sampling.hand_hz)
     assert 5 < steps < 250
     before, after = (
-        growth_rate(sampled_loop(replace(axis, delay=n / sampling.hand_hz), sampling))
-        for n in (steps, steps + 1)
+        growth_rate(replace(axis, delay=n / sampling.hand_hz), sampling) for n in (steps, steps + 1)
     )
     assert before < 0 < after
+
+
+@pytest.mark.parametrize(
+    "axis", [held("light", wall_stiffness=1e3), held("firm", wall_stiffness=2e4)]
+)
+def test_a_multiplier_reaches_the_circle_at_gain_and_phase_margin(axis: OneAxis) -> None:
+    loop = cut_loop(axis, JR3)
+    w = np.geomspace(1e-2, np.pi * JR3.hand_hz, 6000)
+    gain, phase = gain_and_phase_margin(loop_response(loop, w))
+    moved = multipliers(replace(axis, force_scale=gain * axis.force_scale), JR3)
+    assert np.abs(moved).max() == pytest.approx(1.0, abs=1e-6)
+    # The phase margin is the lag of the delay margin where |L| = 1.
+    crossing = w[np.argmin(np.abs(np.abs(loop_response(loop, w)[w > 1.0]) - 1)) + np.sum(w <= 1.0)]
+    assert phase == pytest.approx(float(delay_margin(loop)) * crossing, rel=0.02)
+
+
+def test_margins_of_a_delayed_integrator() -> None:
+    """L = -K e^(-s) / s: gain margin pi / (2 K), phase margin pi / 2 - K."""
+    w = np.geomspace(1e-3, 100.0, 20000)
+    gain, phase = gain_and_phase_margin(-0.5 * np.exp(-1j * w) / (1j * w))
+    assert gain == pytest.approx(np.pi, rel=1e-4) and phase == pytest.approx(np.pi / 2 - 0.5)
+    assert gain_and_phase_margin(0.5 / (1 + 1j * w)) == (np.inf, np.inf)
 
 
 def test_delay_margin_is_0_if_unstable_and_infinite_without_limit() -> None:
@@ -287,20 +317,7 @@ def test_a_simulation_becomes_unstable_at_the_margin(bench: ModuleType, axis: On
 def test_multipliers_predict_how_a_perturbation_grows(bench: ModuleType, delay: float) -> None:
     axis = held("medium", delay=delay)
     simulated = bench.simulated_growth(axis, STATION)
-    assert growth_rate(sampled_loop(axis, STATION)) == pytest.approx(simulated, rel=0.02)
-
-
-def test_control_state_space_has_the_same_response() -> None:
-    loop = sampled_loop(OneAxis(delay=2e-3, wall_damping=5.0), STATION)
-    system = loop.to_control()
-    assert isinstance(system, control.StateSpace) and system.dt == 5e-4
-    assert system.output_labels == list(loop.outputs)
-    np.testing.assert_array_equal(multipliers(system), multipliers(loop))
-    assert growth_rate(system) == growth_rate(loop)
-    w = np.array([1.0, 30.0, 500.0])
-    inner = np.exp(1j * w * loop.period)[:, None, None] * np.eye(len(loop.A)) - loop.A
-    response = loop.C @ np.linalg.solve(inner, np.broadcast_to(loop.B, (3, *loop.B.shape))) + loop.D
-    np.testing.assert_allclose(from_control(system, w), response, rtol=1e-9)
+    assert growth_rate(axis, STATION) == pytest.approx(simulated, rel=0.02)
 
 
 def test_arrays_of_parameters_equal_single_loops() -> None:
@@ -322,8 +339,8 @@ def test_arrays_of_parameters_equal_single_loops() -> None:
 @pytest.mark.parametrize(
     "call, words",
     [
-        (lambda: sampled_loop(OneAxis(ideal_servo=True), STATION), "ideal servo"),
-        (lambda: sampled_loop(OneAxis(), Sampling(joint_control_hz=1999.0)), "joint_control_hz"),
+        (lambda: cut_loop(OneAxis(ideal_servo=True), STATION), "ideal servo"),
+        (lambda: cut_loop(OneAxis(), Sampling(joint_control_hz=1999.0)), "joint_control_hz"),
         (lambda: cut_loop(OneAxis(), Sampling(joint_control_hz=1e3)), "whole number of times"),
     ],
 )

@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import sosfilt
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.change import (
     CHANGED,
     IDENTIFIED,

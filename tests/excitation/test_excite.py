@@ -15,6 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from shown import type_in
 
+from drake_teleop.cli.excitation import draw
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
@@ -696,3 +697,8 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
     assert found.mass == pytest.approx(mass, rel=2e-3)
     np.testing.assert_allclose(found.com, com, atol=3e-4)
     np.testing.assert_allclose(found.inertia_com, inertia, atol=0.05 * np.trace(inertia) / 2)
+
+
+def test_picture_of_a_shortest_motion_states_its_period(short):
+    figure = draw(dataclasses.replace(short, criterion="period"))
+    assert figure.axes[3].get_title() == "period down to 2.4"

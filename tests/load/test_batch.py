@@ -13,10 +13,9 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
-from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.batch.methods import METHODS, _std_growth, identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.batch.total_least_squares import Options, Record
+from drake_teleop.load.batch.uncertainty import ARM
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import (
     is_physically_consistent,
@@ -24,6 +23,7 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     transform_phi,
 )
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.station.result import SimulationResult

@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.identification import Identification, identified_object
+from drake_teleop.load.moments import Noise
 from drake_teleop.load.online.change import (
     HOLD,
     OBJECT_STD,

@@ -8,7 +8,6 @@ from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
-from drake_teleop.load.batch.moments import Moments, Noise
 from drake_teleop.load.batch.total_least_squares import total_least_squares
 from drake_teleop.load.inertia import (
     is_physically_consistent,
@@ -16,6 +15,7 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     pseudo_inertia,
 )
+from drake_teleop.load.moments import Moments, Noise
 from drake_teleop.load.regressor import non_contact_wrench
 
 ROD = phi_from_mass_com_inertia(0.009, [0, 0.002, 0.06], np.diag([5e-5, 5e-5, 0.0]))

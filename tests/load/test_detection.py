@@ -27,6 +27,7 @@ from drake_teleop.load.contact.detection import (
     SLACK,
     ContactDetector,
     detection_update,
+    fit_noise_floor,
     statistics,
     wrench_axis,
 )
@@ -36,7 +37,6 @@ from drake_teleop.load.contact.noise_floor import (
     NoiseFloor,
     finite_covariance,
 )
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 

@@ -10,10 +10,10 @@ from known_motion import Motion, quaternions
 from known_motion import motion_at as fast_motion_at
 from scipy.signal import lfilter
 
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.poses import Poses
-from drake_teleop.logs.read.rotations import rotation_matrices
 
 PHI = phi_from_mass_com_inertia(
     1.7,

@@ -13,11 +13,10 @@ from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.candidates import candidates
 from drake_teleop.logs.causes.cause import causes_of, stretches
-from drake_teleop.logs.causes.changes import with_ramps
-from drake_teleop.logs.causes.contacts import contact_spans
+from drake_teleop.logs.causes.changes import contact_spans, with_ramps
+from drake_teleop.logs.causes.explain import _remove_delay
 from drake_teleop.logs.causes.instants import instants
 from drake_teleop.logs.causes.model import DELAY, Model, Step
-from drake_teleop.logs.causes.search import _remove_delay
 from drake_teleop.logs.causes.state import State, gain_of
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])

@@ -10,11 +10,10 @@ from posed_record import PHI
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causes.fit import fit, regularized_inverse
 from drake_teleop.logs.causes.instants import FORCES, Instants, free_delay, instants
 from drake_teleop.logs.causes.intervals import misfit_factor
 from drake_teleop.logs.causes.model import DELAY, Model, Step
-from drake_teleop.logs.causes.rows import Rows, in_spans
+from drake_teleop.logs.causes.state import Rows, fit, in_spans, regularized_inverse
 
 GRAVITY_W = np.array([0.4, -0.3, -9.79])
 OFFSETS = np.array([3.0, -2.0, 5.0, 0.3, -0.2, 0.1])

@@ -16,8 +16,8 @@ from known_motion import GRAVITY_W, Motion, motion_at, quaternions
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.cause_lines import with_lines
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
+from drake_teleop.logs.explained_log import with_lines
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
 from drake_teleop.logs.read.reading import read_log
 

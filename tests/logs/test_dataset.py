@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,21 +20,18 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.dataset import dataset as command
 from drake_teleop.logs.dataset.dataset import dataset_command
 from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
-from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
+    EpisodeSignals,
     find_hypothesis,
     offset_step,
     unexplained,
 )
-from drake_teleop.logs.dataset.sample_dataset import (
-    NOISE,
-    PHI,
-    SampleEpisode,
-    sample_episode,
-    write_sample_dataset,
-)
 from drake_teleop.logs.pose_motion.poses import Posed, Poses
 from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.sample import NOISE, PHI, SampleEpisode, sample_episode
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from sample_dataset import write_sample_dataset
 
 GRAVITY_W = np.array([0.0, 0.0, -9.80665])
 QUARTER_Z = Rotation.from_euler("z", 90, degrees=True).as_matrix()

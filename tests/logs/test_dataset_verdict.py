@@ -11,15 +11,15 @@ from test_dataset import log_of
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_channels
-from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
+    EpisodeSignals,
     Hypothesis,
     _deviations,
     as_described,
     calm_half,
     offset_step,
 )
-from drake_teleop.logs.dataset.sample_dataset import PHI, sample_episode
+from drake_teleop.logs.sample import PHI, sample_episode
 
 PLAIN, I3 = as_described(2.0), np.eye(3)
 QUARTER = Rotation.from_euler("y", 90, degrees=True).as_matrix()

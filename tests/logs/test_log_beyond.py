@@ -11,7 +11,7 @@ from numpy.lib import format as npy
 
 from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.contact.detection import fit_noise_floor
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.description import load_description

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.logs.read.imu_clock import best_shift
+from drake_teleop.logs.read.mounting import best_shift
 from drake_teleop.logs.read.streams import Stream, on_clock
 
 

@@ -6,8 +6,8 @@ from known_motion import motion_at
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.read.alignment import estimate_delay
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.delay import estimate_delay
 
 PHI = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
 

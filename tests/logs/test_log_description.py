@@ -9,9 +9,14 @@ import yaml
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description import Description, load_description
 
-PAGE = Path(__file__).parents[2] / "docs" / "logs.md"
-EXAMPLES = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-_, THREE_INSTRUMENTS, AT_REST, *_ = EXAMPLES
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = DOCS / "log-description.md"
+EXAMPLES = [
+    example
+    for page in (PAGE, DOCS / "logs.md")
+    for example in re.findall(r"```yaml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+]
+THREE_INSTRUMENTS, AT_REST, *_ = EXAMPLES
 
 
 @pytest.mark.parametrize("example", EXAMPLES)

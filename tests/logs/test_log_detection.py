@@ -16,8 +16,7 @@ from drake_teleop.cli.main import cli
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.detection import detect_log
-from drake_teleop.logs.processing import eliminate_log, identify_log
+from drake_teleop.logs.processing import detect_log, eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 
 TOOL = phi_from_mass_com_inertia(1.5, [0.01, -0.02, 0.1], np.diag([0.01, 0.009, 0.004]))

@@ -9,7 +9,8 @@ from planted import PHI
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.load_fit import LoadFit, load_fit, white_noise
+from drake_teleop.logs.check.against_load import LoadFit, load_fit
+from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.canonical import Log
 
 

@@ -13,10 +13,10 @@ import yaml
 from posed_record import GRAVITY_W, OFFSETS, PHI, motion_at
 from scipy.spatial.transform import Rotation
 
+from drake_teleop.common.rotations import quaternions
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import check_log, identify_log
 from drake_teleop.logs.read.canonical import SPECIFIC_FORCE, WRENCH
-from drake_teleop.logs.read.rotations import quaternions
 
 Columns = dict[str, np.ndarray]
 IMU, POSE, BOTH = ("imu",), ("pose",), ("imu", "pose")

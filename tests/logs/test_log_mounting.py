@@ -24,8 +24,7 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read import auto_frames
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
-from drake_teleop.logs.read.mounting import Mounting, find_mounting
+from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 from drake_teleop.logs.read.reading import read_description, read_log
 from drake_teleop.logs.read.tables import Table
 

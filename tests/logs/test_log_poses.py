@@ -13,6 +13,7 @@ import yaml
 from posed_record import GRAVITY_W, LATE, PHI, SHIFT, TURN, Kind, record
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.logs.check.pose_checks import frame_finding
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
@@ -20,7 +21,6 @@ from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.logs.read.table_files import read_table
 
 WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")

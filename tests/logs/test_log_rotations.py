@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.logs.read.jackknife import solve
-from drake_teleop.logs.read.rotations import WIDTHS, rotation_matrices
+from drake_teleop.common.rotations import WIDTHS, rotation_matrices
+from drake_teleop.logs.read.mounting import solve
 from drake_teleop.logs.read.streams import Orientations
 
 VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])

@@ -16,11 +16,11 @@ from planted import PHI, good
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.rotations import EULER_AXES, rotation_matrices
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.clocks import join_episodes
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.rotations import EULER_AXES, rotation_matrices
 from drake_teleop.logs.read.table_files import read_table
 
 FORCE, TORQUE = ["f0", "f1", "f2"], ["m0", "m1", "m2"]

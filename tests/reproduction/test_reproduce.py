@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
+import re
+from collections import defaultdict
+from functools import partial
 
 import numpy as np
 import pytest
 from shown import type_in
 
+from drake_teleop.cli.main import main
 from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.reproduction import experiments
 from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
     contact_values,
-    eliminated_reaction,
     free_motion,
     free_values,
+    ideal_motion,
+    ideal_values,
     raw_excess,
 )
 from drake_teleop.lab.reproduction.report import compare_with_paper, flat, unaccepted
 from drake_teleop.lab.run_summary import in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
-from drake_teleop.station.operator.operator import Sine
+from drake_teleop.load.regressor import regressor_into
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, replace
 
@@ -54,7 +61,6 @@ def test_free_motion_is_as_in_figure_6(run):
     assert figures["peak_raw_master_N"] == pytest.approx(5.7, abs=0.3)
     assert 0.48 <= figures["half_ratio"] <= 0.52
     assert figures["residual_max_N"] <= figures["residual_norm_max_N"] <= 1.5
-    assert 0 < figures["residual_ideal_max_N"] <= 1e-10
 
 
 @pytest.mark.slow
@@ -64,7 +70,6 @@ def test_free_motion_is_as_in_figure_7(run):
     assert figures["peak_raw_master_Nm"] == pytest.approx(FORCE_SCALE * figures["peak_raw_Nm"])
     assert 0.48 <= figures["half_ratio"] <= 0.52
     assert figures["residual_max_Nm"] <= 0.03 * figures["peak_raw_Nm"]
-    assert 0 < figures["residual_ideal_max_Nm"] <= 1e-11
 
 
 @pytest.mark.slow
@@ -248,20 +253,79 @@ def test_contact_time_is_null_without_contact(motion):
     assert figures["raw_detectable"] is False
 
 
-def test_elimination_removes_the_reaction_force_of_the_plant():
-    """Rotations about all axes excite each term of V."""
-    sine = Sine(
-        duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
-    )
-    scenario = replace(
-        LoadScenario("free_motion_torque"),
-        operator__intent=[sine],
-        simulation__settle=0.4,
-        simulation__duration=0.4,
-    )
-    left = np.abs(eliminated_reaction(scenario, lambda done: None)).max(axis=0)
-    assert 0 < left[:3].max() < 1e-11
-    assert 0 < left[3:].max() < 1e-12
+def mutants_of_regressor():
+    """Return copies of `regressor` that differ in one sign, for all terms of all entries of V."""
+    source = inspect.getsource(regressor_into.py_func).split("\n", 1)[1]
+    head, entries = source[: source.index("    V[:]")], source[source.index("    V[:]") :]
+    mutants = {}
+    # Each row assigns entries, comma-separated; a term is a product with an optional sign.
+    for place, row in ((m.start(), m.group()) for m in re.finditer(r"V.* = (?!0\.0).*", entries)):
+        names, terms = row.split(" = ")
+        for term in re.finditer(r"(?:(?<=^)|(?<=, )|(?<= [+-] )|-)(?:[a-z]{2})", terms):
+            flipped = term.group()[1:] if term.group()[0] == "-" else f"-{term.group()}"
+            changed = terms[: term.start()] + flipped + terms[term.end() :]
+            changed = changed.replace("+ -", "- ").replace("- -", "+ ")
+            text = f"{head}{entries[:place]}{names} = {changed}{entries[place + len(row) :]}"
+            space = {}
+            exec(text, space)
+            mutants[names, term.start()] = space["regressor_into"]
+    return mutants
+
+
+def per_sample(into):
+    def mutated(s, omega, alpha):
+        V = np.empty((len(s), 6, 10))
+        for row, out in zip(zip(s, omega, alpha, strict=True), V, strict=True):
+            into(*row, out)
+        return V
+
+    return mutated
+
+
+def eliminate(mutated, wrench, offsets, s, omega, alpha, phi):
+    return wrench - offsets - mutated(s, omega, alpha) @ phi
+
+
+@pytest.fixture(scope="module")
+def ideal_run():
+    return ideal_motion(lambda done: None)
+
+
+def ideal_rows(values):
+    rows = compare_with_paper(defaultdict(lambda: 0.5, flat({"ideal": values})))
+    return [row.holds for row in rows if row.what.startswith("All axes")]
+
+
+def test_elimination_removes_the_reaction_force_of_the_plant(ideal_run):
+    values = ideal_values(ideal_run)
+    assert 0 < values["residual_max_N"] < 1e-11
+    assert 0 < values["residual_max_Nm"] < 1e-12
+    assert ideal_rows(values) == [True, True]
+
+
+def test_ideal_run_rejects_each_wrong_sign_of_the_regressor(ideal_run, monkeypatch):
+    """Wrong signs in the regressor, and in the elimination's own function."""
+    sparse = slice(None, None, 20)
+    motion = tuple(part[sparse] for part in ideal_run.motion)
+    run = dataclasses.replace(ideal_run, reaction=ideal_run.reaction[sparse], motion=motion)
+    mutants = mutants_of_regressor()
+    assert len(mutants) == 54
+    for place, into in mutants.items():
+        mutated = per_sample(into)
+        with monkeypatch.context() as patch:
+            patch.setattr(experiments, "regressor", mutated)
+            assert False in ideal_rows(ideal_values(run)), place
+        with monkeypatch.context() as patch:
+            patch.setattr(experiments, "contact_wrench", partial(eliminate, mutated))
+            assert False in ideal_rows(ideal_values(run)), place
+
+
+def test_reproduce_exits_with_status_1_for_a_wrong_sign(tmp_path, monkeypatch, capsys):
+    mutant = next(iter(mutants_of_regressor().values()))
+    monkeypatch.setattr(experiments, "regressor", per_sample(mutant))
+    with pytest.raises(SystemExit, match="1"):
+        main(["reproduce", "--quiet", "--out", str(tmp_path)])
+    assert capsys.readouterr().err.count("All axes") == 1
 
 
 def test_wrong_mass_increases_the_residual():
@@ -273,6 +337,6 @@ def test_wrong_mass_increases_the_residual():
     estimate[6:] *= 1.1
     motion = free_motion(scenario, estimate, lambda done: None)
     assert tuple(motion.scaled) == SIGMAS
-    figures = free_values(motion, motion.scaled[0.0], 2, "N")
+    figures = free_values(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

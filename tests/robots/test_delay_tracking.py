@@ -9,8 +9,7 @@ from test_reading_assembly import DT as WRENCH_DT
 from test_reading_assembly import X_FS, StreamStub, played, truth
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.assembly import Assembly, Parts
-from drake_teleop.robots.delay_tracking import SAMPLE_PERIOD_S, DelayTracker
+from drake_teleop.robots.assembly import SAMPLE_PERIOD_S, Assembly, DelayTracker, Parts
 from drake_teleop.robots.streams import POSE, WRENCH
 
 DT = 1.01 * SAMPLE_PERIOD_S

@@ -23,7 +23,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
 from drake_teleop.robots.assembly import Assembly, Parts, PosedByJoints
 from drake_teleop.robots.connections import open_source
-from drake_teleop.robots.ros2 import Messages
+from drake_teleop.robots.ros2_zenoh import Messages
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.plant import arm_of

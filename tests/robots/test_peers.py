@@ -29,7 +29,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.netft import NetFtSource, parse_page
-from drake_teleop.robots.ros2 import Ros2Source
+from drake_teleop.robots.ros2_zenoh import ZenohSource
 from drake_teleop.robots.rtde import RtdeSource
 from drake_teleop.robots.streams import (
     ACCELERATION,
@@ -65,13 +65,15 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
 class Seen(list[Compensated]):
     """Outputs of the loop of `compensate` for a source, with their times."""
 
-    def __init__(self, source: Source, last: int, end: Flag = Flag.RESTART) -> None:
+    def __init__(
+        self, source: Source, last: int, end: Flag = Flag.RESTART, seconds: float = 5.0
+    ) -> None:
         """Read until a good wrench with number `last` after the flag `end`, with a tool at rest."""
         self.at: list[float] = []
         self.parts: list[Part] = []
         compensator = Compensator(load(), source.dt, cutoff_hz=None)
         compensator.offsets = OFFSETS - non_contact_wrench(*np.split(AT_REST, 3), PHI)
-        begun, until = False, time.monotonic() + 5.0
+        begun, until = False, time.monotonic() + seconds
         while time.monotonic() < until:
             parts = source.read(0.01)
             assert parts is not None
@@ -162,7 +164,7 @@ def test_rtde() -> None:
 
 def test_ros_2() -> None:
     with peer("ros", free_port()) as (port, _):
-        source = Ros2Source(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
+        source = ZenohSource(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
         seen = Seen(source, 510, Flag.CLOCK_JUMP)
         source.close()
     flags = Flag.REORDERED | Flag.NOT_FINITE | Flag.DAMAGED | Flag.STALE | Flag.RESTART

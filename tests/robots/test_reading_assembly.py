@@ -10,8 +10,8 @@ import pytest
 from test_compensator import OFFSETS, PHI, load
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.assembly import Assembly, Parts, pose_from_rpy
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_source

@@ -20,7 +20,7 @@ from test_compensator import DT, load, readings
 import drake_teleop.robots.udp as udp
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
-from drake_teleop.robots import table
+from drake_teleop.robots import lines
 from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink, open_source
@@ -171,10 +171,10 @@ WRITER = """
 import sys, time
 import numpy as np
 from pathlib import Path
-from drake_teleop.robots import table
+from drake_teleop.robots import lines
 from drake_teleop.robots.streams import Compensated
-table.PERIOD_S = dict.fromkeys(table.PERIOD_S, 0.02)
-sink = table.TableSink(Path(sys.argv[1]))
+lines.PERIOD_S = dict.fromkeys(lines.PERIOD_S, 0.02)
+sink = lines.TableSink(Path(sys.argv[1]))
 for k in range(10**6):
     sink.write(Compensated(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
     print(k, flush=True)
@@ -204,7 +204,7 @@ def test_table_contains_the_rows_before_a_kill(tmp_path: Path, name: str, after:
 class Failing:
     """Sink that is used until the disk is full, or until an error or Ctrl-C."""
 
-    def __init__(self, sink: table.TableSink) -> None:
+    def __init__(self, sink: lines.TableSink) -> None:
         self.sink, self.written = sink, 0
 
     def write_until(self, error: type[BaseException], count: int = 10**6) -> None:
@@ -217,9 +217,9 @@ class Failing:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) -> None:
-    monkeypatch.setattr(table, "PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
+    monkeypatch.setattr(lines, "PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
     with small_disk(tmp_path, 100_000):
-        failing = Failing(table.TableSink(tmp_path / name))
+        failing = Failing(lines.TableSink(tmp_path / name))
         failing.write_until(CannotWrite)
         with pytest.raises(CannotWrite):
             failing.sink.close()
@@ -232,10 +232,10 @@ def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OverflowError])
 def test_error_or_interrupt_neither_loses_nor_repeats_rows(tmp_path, name, error) -> None:
     """This includes an interrupt while rows are written."""
-    failing, path = Failing(table.TableSink(tmp_path / name)), tmp_path / name
+    failing, path = Failing(lines.TableSink(tmp_path / name)), tmp_path / name
     failing.write_until(error, 50)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(table.time, "monotonic", lambda: (_ for _ in ()).throw(error))
+        patch.setattr(lines.time, "monotonic", lambda: (_ for _ in ()).throw(error))
         with pytest.raises(error):
             failing.sink.close()
     failing.sink.close()

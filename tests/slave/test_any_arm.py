@@ -26,7 +26,7 @@ from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.arm import ROTOR
 from drake_teleop.station.slave.joint_commands import SlaveMonitor, ik_method_name
-from drake_teleop.station.slave.meshes import AddSkeleton
+from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
 from drake_teleop.station.slave.slave_config import Slave

@@ -14,8 +14,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave import model_references
-from drake_teleop.station.slave.model_references import ModelFiles
+from drake_teleop.station.slave.model import model_references
+from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
 SOLID = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"

@@ -19,15 +19,14 @@ from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.link_repair import repair_inertia
-from drake_teleop.station.slave.model_numbers import check_quantities
+from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia, repair_inertia
+from drake_teleop.station.slave.model.model_numbers import check_quantities
+from drake_teleop.station.slave.model.repair_report import RepairReport
+from drake_teleop.station.slave.model.urdf_repair import _has_colour, dependent_joints
 from drake_teleop.station.slave.models import ParseModel, ParseScene
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
-from drake_teleop.station.slave.repair_report import RepairReport
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
-from drake_teleop.station.slave.urdf_repair import _has_colour, dependent_joints
 
 
 def read(path, sensor="l6", hold=None, shapes=False):

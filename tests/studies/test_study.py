@@ -145,7 +145,8 @@ def two_runs(monkeypatch):
 def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
     """With two runs each."""
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).parents[2] / "docs" / "studies.md").read_text(encoding="utf-8")
+    docs = Path(__file__).parents[2] / "docs"
+    page = (docs / "studies.md").read_text(encoding="utf-8")
     (file,) = re.findall("```yaml\n(scenario: .*?)```", page, re.S)
     Path("study.yaml").write_text(file)
     type_in("docs/studies.md", "drake-teleop study")
@@ -153,6 +154,13 @@ def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
     names: dict = {}
     exec(compile(script, "studies.md", "exec"), names)  # all runs are complete
     assert names["summary"] == json.loads(Path("out/study/summary.json").read_text())
+    Path("out/study").rename("out/whole")
+    type_in("docs/cluster.md", "drake-teleop study")
+    assert parts(Path("out/study")) == parts(Path("out/whole"))
+    (script,) = re.findall("```python\n(.*?)```", (docs / "cluster.md").read_text(), re.S)
+    script = script.replace("ProcessPool", "ThreadPool")  # a process would have all points
+    exec(compile(script, "cluster.md", "exec"), {"__name__": "__main__"})
+    assert parts(Path("out/executor")) == parts(Path("out/whole"))
     type_in("README.md", ".venv/bin/drake-teleop study")
     for out in ("study", "touch"):
         summary = json.loads(Path(f"out/{out}/summary.json").read_text())

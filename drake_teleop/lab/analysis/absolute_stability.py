@@ -17,7 +17,7 @@ from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import entries, transmitted_impedance
 
 if TYPE_CHECKING:
-    import control
+    pass
 
 Real = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -88,48 +88,6 @@ def passive(H: Complex) -> Flags:
         & (h22.real >= -_ROUNDING * np.abs(h22))
         & (raisbeck(H) >= -_ROUNDING * size)
     )
-
-
-def positive_real(system: control.lti.LTI) -> bool:
-    """Return whether a rational impedance or hybrid matrix is passive at all frequencies.
-
-    Raises:
-        DrakeTeleopError: unless the system is continuous, square and proper (if improper, pass the
-            admittance).
-    """
-    import control
-    from scipy import linalg
-
-    if system.ninputs != system.noutputs or not system.isctime():
-        raise DrakeTeleopError("needs a continuous system with as many inputs as outputs")
-    try:
-        model = control.ss(system)
-    except (ValueError, TypeError, control.ControlMIMONotImplemented) as error:
-        raise DrakeTeleopError(
-            "this system has no state space", remedy="test its admittance"
-        ) from error
-    n, m = model.nstates, model.ninputs
-    # G(s + e) is positive real for all small e > 0 if and only if G is. The shift handles poles on
-    # the axis, as of a lossless spring.
-    poles = model.poles()
-    shift = 1e-11 * max(1.0, np.max(np.abs(poles), initial=0.0))
-    furthest = np.max(poles.real, initial=-np.inf)
-    if furthest >= shift:
-        return False
-    A = model.A - (shift if furthest > -shift else 0.0) * np.eye(n)
-    B, C, D = model.B, model.C, model.D
-    pencil = np.block([[A, np.zeros((n, n)), B], [np.zeros((n, n)), -A.T, -C.T], [C, B.T, D + D.T]])
-    finite = linalg.block_diag(np.eye(2 * n), np.zeros((m, m)))
-    found = np.abs(linalg.eigvals(pencil, finite).imag)
-    edges = np.sort(found[np.isfinite(found)])
-    edges = np.concatenate([[0.0], edges, [2 * np.max(edges, initial=1.0)]])
-    omega = np.concatenate([edges, (edges[1:] + edges[:-1]) / 2])
-    inner = np.linalg.solve(
-        1j * omega[:, None, None] * np.eye(n) - A, np.broadcast_to(B, (len(omega), n, m))
-    )
-    G = C @ inner + D
-    least = np.linalg.eigvalsh(G + np.conj(np.swapaxes(G, 1, 2)))[:, 0]
-    return bool(np.all(least >= -1e-9 * np.max(np.abs(G), axis=(1, 2), initial=0.0)))
 
 
 def scattering_norm(S: Complex) -> Real:

@@ -21,6 +21,7 @@ _ANGLES = np.pi * np.logspace(-5, 0, 401)
 _PEAK_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 _GOLDEN_RATIO, _GOLDEN_STEPS = 0.6180339887498949, 25
 _MAX_CROSSINGS = 32
+_MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
 _DOUBLINGS, _HALVINGS, _NEWTON_STEPS = 12, 30, 12  # for the growth rate, from 1/s
 _UNIT_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
@@ -80,6 +81,32 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
     # Factor by factor, to keep precision for poles close to z = 1.
     L = 1 - np.prod((z - loop.closed) / (z - loop.open), axis=-1)
     return L * np.exp(-2j * w * np.asarray(delay))
+
+
+def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
+    """Return the factor, and the rotation [rad] in either direction, that bring a stable loop to 1.
+
+    `response`: (n,) of `loop_response` at increasing frequencies up to half the hand's rate; inf:
+    no limit. Crossings are interpolated.
+    """
+    if np.abs(response).max() < _MIN_LOOP_GAIN:
+        return np.inf, np.inf
+    log_gain, angle = np.log(np.abs(response)), np.angle(response)
+    lag = np.mod(_interpolate(np.unwrap(angle), _zero_fraction(log_gain)), 2 * np.pi)
+    phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
+    is_jump = np.abs(np.diff(angle)) >= np.pi
+    factor = np.exp(-_interpolate(log_gain, np.where(is_jump, np.nan, _zero_fraction(angle))))
+    return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
+
+
+def _zero_fraction(value: Array) -> Array:
+    before, after = value[:-1], value[1:]
+    step = np.where(before == after, 1.0, before - after)
+    return np.where((before < 0) != (after < 0), before / step, np.nan)
+
+
+def _interpolate(value: Array, fraction: Array) -> Array:
+    return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
 def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.progress import Stage
-from drake_teleop.lab.analysis import absolute_stability, margins, sampled_wall, transparency
+from drake_teleop.lab.analysis import absolute_stability, sampled_wall, transparency
 from drake_teleop.lab.analysis.cut_loop import (
     cut_loop,
     delay_margin,
     dominant_multiplier,
+    gain_and_phase_margin,
     loop_response,
     unstable_multipliers,
 )
@@ -21,8 +22,7 @@ from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_freq
 from drake_teleop.lab.analysis.linearization import MAX_STATES, Linearization, hybrid_along
 from drake_teleop.lab.analysis.maps import RATE, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
+from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import TaskDirection
 from drake_teleop.lab.analysis.two_port import (
     hybrid,
@@ -43,7 +43,6 @@ COMPARISON_BAND = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S: Complex = 1j * OMEGA.astype(complex)
 _FIT_BAND = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
-_MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
 _MAP_POINTS = 80  # points of a map in each direction
 _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
@@ -113,19 +112,17 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
         for wall in sorted({*WALLS, own_wall}):
             held = dataclasses.replace(with_grip(axis, grip), wall_stiffness=wall)
             loop = cut_loop(held, sampling)
-            response = -loop_response(loop, omega, axis.delay)
             stable = bool(unstable_multipliers(loop, axis.delay) == 0)
-            gain, phase = (np.inf, np.inf) if stable else (1.0, 0.0)
-            if stable and np.abs(response).max() > _MIN_LOOP_GAIN:
-                found = margins.margins_of_response(omega, response, sampled=True)
-                gain, phase = float(found.gain), float(np.degrees(found.phase))
+            gain, phase = 1.0, 0.0
+            if stable:
+                gain, phase = gain_and_phase_margin(loop_response(loop, omega, axis.delay))
             rows.append(
                 {
                     "grip": grip,
                     "wall_N_per_m": wall,
                     "stable": stable,
                     "gain": gain,
-                    "phase_deg": phase,
+                    "phase_deg": float(np.degrees(phase)),
                     "round_trip_s": float(delay_margin(loop)),
                 }
             )
@@ -175,7 +172,7 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
     for name, environment in environments.items():
         felt = transmitted_impedance(H, environment)
         ideal = transparency.ideal_impedance(axis, S, environment)
-        noticed = transparency.fidelity(felt, ideal).noticed
+        noticed = transparency.is_noticed(felt, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
             which: transparency.apparent(impedance[fitted], OMEGA[fitted])._asdict()
@@ -192,7 +189,7 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
     change = transparency.smallest_stiffness_change(H, OMEGA, wall[0])
     figures["smallest_stiffness_N_per_m"] = {
         "on the master, 1 Hz": float(np.interp(2 * np.pi, OMEGA, change)),
-        "on the wall itself": transparency.WEBER_FRACTIONS["stiffness"].value * wall[0],
+        "on the wall itself": transparency.WEBER_FRACTION * wall[0],
     }
     return figures
 

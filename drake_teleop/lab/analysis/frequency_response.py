@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.linearization import delays, linearize_station
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.task_direction import TaskDirection
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
@@ -123,12 +121,6 @@ class StationResponse:
         weighted = acceleration[:, None] * powers
         return float(np.linalg.lstsq(weighted, acceleration * mass, rcond=None)[0][0])
 
-    def to_control(self, output: str, input_: str) -> Any:
-        """Return `response` as a `control.FRD`."""
-        import control
-
-        return control.FRD(self.response(output, input_)[None, None], self.omega)
-
 
 def measure_frequency_response(
     scenario: Scenario,
@@ -178,38 +170,6 @@ def measure_frequency_response(
         spectra,
         scenario.force_scaling.force_scale,
     )
-
-
-def predict_frequency_response(
-    scenario: Scenario,
-    task: TaskDirection,
-    omega: Array,
-    *,
-    load_estimate: Array | None = None,
-    displacement: Sequence[float] = (0.0, 0.0, 0.0),
-) -> StationResponse:
-    """Return the spectra at omega (n,) [rad/s] that the linearised Diagram predicts.
-
-    They are for a unit force; other arguments: see `linearize`.
-    """
-    system = linearize_station(scenario, load_estimate=load_estimate, displacement=displacement)
-    first = system.inputs.index("hand_wrench.x")
-    pushed = system.frequency_response(omega)[:, :, first : first + 6] @ task.hand
-
-    def along(port: str, direction: Array) -> Complex:
-        row = system.outputs.index(f"{port}.x")
-        return (pushed[:, row : row + 6] @ direction)[None]
-
-    _, backward = delays(scenario)
-    delay_factor = np.exp(-1j * np.asarray(omega) * system.dt * backward)
-    spectra = {
-        # Unit force in place of the intent, plus the operator's reaction.
-        "hand_force": 1 + along("operator_wrench", task.hand),
-        "hand_velocity": along("twist_master", task.hand),
-        "felt_force": delay_factor * along("wrench_B", task.hand),
-        "tool_velocity": along("twist_slave", task.tool),
-    }
-    return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
 
 
 def _signals(result: SimulationResult, scenario: Scenario, task: TaskDirection) -> dict[str, Array]:

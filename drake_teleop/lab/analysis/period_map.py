@@ -11,16 +11,17 @@ Order of events; all updates at one instant read earlier values:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import matrix_balance, schur
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.one_axis import OneAxis
+from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
@@ -57,7 +58,7 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
         raise DrakeTeleopError(
             "the hand's period is not the period of all rates",
             where="sampling",
-            remedy="let servo and sensor run a whole number of times faster, or use `sampled_loop`",
+            remedy="let servo and sensor run a whole number of times faster",
         )
     return M
 
@@ -112,6 +113,39 @@ def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> t
         M = new
         M[..., [X_S, V_S], :] = flows[gap] @ M
     return M, periods
+
+
+def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
+    """Return the two-port H (N, 2, 2) of the sampled station, without hand and wall.
+
+    The spectrum of held forces is divided out; the delay is rounded to hand periods. `frequency`
+    (N,) [rad/s]: positive, below half the hand's rate.
+    """
+    bare = replace(
+        axis,
+        hand_mass=0.0,
+        hand_damping=0.0,
+        hand_stiffness=0.0,
+        wall_stiffness=0.0,
+        wall_damping=0.0,
+    )
+    M = cut_map(bare, sampling)
+    n, period = M.shape[-1] - 3, 1 / sampling.hand_hz
+    w = np.atleast_1d(np.asarray(frequency, dtype=float))
+    z = np.exp(1j * w * period)
+    delay_factor = z ** -delay_steps(axis, sampling)
+    # Responses without delay to a force on the device, and to one of the environment.
+    C = np.eye(n)[[V_M, V_S, SAMPLE]]
+    response = _resolvent(M[:n, :n], M[:n, n : n + 2], C, z)
+    (v_m, _), (v_s, give), (felt, felt_e) = np.moveaxis(response, 0, 2)
+    hold = -np.expm1(-1j * w * period) / (1j * w * period)
+    H = np.array(
+        [
+            [hold * (1 + delay_factor**2 * felt) / v_m, delay_factor * felt_e],
+            [-delay_factor * v_s / v_m, -give / hold],
+        ]
+    )
+    return np.moveaxis(H, 2, 0)
 
 
 def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
@@ -256,3 +290,15 @@ def _matrix_exponential(M: Array) -> Array:
     for _ in range(halvings):
         E = E @ E
     return E
+
+
+def _resolvent(A: Array, B: Array, C: Array, z: Complex) -> Complex:
+    """Return C (z - A)^-1 B (N, p, m) at z (N,)."""
+    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    T, Q = schur(balanced, output="complex")
+    right, left = Q.conj().T @ (B / scale[:, None]), (C * scale) @ Q
+    states = np.empty((len(T), len(z), right.shape[1]), complex)
+    for i in reversed(range(len(T))):
+        known = right[i] + np.tensordot(T[i, i + 1 :], states[i + 1 :], 1)
+        states[i] = known / (z - T[i, i])[:, None]
+    return np.moveaxis(np.tensordot(left, states, 1), 1, 0)

@@ -42,23 +42,6 @@ def apparent(felt: Complex, omega: Real) -> Apparent:
     return Apparent(mass, felt.real.mean(axis=0), stiffness)
 
 
-class Tracking(NamedTuple):
-    """Position and force tracking between master and slave."""
-
-    position: Complex  #: slave over device, V_s / V_m; l_p is ideal
-    force: Complex  #: hand over environment, F_h / F_e, including the force on the device
-    reflected: Complex  #: as `force`, without the force on the device; k_f gamma is ideal
-
-
-def tracking(H: Complex, environment: Complex, device: Complex) -> Tracking:
-    """Return position and force tracking in contact; impedances in N s/m, `environment` not 0."""
-    _, _, h21, h22 = entries(H)
-    position = -h21 / (1 + h22 * environment)
-    felt = transmitted_impedance(H, environment)
-    pushed = environment * position
-    return Tracking(position, felt / pushed, (felt - device) / pushed)
-
-
 class ZWidth(NamedTuple):
     """Impedances displayed in free motion and at a rigid wall [N s/m]."""
 
@@ -82,72 +65,30 @@ def transmitted_width(H: Complex) -> ZWidth:
     return ZWidth(h11, rigid)
 
 
-def sensitivity(H: Complex, environment: ArrayLike) -> Complex:
-    """Return the derivative of the displayed impedance with respect to the environment's.
-
-    Ideal: k_f l_p gamma. Its norm over frequencies is the fidelity of Cavusoglu, Sherman and
-    Tendick, T-RA 18 (2002).
-    """
-    _, h12, h21, h22 = entries(H)
-    return -h12 * h21 / (1 + h22 * np.asarray(environment)) ** 2
+#: Smallest relative change of a stiffness that a human hand can detect: Jones and Hunter 1990, by
+#: matching of both arms, as commonly cited. Other studies: 0.19 to 0.34 for damping, 0.21 for mass.
+WEBER_FRACTION = 0.23
 
 
-class WeberFraction(NamedTuple):
-    """Smallest relative change of a quantity that a human can detect."""
-
-    value: float
-    source: str
-
-
-#: Weber fractions of the human hand. Studies differ by a factor of two and more. "abstract": taken
-#: from the source's abstract; "recalled": the value commonly cited from it.
-WEBER_FRACTIONS = {
-    "force": WeberFraction(
-        0.07, "Pang, Tan and Durlach 1991, 2.5 to 10 N between two fingers; abstract"
-    ),
-    "stiffness": WeberFraction(0.23, "Jones and Hunter 1990, matching of both arms; recalled"),
-    "compliance": WeberFraction(
-        0.22,
-        "Tan, Durlach, Beauregard and Srinivasan 1995, without cues of force or work; abstract",
-    ),
-    "damping": WeberFraction(
-        0.19, "Jones, Hunter and Lafontaine 1997, forced choice; 0.34 by matching; abstract"
-    ),
-    "mass": WeberFraction(0.21, "Beauregard and Srinivasan 1997, pinch grasp; recalled"),
-}
-
-
-class Fidelity(NamedTuple):
-    """Comparison of the displayed impedance with the ideal one."""
-
-    level: Real  #: displayed over ideal [dB]
-    phase: Real  #: phase lead [deg], within +-180
-    noticed: NDArray[np.bool_]  #: True where a human can detect the difference
-
-
-def fidelity(
-    felt: Complex, ideal: Complex, weber: float = WEBER_FRACTIONS["stiffness"].value
-) -> Fidelity:
-    """Return level, phase and detectability of the difference from the ideal impedance.
+def is_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
+    """Return booleans: True where a human can distinguish the displayed impedance from the ideal.
 
     One Weber fraction applies to mass, damping and stiffness (Fu, Landman, van Paassen and Mulder,
     T-HMS 48, 2018; abstracts).
     """
-    ratio = felt / ideal
-    level, phase = 20 * np.log10(np.abs(ratio)), np.angle(ratio, deg=True)
-    return Fidelity(level, phase, np.abs(ratio - 1) > weber)
+    return np.abs(felt / ideal - 1) > WEBER_FRACTION
 
 
 def smallest_stiffness_change(
     H: Complex,
     omega: Real,
     stiffness: ArrayLike,
-    weber: float = WEBER_FRACTIONS["stiffness"].value,
+    weber: float = WEBER_FRACTION,
     damping: ArrayLike = 0.0,
 ) -> Real:
     """Return the smallest increase of the environment's stiffness that the hand can detect [N/m].
 
-    It explores with a motion at `omega`; detection as in `fidelity`. inf: none is detectable; for
+    It explores with a motion at `omega`; detection as in `is_noticed`. inf: none is detectable; for
     stiffness 0: the softest detectable wall.
     """
     if weber <= 0:

@@ -9,10 +9,10 @@ arrays (..., 2, 2), frequencies first; s in rad/s, impedances in N s/m, delays o
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import (
@@ -24,7 +24,7 @@ from drake_teleop.lab.analysis.one_axis import (
 )
 
 if TYPE_CHECKING:
-    import control
+    pass
 
 
 def two_port(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
@@ -54,94 +54,6 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
         -slave,
         slave_admittance,
     )
-
-
-def force_velocity_exchange(s: Complex, delay: ArrayLike) -> Complex:
-    """Return the hybrid matrix H of a line that delays force and velocity by `delay` [s] (T53)."""
-    delay_factor = np.exp(-s * np.asarray(delay))
-    return two_port(0.0, delay_factor, -delay_factor, 0.0)
-
-
-def wave_line(s: Complex, delay: ArrayLike, impedance: ArrayLike) -> Complex:
-    """Return the hybrid matrix H of a delay line with wave variables and wave `impedance` (T53)."""
-    delay_factor = np.exp(-s * np.asarray(delay))
-    tanh = (1 - delay_factor**2) / (1 + delay_factor**2)
-    sech = 2 * delay_factor / (1 + delay_factor**2)
-    b = np.asarray(impedance)
-    return two_port(b * tanh, sech, -sech, tanh / b)
-
-
-class Channels(NamedTuple):
-    """Transfer functions of a four-channel station (Lawrence 1993)."""
-
-    c1: ArrayLike  #: velocity of the master, to the slave
-    c2: ArrayLike  #: force of the environment, to the master
-    c3: ArrayLike  #: force of the hand, to the slave
-    c4: ArrayLike  #: velocity of the slave, to the master
-    c5: ArrayLike = 0.0  #: local feedback of the environment's force
-    c6: ArrayLike = 0.0  #: local feedback of the hand's force
-
-
-def transparent_channels(
-    master: Complex, slave: Complex, c5: ArrayLike = 0.0, c6: ArrayLike = 0.0
-) -> Channels:
-    """Return the channels that make a station without delay transparent (T39).
-
-    `master`, `slave`: impedances with local control; `c5`, `c6`: local force feedback, above -1.
-    """
-    return Channels(slave, 1 + np.asarray(c6), 1 + np.asarray(c5), -master, c5, c6)
-
-
-def four_channel(
-    s: Complex, master: Complex, slave: Complex, channels: Channels, delay: ArrayLike = 0.0
-) -> Complex:
-    """Return the hybrid matrix H of the four-channel station; C1 to C4 are delayed (T39).
-
-    `master` and `slave` are impedances with local control.
-    """
-    delay_factor = np.exp(-s * np.asarray(delay))
-    c1, c2, c3, c4 = (delay_factor * np.asarray(c) for c in channels[:4])
-    at_slave, at_master = 1 + np.asarray(channels.c5), 1 + np.asarray(channels.c6)
-    determinant = at_master * slave - c3 * c4
-    return (
-        two_port(
-            slave * master + c1 * c4,
-            slave * c2 - c4 * at_slave,
-            -c3 * master - at_master * c1,
-            at_master * at_slave - c3 * c2,
-        )
-        / determinant[..., None, None]
-    )
-
-
-def impedance(H: Complex) -> Complex:
-    """Return the impedance matrix Z of [F_h; F_e] = Z [V_m; -V_s]; raise an error if h22 is 0.
-
-    Applied to Z, the function returns H.
-    """
-    h11, h12, h21, h22 = entries(H)
-    _require_nonzero(h22, "impedance", "h22")
-    return two_port(h11 - h12 * h21 / h22, h12 / h22, -h21 / h22, 1 / h22)
-
-
-def admittance(H: Complex) -> Complex:
-    """Return the admittance matrix Y of [V_m; -V_s] = Y [F_h; F_e]; raise an error if h11 is 0.
-
-    Applied to Y, the function returns H.
-    """
-    h11, h12, h21, h22 = entries(H)
-    _require_nonzero(h11, "admittance", "h11")
-    return two_port(1 / h11, -h12 / h11, h21 / h11, h22 - h12 * h21 / h11)
-
-
-def chain(H: Complex) -> Complex:
-    """Return the chain matrix A of [F_h; V_m] = A [F_e; V_s]; raise an error if h21 is 0.
-
-    The chain matrix of two-ports in series is the product of theirs.
-    """
-    h11, h12, h21, h22 = entries(H)
-    _require_nonzero(h21, "chain", "h21")
-    return two_port(h12 - h11 * h22 / h21, -h11 / h21, -h22 / h21, -1 / h21)
 
 
 def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
@@ -209,54 +121,3 @@ def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> C
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
     """Return the impedance Z_to displayed to the hand for that of the environment [N s/m] (T52)."""
     return absorb(H, environment=environment)[..., 0, 0]
-
-
-def transfer_function(axis: OneAxis) -> control.TransferFunction:
-    """Return the hybrid matrix H without its delay as a python-control object.
-
-    h11 and h12 have no state space if the device has mass, or if the tool mass is displayed behind
-    an ideal servo.
-    """
-    import control
-
-    kv, kp = (0.0, 1.0) if axis.ideal_servo else (axis.velocity_gain, axis.position_gain)
-    # An ideal servo has response 1 and admittance 0.
-    servo = np.array([1.0]) if axis.ideal_servo else np.array([1.0, kv, kv * kp])
-    response = 1.0 if axis.ideal_servo else kv * kp
-    slave_admittance = np.array([0.0] if axis.ideal_servo else [1 / axis.slave_mass, 0.0])
-    device = np.array([axis.device_mass, axis.device_damping])
-    tool = np.array([axis.displayed_tool_mass, 0.0])
-    felt = axis.force_scale * axis.position_scale * response
-    h11 = np.polyadd(np.polymul(device, servo), felt * tool)
-    h12 = axis.force_scale * np.polysub(axis.gamma * servo, np.polymul(tool, slave_admittance))
-    h21 = np.array([-axis.position_scale * response])
-    return control.tf([[h11, h12], [h21, slave_admittance]], [[servo, servo], [servo, servo]])
-
-
-def to_frd(H: Complex, omega: NDArray[np.float64]) -> control.FRD:
-    """Return a two-port (n, 2, 2) or impedance (n,) at omega (n,) [rad/s] as `control.FRD`."""
-    import control
-
-    return control.FRD(H if H.ndim == 1 else np.moveaxis(H, 0, -1), omega)
-
-
-def from_control(system: control.lti.LTI, omega: NDArray[np.float64] | None = None) -> Complex:
-    """Return the response of a python-control object: (n, outputs, inputs), or (n,) if scalar.
-
-    `omega` (n,) [rad/s] is optional for an FRD; otherwise its absence raises DrakeTeleopError.
-    """
-    if omega is None:
-        omega = getattr(system, "omega", None)
-    if omega is None:
-        raise DrakeTeleopError("no frequencies", where="omega", remedy="pass omega [rad/s]")
-    sampled = system.isdtime(strict=True)
-    points = np.exp(1j * omega * system.dt) if sampled else 1j * omega
-    response = np.moveaxis(system(points, squeeze=False), -1, 0)
-    return response[:, 0, 0] if response.shape[1:] == (1, 1) else response
-
-
-def _require_nonzero(entry: Complex, matrix: str, name: str) -> None:
-    if not np.all(entry):
-        raise DrakeTeleopError(
-            f"no {matrix} matrix where {name} is zero", remedy="use another form of the two-port"
-        )

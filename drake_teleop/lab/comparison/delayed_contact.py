@@ -23,7 +23,8 @@ from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
 _START_GAP, _PRESS_DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
-#: Leaves by name: thickness [m] of a leaf of 120 mm x 50 mm, light enough not to oscillate.
+_LEAF_LENGTH, _LEAF_WIDTH = 0.12, 0.05  # m
+#: Leaves by name: thickness [m], light enough not to oscillate.
 LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
@@ -45,13 +46,23 @@ def task_for_round_trip(round_trip: float) -> Task:
 
 
 def delayed_contact(
-    base: Scenario, channel: Channel, passivity: PassivityConfig, leaf: str
+    base: Scenario,
+    channel: Channel,
+    passivity: PassivityConfig,
+    leaf: str | float,
+    *,
+    task: Task | None = None,
+    depth: float = _PRESS_DEPTH,
 ) -> tuple[Scenario, Task]:
     """Return the scenario with this task and the task's times.
 
-    `base` gives rates, sensor, scales and grip; `leaf` is a key of `LEAVES`.
+    Args:
+        base: gives rates, sensor, scales and grip.
+        leaf: key of `LEAVES`, or stiffness [N/m].
+        task: times; default: those of `task_for_round_trip`.
+        depth: intended displacement of the hand beyond the contact [m].
     """
-    task = task_for_round_trip(sum(line.delay for line in channel.lines()))
+    task = task or task_for_round_trip(sum(line.delay for line in channel.lines()))
     settle = 0.5
     swing = Sine(
         t_start=settle + task.swing,
@@ -61,7 +72,8 @@ def delayed_contact(
         translation=[0.005, 0.0, 0.02],
         rotation=[0.0, 0.05, 0.0],
     )
-    reach = [0.0, 0.0, -(_START_GAP + _PRESS_DEPTH)]
+    scale = base.kinematic_scaling.translation_scale
+    reach = [0.0, 0.0, -(_START_GAP / scale + depth)]
     press, retreat = (
         MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
         for start, end, translation in (
@@ -71,7 +83,10 @@ def delayed_contact(
     )
     x, y, z = NominalSlave(base.slave).start_tip.tolist()
     sheet = SheetSpring(
-        position=[x, y, z - _START_GAP], length=0.12, width=0.05, thickness=LEAVES[leaf]
+        position=[x, y, z - _START_GAP],
+        length=_LEAF_LENGTH,
+        width=_LEAF_WIDTH,
+        thickness=LEAVES[leaf] if isinstance(leaf, str) else thickness_of(leaf),
     )
     return (
         replace(
@@ -84,6 +99,12 @@ def delayed_contact(
         ),
         task,
     )
+
+
+def thickness_of(stiffness: float) -> float:
+    """Return the thickness [m] of a leaf with this stiffness [N/m]."""
+    unit = SheetSpring(length=_LEAF_LENGTH, width=_LEAF_WIDTH, thickness=1e-3)
+    return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
 
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:

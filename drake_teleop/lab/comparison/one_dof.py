@@ -181,7 +181,7 @@ def run_one_dof(
         servo_damping=[model.believed_damping * model.servo_damping] * 2,
         slave_mass=[model.believed_mass * model.slave_mass] * 2,
     )
-    p = methods.parameters(passivity, [scale, scale])
+    p = methods.parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
     intent = operators_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
     # The channel's command belongs to the next step; here it is used at once.

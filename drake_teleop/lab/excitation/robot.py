@@ -24,9 +24,8 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.model_check import check_size
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.station.slave.surroundings import AddEnvironment

@@ -9,19 +9,17 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.new_station.frame_advice import (
-    OPPOSITE,
-    last_joint_axis,
-    nearest_axis,
-    tool_frame_advice,
-)
 from drake_teleop.lab.new_station.place import (
+    OPPOSITE,
     TOOL_AXES,
     Place,
     TrialWalls,
     extent,
     find_place,
+    last_joint_axis,
     lowest_point,
+    nearest_axis,
+    tool_frame_advice,
 )
 from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM
 from drake_teleop.station.master.phantom import FORCE_LIMIT

@@ -13,8 +13,10 @@ from drake_teleop.common.progress import Progress, Stage
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
 from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
+from drake_teleop.load.regressor import regressor
+from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.result import SimulationResult
-from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
@@ -22,6 +24,9 @@ Values = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
 _THRESHOLD_OVER_FREE = 1.5
+_ALL_AXES = Sine(
+    duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +36,21 @@ class FreeMotion:
     scenario: Scenario
     result: SimulationResult
     scaled: dict[float, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class IdealMotion:
+    """Free movement as Drake's plant moves, without any sensor.
+
+    Attributes:
+        reaction: (N, 6) reaction wrench of the tool's weld [N, N m], in S about So.
+        motion: specific force, angular velocity and angular acceleration of S, (N, 3) each.
+        phi: (10,) true load.
+    """
+
+    reaction: Array
+    motion: tuple[Array, ...]
+    phi: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,18 +107,17 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
     )
 
 
-def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
-    """Simulate a free movement; subtract the true load's wrench from Drake's reaction wrench.
+def ideal_motion(progress: Progress) -> IdealMotion:
+    """Simulate a free movement that moves and rotates the tool about all axes.
 
-    The reaction of the tool's weld does not use the regressor V, and therefore checks V.
-
-    Returns:
-        (N, 6) reaction wrench minus the load's wrench, F - V phi [N, N m], after the settling time;
-            only rounding errors if V is correct.
+    The reaction of the tool's weld comes from Drake's plant and does not use the regressor V.
     """
+    scenario = replace(
+        LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
+    )
     rate, simulation = scenario.rates.log_hz, scenario.simulation
     phi = slave_arm(scenario).phi_load
-    ideal = replace(scenario, wrist_sensor__ideal=True, rates__sensor_hz=rate)
+    ideal = replace(scenario, rates__sensor_hz=rate)
     station = MakeTeleopStation(ideal, load_estimate=np.concatenate([np.zeros(6), phi]))
     plant, simulator = GetBlock(station, "slave_plant"), MakeSimulator(station, simulation)
     context = plant.GetMyContextFromRoot(simulator.get_context())
@@ -115,18 +134,32 @@ def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
     progress(1.0)
     result = read_log(simulator, simulation.settle)
     taken = np.rint((result["sample_time"][:, 0] + simulation.settle) * rate).astype(int)
-    _, s, omega, alpha = sensor_samples(result)
     started = taken >= 0
-    return contact_wrench(
-        wrenches[taken[started]], np.zeros(6), s[started], omega[started], alpha[started], phi
+    motion = tuple(part[started] for part in sensor_samples(result)[1:])
+    return IdealMotion(wrenches[taken[started]], motion, phi)
+
+
+def ideal_values(run: IdealMotion) -> Values:
+    """Return the reaction minus V phi, by the elimination and by the regressor, by name.
+
+    All six components are compared; only rounding errors remain if V is correct.
+    """
+    load = regressor(*run.motion) @ run.phi
+    left = np.concatenate(
+        [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]
     )
+    return {
+        "peak_raw_N": _largest_norm(run.reaction[:, :3]),
+        "peak_raw_Nm": _largest_norm(run.reaction[:, 3:]),
+        "residual_max_N": _largest_norm(left[:, :3]),
+        "residual_max_Nm": _largest_norm(left[:, 3:]),
+    }
 
 
-def free_values(run: FreeMotion, ideal: Array, component: int, unit: str) -> Values:
+def free_values(run: FreeMotion, component: int, unit: str) -> Values:
     """Return the values of Fig. 6 or Fig. 7 for one component of the wrench.
 
     Args:
-        ideal: (N, 6) result of `eliminated_reaction`.
         component: index 0 to 5 in the wrench.
         unit: unit, as suffix of the values' names.
     """
@@ -141,7 +174,6 @@ def free_values(run: FreeMotion, ideal: Array, component: int, unit: str) -> Val
         f"residual_max_{unit}": float(np.abs(rest).max()),
         f"residual_rms_{unit}": _rms(rest),
         f"residual_norm_max_{unit}": _largest_norm(run.scaled[0.0][:, vector]),
-        f"residual_ideal_max_{unit}": _largest_norm(ideal[:, vector]),
     }
 
 

@@ -1,7 +1,7 @@
 """`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order.
 
 1. Identification of the load (section IV) by the recursive estimator in the loop.
-2. Figs. 6 and 7: free movements, with the sensor and with the reaction force of Drake's plant.
+2. Figs. 6 and 7: free movements, and one about all axes with the reaction force of Drake's plant.
 3. Fig. 8: contact, and the same movement without the leaf spring.
 """
 
@@ -34,9 +34,10 @@ from drake_teleop.lab.reproduction.experiments import (
     Values,
     contact_motion,
     contact_values,
-    eliminated_reaction,
     free_motion,
     free_values,
+    ideal_motion,
+    ideal_values,
     identification_values,
     reversal_without_contact,
     true_parameters,
@@ -87,14 +88,12 @@ def reproduce_command(
         load = identify_load(identification_scenario(force, seed), stage)
         force_run = free_motion(force, load.estimate, stage("Fig. 6: vertical free motion"))
         torque_run = free_motion(torque, load.estimate, stage("Fig. 7: horizontal free motion"))
-        ideal = [
-            eliminated_reaction(scenario, stage(f"Fig. {number}: the same, ideal sensor"))
-            for number, scenario in ((6, force), (7, torque))
-        ]
+        ideal_run = ideal_motion(stage("Rotation about all axes, ideal sensor"))
         contact_run = contact_motion(contact, load.estimate, stage)
         summary = {
-            "free_force": free_values(force_run, ideal[0], _FORCE_Z, "N"),
-            "free_torque": free_values(torque_run, ideal[1], _TORQUE_X, "Nm"),
+            "free_force": free_values(force_run, _FORCE_Z, "N"),
+            "free_torque": free_values(torque_run, _TORQUE_X, "Nm"),
+            "ideal": ideal_values(ideal_run),
             "contact": contact_values(contact_run),
             "identification": identification_values(load, force),
         }

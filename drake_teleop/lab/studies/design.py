@@ -1,6 +1,5 @@
 """Content of a study file, and its design points: the sets of factor values to simulate."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import itertools
 import math
 from collections.abc import Callable, Sequence

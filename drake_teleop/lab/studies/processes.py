@@ -1,4 +1,4 @@
-"""Execution of a study's runs by processes of this machine or by Dask workers.
+"""Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
 If a run crashes (ends its process), the rows of its chunk are run one by one; a row that crashes
 again gets an error. With one job, a crash ends the study.
@@ -11,12 +11,13 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, Executor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.store import Store
 
 Chunk: TypeAlias = list[dict[str, Any]]
@@ -37,17 +38,31 @@ _PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 
 
 @contextmanager
-def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processes]:
+def processes(
+    store: Store, jobs: int, cluster: str | None, executor: Executor | None
+) -> Iterator[Processes]:
     """Start the processes of a study for the duration of the context.
 
     Args:
         store: where started chunks are marked.
         jobs: number of processes as in joblib; 1 is this process.
         cluster: address of a Dask scheduler, or "local".
+        executor: any `concurrent.futures.Executor`, which remains open.
 
     Raises:
-        DrakeTeleopError: without Dask or scheduler, or if processes end before their first run.
+        DrakeTeleopError: without Dask or scheduler, if processes end before their first run, if
+            the executor ends, or if a Dask worker has another version of this package.
     """
+    if executor is not None:
+        if not isinstance(executor, Executor):
+            raise DrakeTeleopError(
+                f"{type(executor).__name__} is not a concurrent.futures.Executor", where="executor"
+            )
+        yield Processes(
+            getattr(executor, "_max_workers", max(jobs, 1)),
+            lambda run, chunks: _run_by_executor(run, chunks, executor),
+        )
+        return
     if cluster is None:
         from joblib import effective_n_jobs
 
@@ -56,6 +71,7 @@ def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processe
         )
         return
     with _client(cluster, jobs) as client:
+        _check_versions(client)
         workers = sum(client.nthreads().values())
         yield Processes(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
@@ -166,9 +182,64 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
             yield client
 
 
+def _run_by_executor(run: Run, chunks: Sequence[Chunk], executor: Executor) -> Iterator[Chunk]:
+    futures = [executor.submit(run, chunk) for chunk in chunks]
+    try:
+        for future in as_completed(futures):
+            yield future.result()
+    except BrokenExecutor as error:
+        raise DrakeTeleopError(
+            f"ended before the study ({error})",
+            where="executor",
+            remedy="repeat the call with a new executor; finished runs are kept",
+        ) from error
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _check_versions(client: Any) -> None:
+    for worker, found in client.run(_version_reader(), on_error="return").items():
+        if found != __version__:
+            raise _wrong_version(worker, found, __version__)
+
+
+def _version_reader() -> Callable[[], str]:
+    # Dask sends a nested function as code, so that a worker of any version can execute it.
+    def version() -> str:
+        from drake_teleop.common.version import __version__ as found
+
+        return found
+
+    return version
+
+
+def _wrong_version(worker: str, found: Any, expected: str) -> DrakeTeleopError:
+    return DrakeTeleopError(
+        f"worker {worker} has drake_teleop {found}, this process has {expected}",
+        where="--cluster",
+        remedy="install the same version on all workers and start them again",
+    )
+
+
+def _on_same_version(run: Run) -> Run:
+    """Return `run` with a check of the version, for workers that join later."""
+    version, expected = _version_reader(), __version__
+
+    def checked(chunk: Chunk) -> Chunk:
+        from distributed import get_worker
+
+        if (found := version()) != expected:
+            raise _wrong_version(get_worker().address, found, expected)
+        return run(chunk)
+
+    return checked
+
+
 def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
     from distributed import as_completed
 
+    run = _on_same_version(run)
     futures = client.map(run, chunks, pure=False)
     chunk_of = dict(zip(futures, chunks, strict=True))
     for future in as_completed(futures):

@@ -8,6 +8,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -21,6 +22,7 @@ from drake_teleop.common.progress import Progress, show_progress
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.design import Study, Values
 from drake_teleop.lab.studies.processes import Chunk, processes
+from drake_teleop.lab.studies.shards import merge_shards, parse_shard
 from drake_teleop.lab.studies.store import Store, open_store
 
 if TYPE_CHECKING:
@@ -50,6 +52,9 @@ def run_study(
     *,
     jobs: int = -1,
     cluster: str | None = None,
+    executor: Executor | None = None,
+    shard: str | None = None,
+    merge: bool = False,
     progress: bool = True,
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
@@ -57,12 +62,20 @@ def run_study(
     Args:
         work: picklable function that executes one run.
         basis: JSON data of all inputs of the rows besides the study.
+        shard: "K/N" for the runs and rows of this shard only; see `shards.py`.
+        merge: True collects the rows of the shards in `out`, and runs nothing.
         progress: whether to show a progress bar.
 
     Raises:
         DrakeTeleopError: for the reasons of `study_command`.
         KeyboardInterrupt: its message contains the number of stored runs.
     """
+    part = None if shard is None else parse_shard(shard)
+    if (part or merge) and study.design == "adaptive":
+        raise DrakeTeleopError(
+            "an adaptive design has no shards, because its points depend on earlier runs",
+            remedy="use jobs, cluster or executor",
+        )
     points = study.points()
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
@@ -70,18 +83,28 @@ def run_study(
     identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
     schema = _schema(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
-    with open_store(out, identity) as store:
-        counter = StudyProgress(study.size() * study.repeats)
+    chunks = _chunks(first_rows) if part is None else part.chunks(_chunks(first_rows))
+    total = sum(map(len, chunks)) if part else study.size() * study.repeats
+    with open_store(part.folder(out) if part else out, identity) as store:
+        if merge:
+            merge_shards(out, store, identity, chunks)
+        counter = StudyProgress(total)
         try:
-            with show_progress(progress) as stage, processes(store, jobs, cluster) as workers:
+            with (
+                show_progress(progress) as stage,
+                processes(store, jobs, cluster, executor) as workers,
+            ):
                 counter.start(stage("Study"), workers.count)
                 new = points
                 while new:
-                    chunks = _chunks(study.rows(new, len(points) - len(new)), store, counter)
-                    for found in workers.rows_of(run, chunks):
+                    finished = store.finished()
+                    left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
+                    counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
+                    for found in workers.rows_of(run, left):
                         _store_rows(store, found, schema)
                         counter.add_finished_runs(found)
                     new = study.next_points(points, _objective(study, store, len(points)))
+                    chunks = _chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
             remedy = (
@@ -93,14 +116,11 @@ def run_study(
         return store.read()
 
 
-def _chunks(rows: Chunk, store: Store, counter: StudyProgress) -> list[Chunk]:
+def _chunks(rows: Chunk) -> list[Chunk]:
     size = min(max(len(rows) // _NUM_CHUNKS, 1), _LARGEST_CHUNK)
     chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
     chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
-    finished = store.finished()
-    left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
-    counter.add_earlier_runs(len(rows) - sum(map(len, left)))
-    return left
+    return chunks
 
 
 def _objective(study: Study, store: Store, points: int) -> Array:

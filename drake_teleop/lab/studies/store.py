@@ -32,14 +32,15 @@ class Store:
 
     def finished(self) -> set[int]:
         """Return the first run of each stored chunk."""
-        return set(map(_first_run, self._parts()))
+        return set(map(_first_run, self.parts()))
 
-    def _parts(self) -> list[Path]:
+    def parts(self) -> list[Path]:
+        """Return the files of the stored chunks, sorted by run."""
         return sorted(self.folder.glob(_PART.format(0).replace("0", "[0-9]")))
 
     def remove_damaged_parts(self) -> None:
         """Remove unreadable or empty parts."""
-        parts = self._parts()
+        parts = self.parts()
         whole = _runs_in(parts)
         for part in parts:
             if not {_first_run(part)} & (whole or _runs_in([part])):
@@ -75,7 +76,7 @@ class Store:
         import polars as pl
 
         remedy = "remove the damaged part and repeat the command"
-        parts = self._parts()
+        parts = self.parts()
         for part in parts:
             with wrap_read_errors(part, remedy):
                 check_parquet(part)
@@ -130,7 +131,7 @@ def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
     handle = os.open(out, os.O_RDONLY)
     try:
         _lock(handle, out)
-        _check_identity(out, identity)
+        check_identity(out, identity)
         yield
     finally:
         os.close(handle)
@@ -145,7 +146,12 @@ def _lock(handle: int, out: Path) -> None:
         ) from None
 
 
-def _check_identity(out: Path, identity: dict[str, Any]) -> None:
+def check_identity(out: Path, identity: dict[str, Any]) -> None:
+    """Write the inputs of the rows into a new folder `out`, or compare them.
+
+    Raises:
+        DrakeTeleopError: if the folder has other inputs.
+    """
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():

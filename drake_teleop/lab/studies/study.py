@@ -13,17 +13,15 @@ pictures     main effects, interactions of two factors, Pareto front
 from __future__ import annotations
 
 import copy
-import os
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydrake.common.yaml import yaml_dump, yaml_load_typed
-
-from drake_teleop.common.config import check_ranges, check_structure
-from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
+from drake_teleop.common.config import check_ranges
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.lab.run import run_scenario
@@ -32,7 +30,15 @@ from drake_teleop.lab.studies.effects import effects
 from drake_teleop.lab.studies.measures import measured
 from drake_teleop.lab.studies.pictures import write_pictures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
-from drake_teleop.station.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
+from drake_teleop.lab.studies.shards import parse_shard
+from drake_teleop.station.scenario import (
+    ReadScenario,
+    Scenario,
+    ScenarioFromData,
+    ScenarioNames,
+    settings_from_data,
+    shipped_file,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -75,6 +81,9 @@ def study_command(
     *,
     jobs: int = -1,
     cluster: str | None = None,
+    executor: Executor | None = None,
+    shard: str | None = None,
+    merge: bool = False,
     quiet: bool = False,
     progress: bool = True,
     repeats: int | None = None,
@@ -86,15 +95,25 @@ def study_command(
         path: study file, or the name of a shipped study.
         jobs: number of processes; -1: one for each core.
         cluster: address of a Dask scheduler, or "local".
+        executor: any `concurrent.futures.Executor` that executes the runs instead; stays open.
+        shard: "K/N" for every N-th group of runs, with a summary in the folder `shards/K-of-N`.
+        merge: True collects the rows of all shards in `out` and runs nothing.
         quiet: True hides progress bars and tables; `progress` False only the bars.
         repeats: replaces the value of the file.
         yes: True permits more than 1e5 runs; or a function that asks the user.
 
     Raises:
-        DrakeTeleopError: for a wrong file, too many runs, another study's folder, or missing Dask.
+        DrakeTeleopError: for a wrong file, too many runs, another study's folder, missing Dask, a
+            Dask worker of another version, or shards that are missing.
         KeyboardInterrupt: its message contains the number of stored runs.
     """
-    study, path = LoadStudy(path), study_file(path)
+    for first, second, both in (
+        ("shard", "merge", shard and merge),
+        ("cluster", "executor", cluster and executor is not None),
+    ):
+        if both:
+            raise DrakeTeleopError(f"{first} and {second} exclude each other", where=str(path))
+    study, path = LoadStudy(path), shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_size(str(path), yes)
     data, where = ReadScenario(_scenario_path(study, path))
@@ -103,35 +122,20 @@ def study_command(
         _check_values(factor, f"{path}:factors[{index}]")
     work = StationWork(data, where, tuple(study.measures), study.force_threshold)
     shown = progress and not quiet
-    rows = run_study(study, out, work, {"data": data}, jobs=jobs, cluster=cluster, progress=shown)
+    rows = run_study(
+        study, out, work, {"data": data}, jobs=jobs, cluster=cluster, executor=executor,
+        shard=shard, merge=merge, progress=shown,
+    )  # fmt: skip
     summary = _summary(study, rows)
+    out = parse_shard(shard).folder(out) if shard else out
     with output_folder(out, kept=["runs.parquet"]):
-        write_table(out / "effects.csv", effects(study, rows))
-        write_pictures(study, rows, out)
+        if not shard:
+            write_table(out / "effects.csv", effects(study, rows))
+            write_pictures(study, rows, out)
         write_json(out / "summary.json", summary)
     if not quiet:
         _print(study, summary, out)
     return summary
-
-
-def study_file(name_or_path: str | Path) -> Path:
-    """Return the file of a shipped study, or the given path.
-
-    Raises:
-        DrakeTeleopError: if neither exists.
-    """
-    expect((str, Path), name_or_path, "study")
-    shipped = studies_dir() / f"{name_or_path}.yaml"
-    path = shipped if os.path.isfile(shipped) else Path(name_or_path)
-    if not os.path.isfile(path):
-        names = sorted(file.stem for file in studies_dir().glob("*.yaml"))
-        raise DrakeTeleopError(
-            f"there is no study '{name_or_path}'",
-            remedy=suggestion(
-                name_or_path, names, f"give a YAML file or one of {', '.join(names)}"
-            ),
-        )
-    return path
 
 
 def LoadStudy(path: str | Path) -> Study:
@@ -140,10 +144,8 @@ def LoadStudy(path: str | Path) -> Study:
     Raises:
         DrakeTeleopError: if it is invalid; with file and field.
     """
-    path = study_file(path)
-    data = read_yaml(path)
-    check_structure(Study, data, str(path))
-    study = yaml_load_typed(schema=Study, data=yaml_dump(data), defaults=Study())
+    path = shipped_file("study", path, studies_dir())
+    study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))
     return study
 
@@ -157,8 +159,7 @@ def _check_values(factor: Factor, where: str) -> None:
     ranged = factor.low is not None and factor.high is not None
     for value in (factor.low, factor.high) if ranged else factor.listed():
         data = _with_changes({}, {factor.field: value})
-        check_structure(Scenario, data, where)
-        check_ranges(yaml_load_typed(schema=Scenario, data=yaml_dump(data)), where)
+        check_ranges(settings_from_data(Scenario, data, where), where)
 
 
 def _with_changes(data: Any, changes: dict[str, Any]) -> Any:
@@ -186,7 +187,7 @@ def _summary(study: Study, rows: pl.DataFrame) -> dict[str, Any]:
     return {
         "description": study.description,
         "runs": rows.height,
-        "points": rows.height // study.repeats,
+        "points": rows["point"].n_unique(),
         "failed": len(failed),
         "first_error": failed[0] if len(failed) else None,
         "measures": figures,

@@ -1,27 +1,28 @@
 """Design of an experiment, from its YAML file."""
 
-# No postponed annotations: yaml_load_typed reads the types of the fields.
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-from pydrake.common.yaml import yaml_dump, yaml_load_typed
-
 from drake_teleop.common.config import (
     check_ranges,
-    check_structure,
     choice,
     plain,
     quantity,
     settings,
 )
-from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.live.inputs import NETWORKS, OWN
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioNames
+from drake_teleop.station.scenario import (
+    LoadScenario,
+    Scenario,
+    ScenarioNames,
+    settings_from_data,
+    shipped_file,
+)
 
 _FOLDER = Path(__file__).parent
 
@@ -163,28 +164,14 @@ class Experiment:
                 )
 
 
-def ExperimentNames() -> list[str]:
-    """Return the names of the shipped experiments."""
-    return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
-
-
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios.
 
     Raises:
         DrakeTeleopError: for an invalid field.
     """
-    expect((str, Path), path, "study")
-    names = ExperimentNames()
-    path = _FOLDER / f"{path}.yaml" if str(path) in names else Path(path)
-    if not os.path.isfile(path):
-        raise DrakeTeleopError(
-            f"there is no experiment '{path}'",
-            remedy=suggestion(path, names, f"give a YAML file or one of {', '.join(names)}"),
-        )
-    data = read_yaml(path, tagged=True)
-    check_structure(Experiment, data, str(path))
-    experiment = yaml_load_typed(schema=Experiment, data=yaml_dump(data), defaults=Experiment())
+    path = shipped_file("experiment", path, _FOLDER)
+    experiment = settings_from_data(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))
     return experiment, [_scenario(task, path, index) for index, task in enumerate(experiment.tasks)]
 

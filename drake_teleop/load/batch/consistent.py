@@ -70,11 +70,7 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def row(self) -> Array:
-        """Return coefficients (10,): coefficients @ phi >= 0 if the ellipsoid can contain the mass.
-
-        Raises:
-            DrakeTeleopError: if the matrix is not positive definite.
-        """
+        """Return coefficients (10,); their product with a phi of a mass inside is not negative."""
         A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
             raise DrakeTeleopError("is not positive definite", where="ellipsoid.matrix")
@@ -94,9 +90,6 @@ def consistent_least_squares(
     Args:
         gram, right: (16, 16), (16,) weighted normal equations; per sample if there is a prior.
         theta: (16,) their solution, returned if it satisfies the constraints.
-
-    Raises:
-        DrakeTeleopError: if the solver finds no solution.
     """
     row = None if ellipsoid is None else ellipsoid.row()
     inside = row is None or row @ theta[6:] >= 0.0

@@ -23,14 +23,22 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, checked_rows, number
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
-from drake_teleop.load.batch.covariance import (
+from drake_teleop.load.batch.total_least_squares import (
+    Fit,
+    NormalForm,
+    Options,
+    Record,
+    total_least_squares,
+)
+from drake_teleop.load.batch.uncertainty import (
     covariance_of,
     gain_covariance,
     walk_covariance,
     white_covariance,
     with_prior,
 )
-from drake_teleop.load.batch.moments import (
+from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.moments import (
     CHUNK,
     Moments,
     Noise,
@@ -39,14 +47,6 @@ from drake_teleop.load.batch.moments import (
     normal_equations,
     residual_covariance,
 )
-from drake_teleop.load.batch.total_least_squares import (
-    Fit,
-    NormalForm,
-    Options,
-    Record,
-    total_least_squares,
-)
-from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.

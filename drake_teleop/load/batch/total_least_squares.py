@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior
-from drake_teleop.load.batch.moments import (
+from drake_teleop.load.moments import (
     Moments,
     Noise,
     excited_columns,
@@ -65,9 +65,6 @@ def total_least_squares(
         noise: of the motion.
         wrench_noise: (6,) standard deviations [N, N m].
         offsets: False fixes the offsets at 0.
-
-    Raises:
-        DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
     """
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
@@ -36,11 +37,7 @@ less often than that value, which is reached about once in a record of the same 
 
 
 def statistic_index(statistic: str) -> int:
-    """Return the column of a statistic: "level", "cusum" or "glr".
-
-    Raises:
-        DrakeTeleopError: for another name.
-    """
+    """Return the column of a statistic: "level", "cusum" or "glr"."""
     if statistic not in STATISTICS:
         raise DrakeTeleopError(
             f"{statistic!r} is not a statistic",
@@ -48,6 +45,26 @@ def statistic_index(statistic: str) -> int:
             remedy=f"give one of {', '.join(STATISTICS)}",
         )
     return STATISTICS.index(statistic)
+
+
+class Samples(NamedTuple):
+    """Contact wrench and motion of N consecutive samples.
+
+    Attributes:
+        contact: (N, 6) contact wrench F_c, Eq. (13) [N, N m].
+        s, omega, alpha: (N, 3) specific force, angular velocity and acceleration of S, in S [SI].
+        acceleration: (N, 3) acceleration of So without gravity, in any axes [m/s^2].
+    """
+
+    contact: Array
+    s: Array
+    omega: Array
+    alpha: Array
+    acceleration: Array
+
+    def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
+        """Return the samples in `rows`."""
+        return Samples(*(x[rows] for x in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +109,7 @@ class NoiseFloor:
             raise DrakeTeleopError("is not positive definite", where="correlation")
 
     def threshold(self, statistic: str, margin: float = MARGIN) -> float:
-        """Return a contact threshold: `margin` times the largest statistic in free motion.
-
-        Raises:
-            DrakeTeleopError: for an unknown statistic, or without a fitted motion.
-        """
+        """Return a contact threshold: `margin` times the largest statistic in free motion."""
         return margin * float(positive("reached", self.reached, 3)[statistic_index(statistic)])
 
     @property
@@ -106,17 +119,9 @@ class NoiseFloor:
         variances, growth = self.noise**2, self.per_acceleration**2
         return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
 
-    def sigma(
-        self, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, acceleration: ArrayLike
-    ) -> Array:
-        """Return the noise sigma (N, 6) [N, N m] along a free motion of N consecutive samples.
-
-        Args:
-            s, omega, alpha: (N, 3) specific force, angular velocity and acceleration of S, in S
-                [SI].
-            acceleration: (N, 3) acceleration of So without gravity, in any axes [m/s^2].
-        """
-        rows = checked_motion(s=s, omega=omega, alpha=alpha, acceleration=acceleration)
+    def sigma(self, *motion: ArrayLike) -> Array:
+        """Return the noise sigma (N, 6) [N, N m] along a free motion, see `Samples`."""
+        rows = checked_samples(*motion)
         out = np.empty((len(rows[0]), 6))
         write_sigmas(*rows, *self.parameters[:3], self.fade, out)
         return out
@@ -162,10 +167,10 @@ def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out)
             out[k, c] = math.sqrt(variances[c] + max(out[k, c], 0.0) + moving)
 
 
-def checked_motion(**arrays: ArrayLike) -> list[Array]:
-    """Return the named arrays as (N, 3) tables of equal length; `contact` as (N, 6)."""
-    sizes = {name: (value, 6 if name == "contact" else 3) for name, value in arrays.items()}
-    return checked_rows(**sizes)[1]
+def checked_samples(*arrays: ArrayLike) -> list[Array]:
+    """Return the five arrays of `Samples`, or the last four, as tables of equal length."""
+    named = zip(Samples._fields[-len(arrays) :], arrays, strict=True)
+    return checked_rows(**{name: (x, 6 if name == "contact" else 3) for name, x in named})[1]
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:

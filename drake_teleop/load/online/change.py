@@ -307,9 +307,6 @@ def change_parameters(
         model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
         bound: required standard deviation of a new load's mass, relative to the change of mass;
             default `BOUND`, or twice the model error if larger.
-
-    Raises:
-        DrakeTeleopError: for values outside their range.
     """
     positive("period", period)
     if not 0.0 <= model_error < 1.0:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,9 +102,6 @@ class RecursiveEstimator(ABC):
         forgetting: factor per sample on the weight of past samples, 0 < forgetting <= 1.
         prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
         bound: standard deviation that `settled` requires, relative to `natural_scale`.
-
-    Raises:
-        DrakeTeleopError: for values outside their range.
     """
 
     #: Value of `Identification.method`.
@@ -214,11 +212,7 @@ class RecursiveEstimator(ABC):
         self._samples += len(rows[0])
 
     def identification(self) -> Identification:
-        """Return the present estimate.
-
-        Raises:
-            DrakeTeleopError: before the first update.
-        """
+        """Return the present estimate."""
         if self._theta[6] == 0.0:
             raise DrakeTeleopError("there was no update yet", where="estimator")
         covariance = self.covariance
@@ -252,14 +246,8 @@ class RecursiveLeastSquares(RecursiveEstimator):
 
     method = "recursive least squares"
 
-    def __init__(
-        self,
-        noise_std: ArrayLike,
-        forgetting: float = 1.0,
-        prior_std: ArrayLike = PRIOR_STD,
-        bound: float = SETTLED,
-    ) -> None:
-        super().__init__(noise_std, forgetting, prior_std, bound)
+    def __init__(self, noise_std: ArrayLike, *options: Any, **named: Any) -> None:
+        super().__init__(noise_std, *options, **named)
         self._squares = np.zeros(6)
 
     def initial_memory(self, theta: Array) -> Array:

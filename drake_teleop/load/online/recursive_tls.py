@@ -1,7 +1,7 @@
 """Recursive total least squares: load and offsets for noise of wrench and motion, Eq. (T18).
 
 The estimate minimises lambda, the squared residuals over their expected value (Kubus, Kroeger,
-Wahl, IROS 2008). As in `batch.moments`, row c of the regressor [E V] is T_c z, with the wrench F
+Wahl, IROS 2008). As in `moments`, row c of the regressor [E V] is T_c z, with the wrench F
 last:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, checked
-from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.load.moments import coefficients
 from drake_teleop.load.online.recursive import (
     PRIOR_STD,
     SETTLED,
@@ -246,10 +246,6 @@ class MomentEstimator(RecursiveEstimator):
         residual_products(self._memory[:19], self._theta, *terms(), L, LZ, S)
         return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
 
-    def _within_prior(self, covariance: Array) -> Array:
-        shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
-        return np.asarray(covariance * np.outer(shrink, shrink))
-
 
 @njit(cache=True)
 def select_compensated(G, N, strength, K, taper):
@@ -404,7 +400,9 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         factor = inverse @ _cholesky(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
-        return self._within_prior(factor @ factor.T + unknown @ unknown.T)
+        covariance = factor @ factor.T + unknown @ unknown.T
+        shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
+        return np.asarray(covariance * np.outer(shrink, shrink))
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))

@@ -8,27 +8,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import signed_permutations
 from drake_teleop.load.identification import natural_scale
-from drake_teleop.logs.causes.changes import add_step
-from drake_teleop.logs.causes.contacts import contact_spans
+from drake_teleop.logs.causes.changes import add_step, contact_spans
 from drake_teleop.logs.causes.instants import FORCES, ONE, G, R, S
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.state import State
 
 ORDER = (
-    "axes",
-    "gravity",
-    "weight",
-    "torque factor",
-    "offsets",
-    "load",
-    "linear drift",
-    "gain",
-    "frame",
-    "rotation",
-    "contact",
-    "cable",
-    "drift",
+    *("axes", "gravity", "weight", "torque factor", "offsets", "load", "linear drift", "gain"),
+    *("frame", "rotation", "contact", "cable", "drift"),
 )
 """Order of plausibility: of nearly equal candidates the first is chosen."""
 _FACTORS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
@@ -92,9 +81,12 @@ def candidates(state: State, first: bool) -> Iterator[Candidate]:
             if _SMALLEST_GAIN < abs(larger.extension(f"gain {c}")[0][0]) < _LARGEST_GAIN:
                 yield _candidate("gain", state, larger)
     if "frame" not in model.parts and data.accelerates_enough:
-        yield from _fit_part(state, "frame", [None], _is_shift_significant)
+        yield from _fit_part(
+            state, "frame", [None], lambda x: _size(x, "frame") > _SMALLEST_SHIFT_M
+        )
     if first and not model.parts:
-        yield from _fit_part(state, "rotation", [None], _is_rotation_significant)
+        angle = np.radians(_SMALLEST_ROTATION_DEG)
+        yield from _fit_part(state, "rotation", [None], lambda x: _size(x, "rotation") > angle)
     spans = contact_spans(state)
     if spans and spans != state.spans:
         larger = State.of(data, model, state.x, spans)
@@ -204,19 +196,15 @@ def tilt_start(state: State) -> Array | None:
     return x
 
 
+def _size(state: State, name: str) -> float:
+    return float(np.linalg.norm(state.extension(name)[0]))
+
+
 def _is_weight_significant(state: State) -> bool:
     removed, _ = state.extension("weight")
     mass = abs(state.x[6])
     moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)
     return bool(removed[0] > _MASS_SHARE * mass or moment > _SMALLEST_ARM_M)
-
-
-def _is_shift_significant(state: State) -> bool:
-    return bool(np.linalg.norm(state.extension("frame")[0]) > _SMALLEST_SHIFT_M)
-
-
-def _is_rotation_significant(state: State) -> bool:
-    return bool(np.degrees(np.linalg.norm(state.extension("rotation")[0])) > _SMALLEST_ROTATION_DEG)
 
 
 def _is_drift_significant(state: State) -> bool:
@@ -269,8 +257,6 @@ def similar_factors(state: State) -> list[State]:
 
 
 def _axes(state: State) -> Iterator[Candidate]:
-    from itertools import permutations, product
-
     y = state.data.only(state.rows.used).y[:, state.model.columns]
     sums = y.T @ y
     sums = sums - np.outer(sums[:, ONE], sums[ONE]) / sums[0, 0]
@@ -287,17 +273,14 @@ def _axes(state: State) -> Iterator[Candidate]:
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
     best: tuple[float, Array] = (np.inf, np.eye(3))
     plain = total
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            Q = np.zeros((3, 3))
-            Q[range(3), order] = signs
-            right = np.einsum("dc,cdp->p", Q, cross)
-            found = inverse @ right
-            left = total - float(right @ found) if found[0] > 0.0 else total
-            if (np.eye(3) == Q).all():
-                plain = left
-            elif left < best[0]:
-                best = (left, Q)
+    for Q in signed_permutations():
+        right = np.einsum("dc,cdp->p", Q, cross)
+        found = inverse @ right
+        left = total - float(right @ found) if found[0] > 0.0 else total
+        if (np.eye(3) == Q).all():
+            plain = left
+        elif left < best[0]:
+            best = (left, Q)
     if best[0] < _HALVED * plain:
         larger = state.extended(replace(state.model, axes=best[1]), np.zeros(state.model.size))
         if larger.x[6] > 0.0:

@@ -1,14 +1,28 @@
-"""Explanation of a wrench: noise test, search for causes, and the resulting load."""
+"""Search for causes of a misfit, and the resulting load (docs/theory.md)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drake_teleop.common.numeric import Array, one_blas_thread
+from drake_teleop.logs.causes.candidates import (
+    ORDER,
+    Candidate,
+    candidates,
+    has_negative_inertia,
+    is_plausible,
+    tilt_start,
+)
 from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
-from drake_teleop.logs.causes.instants import Instants
+from drake_teleop.logs.causes.changes import (
+    replace_contacts_by_steps,
+    replace_steps_by_contact,
+    shrink_contacts,
+)
+from drake_teleop.logs.causes.instants import Instants, free_delay
 from drake_teleop.logs.causes.intervals import (
     block_deviations,
     covariance_of,
@@ -16,15 +30,196 @@ from drake_teleop.logs.causes.intervals import (
     gain_covariance,
     misfit_deviations,
 )
-from drake_teleop.logs.causes.model import DELAY, LOAD
-from drake_teleop.logs.causes.search import (
-    WithDelay,
-    is_clear_misfit,
-    is_noise,
-    may_be_coloured_noise,
-    search,
-)
+from drake_teleop.logs.causes.model import DELAY, LOAD, Model
 from drake_teleop.logs.causes.state import State
+
+ROUNDS = 4
+WithDelay = Callable[[float], Instants]
+_SMALLEST_DELAY_S, _LARGEST_DELAY_S, _SAME_DELAY_S, _DELAY_ITERATIONS = 5e-4, 0.3, 0.004, 4  # s
+MAX_RESIDUAL_RATIO, MAX_SMOOTH_MISFIT, MAX_EXTENSION_SCORE = 1.25, 2.2, 20.0
+"""Limits of the noise test: `State.residual_ratio`, `State.smooth_misfit`, `State.score`."""
+_MIN_SCORE, _SCORE_MARGIN, _SCORE_MARGIN_SHARE = 40.0, 25.0, 0.02
+_HALVED, _FIFTH, _COLOURED_NOISE_RATIO, _REDUCED, _CERTAIN_SCORE = 0.5, 0.2, 15.0, 0.9, 1000.0
+_ATTENUATED_SHARE = 1.0 / 3.0
+_GOOD_SMOOTH_MISFIT = 1.35
+"""Largest smooth misfit of good records."""
+_STEP_CAUSES, _LARGEST_INCREASE = ("offsets", "load"), 3.0
+_SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
+"""Causes whose misfit may be as smooth as coloured noise."""
+_FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"), 80.0, 0.1
+"""Causes with many columns, which resemble others; required margins of their scores."""
+
+
+def is_noise(state: State) -> bool:
+    """Return whether the residual of a fitted model is sensor noise."""
+    if (
+        has_negative_inertia(state)
+        or state.residual_ratio > MAX_RESIDUAL_RATIO
+        or state.smooth_misfit > MAX_SMOOTH_MISFIT
+    ):
+        return False
+    model = state.model
+    parts = ["frame", "linear drift", "rotation"]
+    if state.data.gravity_W is not None:
+        parts += ["gravity", "weight"]
+    larger = [model.extended(name) for name in parts if name not in model.parts]
+    larger += [replace(model, gains=(*model.gains, c)) for c in range(6) if c not in model.gains]
+    return all(state.score(x) < MAX_EXTENSION_SCORE for x in larger)
+
+
+Found = tuple[State, float, list[Candidate]]
+
+
+def search(
+    data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
+) -> Found:
+    """Return the model that explains a record, additional delay [s], and rejected candidates.
+
+    `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
+    model.
+    """
+    found = _search(_initial_state(data, given), 0.0, with_delay)
+    if with_delay is None or may_be_coloured_noise(found[0]) or is_noise(found[0]):
+        return found
+    delay_s = free_delay(data)
+    if abs(delay_s - found[1]) < _SAME_DELAY_S:
+        return found
+    repeated = _search(_initial_state(with_delay(delay_s), given), delay_s, with_delay)
+    better = is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
+    better = better or (repeated[0].residual_ratio < _FIFTH * found[0].residual_ratio)
+    return repeated if better else found
+
+
+def may_be_coloured_noise(state: State) -> bool:
+    """Return whether the residual may be coloured noise: smooth signals do not explain it."""
+    return (
+        state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
+    )
+
+
+def is_clear_misfit(state: State) -> bool:
+    """Return whether the residual is clearly not noise: large, or explained by smooth signals."""
+    return state.smooth_misfit > MAX_SMOOTH_MISFIT or state.residual_ratio > _COLOURED_NOISE_RATIO
+
+
+def _initial_state(data: Instants, given: tuple[str, ...]) -> State:
+    state = State.of(data, Model(parts=given))
+    start = tilt_start(state) if "gravity" in given else None
+    return state if start is None else State.of(data, state.model, start)
+
+
+def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found:
+    state, delay_s = _remove_delay(state, delay_s, with_delay)
+    rejected: list[Candidate] = []
+    for number in range(ROUNDS):
+        if is_noise(state):
+            return state, delay_s, []
+        found = _without_attenuation(list(candidates(state, first=number == 0)))
+        rejected = [x for x in found if is_plausible(x.state)]
+        effective = [x for x in rejected if _is_effective(x, state)]
+        winner, calmest = _best_candidate(effective), _smallest_residual(state, rejected)
+        if winner is None or _much_smaller_residual(calmest, winner):
+            winner = calmest
+        if winner is None:
+            explained = _without_contact(state, rejected)
+            if explained is None:
+                break
+            state, delay_s = _remove_delay(explained, delay_s, with_delay)
+            continue
+        larger = replace_steps_by_contact(winner.state)
+        if winner.name == "contact":
+            larger = replace_contacts_by_steps(larger) or shrink_contacts(larger)
+        elif larger.spans != winner.state.spans:
+            larger = replace_contacts_by_steps(larger) or larger
+        state, delay_s = _remove_delay(larger, delay_s, with_delay)
+        rejected = [x for x in rejected if x is not winner]
+        if winner.name == "cable":
+            return state, delay_s, []
+    return state, delay_s, rejected
+
+
+def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
+    """Remove "cable" if an attenuated inertia explains a third of its score."""
+    best = max(
+        (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
+    )
+    return [x for x in found if x.name != "cable" or best < _ATTENUATED_SHARE * x.score]
+
+
+def _remove_delay(
+    state: State, delay_s: float, with_delay: WithDelay | None
+) -> tuple[State, float]:
+    for _ in range(_DELAY_ITERATIONS):
+        if (
+            with_delay is None
+            or abs(state.x[DELAY]) < _SMALLEST_DELAY_S
+            or abs(delay_s) > _LARGEST_DELAY_S
+        ):
+            break
+        delay_s += float(state.x[DELAY])
+        x = state.x.copy()
+        x[DELAY] = 0.0
+        state = State.of(with_delay(delay_s), state.model, x, state.spans)
+    return state, delay_s
+
+
+def _smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
+    small = [x for x in found if x.name in _SMOOTH_CAUSES]
+    small = [x for x in small if x.state.residual_ratio < _FIFTH * state.residual_ratio]
+    least = min([x.state.residual_ratio for x in small], default=0.0)
+    near = [x for x in small if x.state.residual_ratio < 2.0 * least]
+    return min(near, key=lambda x: ORDER.index(x.name), default=None)
+
+
+def _much_smaller_residual(calmest: Candidate | None, winner: Candidate) -> bool:
+    if calmest is None or calmest.name == "contact":
+        return False
+    return calmest.state.residual_ratio < _FIFTH * winner.state.residual_ratio
+
+
+def _without_contact(state: State, found: list[Candidate]) -> State | None:
+    for candidate in found:
+        if (
+            candidate.name == "contact"
+            and candidate.state.residual_ratio < _HALVED * state.residual_ratio
+        ):
+            return replace_contacts_by_steps(candidate.state)
+    return None
+
+
+def _is_effective(candidate: Candidate, state: State) -> bool:
+    fitted = candidate.state
+    smaller = fitted.residual_ratio < _REDUCED * state.residual_ratio
+    if candidate.name == "cable":
+        return smaller  # the force of a cable far exceeds the noise
+    if (
+        candidate.name not in _STEP_CAUSES
+        and fitted.residual_ratio > _LARGEST_INCREASE * state.residual_ratio
+    ):
+        return False  # the candidate increases the residual, and coloured noise predicts it
+    better = smaller or fitted.smooth_misfit < _REDUCED * state.smooth_misfit
+    return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_SCORE)
+
+
+def _best_candidate(found: list[Candidate]) -> Candidate | None:
+    best = max([x.score for x in found], default=0.0)
+    if best < _MIN_SCORE:
+        return None
+    top = max(found, key=lambda x: x.score).name
+    margin = (
+        max(_SCORE_MARGIN, _SCORE_MARGIN_SHARE * best)
+        if top not in _FLEXIBLE_CAUSES
+        else max(_FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE * best)
+    )
+    near = [x for x in found if x.score > max(_MIN_SCORE, best - margin)]
+    first = min(near, key=lambda x: ORDER.index(x.name))
+    return (
+        first
+        if first.score
+        > _MIN_SCORE * max(1.0, first.state.smooth_misfit / _GOOD_SMOOTH_MISFIT) ** 1.5
+        else None
+    )
+
 
 _NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, parabola_minimum
 
 ORDER = 4
 """Order of the autoregressive noise."""
@@ -147,7 +147,8 @@ def instants(
     y[:, FORCES] = wrench.reshape(rows, size, 6).mean(axis=1)
     y[1:-1, RATES] = (y[2:, FORCES] - y[:-2, FORCES]) / (2.0 * size * dt)
     positions = _write_motion(y, t, size, motion, gravity_W)
-    y[:, TIME] = _legendre(np.linspace(-1.0, 1.0, rows))
+    x = np.linspace(-1.0, 1.0, rows)
+    y[:, TIME] = np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)  # Legendre
     used = np.ones(rows, bool)
     used[[0, -1]] = False
     if lost is not None:
@@ -224,10 +225,6 @@ def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     return np.hstack(parts)
 
 
-def _legendre(x: Array) -> Array:
-    return np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
-
-
 def free_delay(data: Instants) -> float:
     """Return the delay of the motion [s] with the smallest residual.
 
@@ -256,7 +253,4 @@ def free_delay(data: Instants) -> float:
     best = int(np.argmin(costs))
     if best in (0, len(shifts) - 1):
         return 0.0
-    left, middle, right = costs[best - 1 : best + 2]
-    bend = left - 2.0 * middle + right
-    move = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
-    return float(shifts[best] + _DELAY_STEP_S * move)  # |move| <= 0.5 at the smallest of three
+    return float(shifts[best] + _DELAY_STEP_S * parabola_minimum(*costs[best - 1 : best + 2]))

@@ -8,14 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.covariance import ARM
+from drake_teleop.load.batch.uncertainty import ARM
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.candidates import Candidate, similar_factors
-from drake_teleop.logs.causes.fit import regularized_inverse
 from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import LOAD
-from drake_teleop.logs.causes.rows import Rows
-from drake_teleop.logs.causes.state import State
+from drake_teleop.logs.causes.state import Rows, State, regularized_inverse
 
 _GROUPS = 12
 _TOLERATED, _USUAL = 1.5, 1.15

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.load.moments import centripetal_matrix, coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA,
     FORCES,
@@ -186,8 +187,8 @@ class Model:
                 M[:, i, R.start + 3 * i : R.start + 3 * i + 3] += d
         if "frame" in parts:
             r = x[:, parts["frame"]]
-            M[:, :3, ALPHA] -= _cross(r)
-            M[:, :3, PRODUCTS] += _centripetal(r)
+            M[:, :3, ALPHA] -= cross_matrix(r)
+            M[:, :3, PRODUCTS] += centripetal_matrix(r)
         return M
 
     def _rotations(self, x: Array) -> Array:
@@ -226,18 +227,5 @@ def _cable(x: Array) -> Array:
     for i in range(3):
         out[:, i, R.start + 3 * i : R.start + 3 * i + 3] = x[:, :3]
         out[:, i, RP.start + 9 * i : RP.start + 9 * i + 9] = K.reshape(-1, 9)
-    out[:, 3:] = _cross(x[:, 9:]) @ out[:, :3]
+    out[:, 3:] = cross_matrix(x[:, 9:]) @ out[:, :3]
     return out
-
-
-def _cross(r: Array) -> Array:
-    out = np.zeros((len(r), 3, 3))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[:, k, j], out[:, j, k] = r[:, i], -r[:, i]
-    return out
-
-
-def _centripetal(r: Array) -> Array:
-    (x, y, z), o = r.T, np.zeros(len(r))
-    rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
-    return np.moveaxis(np.array(rows), -1, 0)

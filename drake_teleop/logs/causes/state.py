@@ -1,4 +1,4 @@
-"""Fitted model of a record, and tests of its residual."""
+"""Fitted model of a record: whitened rows, Gauss-Newton fit, and tests of its residual."""
 
 from __future__ import annotations
 
@@ -6,12 +6,176 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.fit import Fit, fit
-from drake_teleop.logs.causes.instants import ORDER, PRODUCTS, RP, Instants, R
+from drake_teleop.logs.causes.instants import FORCES, ORDER, PRODUCTS, RP, Instants, R
 from drake_teleop.logs.causes.model import Model
-from drake_teleop.logs.causes.rows import Rows, Spans, in_spans
+
+_MIN_NOISE_ROWS = 50
+"""Fewest rows for an autoregression."""
+Spans = tuple[tuple[float, float], ...]
+"""(start, stop) of contacts [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Selected rows (`used`, (M,)) of a record, and columns of its signals, for a model."""
+
+    data: Instants
+    used: NDArray[np.bool_]
+    times: tuple[float, ...]
+    columns: NDArray[np.intp]
+
+    def fits(self, model: Model) -> bool:
+        """Return whether `model` uses the same signals."""
+        return self.times == model.times and np.array_equal(self.columns, model.columns)
+
+    @cached_property
+    def y(self) -> Array:
+        """Signals (M, W), 0 in unused rows."""
+        return self.data.only(self.used).with_steps(self.times)[:, self.columns]
+
+    @cached_property
+    def sums(self) -> Array:
+        """Sums (5, W, W) of products of the signals at lags 0 to 4."""
+        return np.asarray(self.data.sums(self.y, rows=len(self.y))[0])
+
+    @cached_property
+    def whole(self) -> NDArray[np.intp]:
+        """Indices of rows whose four predecessors are used, too."""
+        whole = self.used.copy()
+        whole[:ORDER] = False
+        for d in range(1, ORDER + 1):
+            whole[d:] &= self.used[:-d]
+        return np.flatnonzero(whole)
+
+    @cached_property
+    def _partial(self) -> Array:
+        padded = np.concatenate([self.used, np.zeros(ORDER, bool)])
+        near = padded.copy()
+        for d in range(1, ORDER + 1):
+            near[d:] |= padded[:-d]
+        near[self.whole] = False
+        at = np.flatnonzero(near)[:, None] - np.arange(ORDER + 1)
+        y = np.vstack([self.y, np.zeros((2 * ORDER, self.y.shape[1]))])
+        return np.asarray(y[at])
+
+    def whitened(self, filters: Array) -> Array:
+        """Return sums of products (6, W, W) of the signals after filters (6, 5) per channel."""
+        width = self.y.shape[1]
+        taps = [(filters[:, : ORDER + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
+        full = np.stack(taps, axis=1) @ self.sums.reshape(ORDER + 1, -1)
+        out = full.reshape(6, width, width)
+        edge = np.tensordot(filters, self._partial, axes=(1, 1))
+        return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
+
+    def noise(self, residual: Array, floor: Array, order: int = ORDER) -> tuple[Array, Array]:
+        """Return whitening filters (6, 5) and noise power (6,) for the residual (6, W)."""
+        e = self.y @ residual.T
+        filters = np.zeros((6, ORDER + 1))
+        filters[:, 0] = 1.0
+        history = np.stack([e[self.whole - d] for d in range(ORDER + 1)], axis=2)
+        products = np.einsum("nci,ncj->cij", history, history, optimize=True)
+        products /= max(len(self.whole), 1)
+        if order == 0 or len(self.whole) < _MIN_NOISE_ROWS:
+            return filters, np.maximum(products[:, 0, 0], floor)
+        inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(ORDER)
+        inner += 1e-300 * np.eye(ORDER)
+        filters[:, 1:] = -np.linalg.solve(inner, products[:, 1:, :1])[..., 0]
+        power = products[:, 0, 0] + (filters[:, 1:] * products[:, 0, 1:]).sum(axis=1)
+        return filters, np.maximum(power, floor)
+
+    def rms(self, residual: Array) -> Array:
+        """Return the RMS (6,) of a residual with coefficients (6, W) in the signals."""
+        e = self.y @ residual.T
+        return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
+
+
+def in_spans(data: Instants, spans: Spans) -> NDArray[np.bool_]:
+    """Return (M,) booleans: True for rows within a time span."""
+    inside = np.zeros(len(data.t), bool)
+    for start, stop in spans:
+        inside |= (data.t >= start) & (data.t <= stop)
+    return inside
+
+
+_MAX_ITERATIONS, _CONVERGENCE, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
+_RIDGE, _FLOOR = 1e-11, 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Model with parameters x (size,), fitted to rows of a record.
+
+    Attributes:
+        covariance: (size, size); huge for undetermined parameters.
+        residual: (6, W) coefficients of the residual in the signals y.
+        filters: (6, 5) filters that whiten the residual e: sum over d of filters[c, d] e_c[n - d].
+        power: (6,) variance of the whitened residual.
+    """
+
+    model: Model
+    rows: Rows
+    x: Array
+    covariance: Array
+    residual: Array
+    filters: Array
+    power: Array
+
+    @property
+    def likelihood(self) -> float:
+        """Logarithm of the likelihood up to a constant."""
+        return -0.5 * len(self.rows.whole) * float(np.log(self.power).sum())
+
+    def normal(self, model: Model, x: Array) -> tuple[Array, Array]:
+        """Return Gram matrix and right-hand side of the normal equations at x (size,)."""
+        whitened = self.rows.whitened(self.filters) / self.power[:, None, None]
+        J = model.derivative(x).transpose(1, 0, 2)
+        weighted = J @ whitened
+        gram = (weighted @ J.transpose(0, 2, 1)).sum(axis=0)
+        right = (weighted @ self.residual[:, :, None]).sum(axis=0)[:, 0]
+        return 0.5 * (gram + gram.T), right
+
+
+def fit(
+    model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
+) -> Fit:
+    """Fit a model to rows in at most `steps` iterations, from the parameters `start` (size,)."""
+    x = np.zeros(model.size) if start is None else start
+    count = max(float(rows.used.sum()), 1.0)
+    total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
+    both = total.reshape(2, 3).sum(axis=1).repeat(3)
+    floor = np.maximum(_FLOOR * both, 1e-30)
+    filters = np.zeros((6, ORDER + 1))
+    filters[:, 0] = 1.0
+    found = Fit(model, rows, x, np.zeros(0), model.residual(x), filters, np.maximum(both, floor))
+    for step in range(steps):
+        gram, right = found.normal(model, x)
+        inverse = regularized_inverse(gram)
+        move = inverse @ right
+        move /= max(1.0, float(np.max(np.abs(move) / model.limits)))
+        x = x + move
+        residual = model.residual(x)
+        order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else ORDER
+        filters, power = rows.noise(residual, floor, order)
+        found = Fit(model, rows, x, inverse, residual, filters, power)
+        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGENCE
+        if still and step > _UNWEIGHTED_ITERATIONS:
+            break
+    return found
+
+
+def regularized_inverse(gram: Array) -> Array:
+    """Invert a Gram matrix with a small ridge on its scaled diagonal."""
+    diagonal = np.diag(gram)
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))
+    scaled = gram * np.outer(scale, scale)
+    scaled[np.diag_indices(len(gram))] += _RIDGE
+    values, vectors = np.linalg.eigh(scaled)
+    values = np.maximum(values, _RIDGE)
+    return np.asarray(scale[:, None] * ((vectors / values) @ vectors.T) * scale)
+
 
 _SEGMENTS = 6
 _STIFFNESS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -100,10 +264,16 @@ class State:
     @cached_property
     def smooth_gain(self) -> tuple[float, int]:
         """Gain of twice the log likelihood by generic smooth signals, and their number."""
-        columns = self.data.y[:, self._smooth()]
-        if self.data.positions:
-            columns = np.hstack([columns, self.data.y[:, RP] @ _springs().T])
-        columns = np.hstack([columns, self._segments()])
+        y = self.data.y
+        part = np.linspace(0.0, _SEGMENTS, len(y), endpoint=False).astype(int)
+        columns = np.hstack(
+            [
+                y[:, : PRODUCTS.stop],
+                y[:, R] if self.data.gravity_W is not None else y[:, :0],
+                y[:, RP] @ _springs().T if self.data.positions else y[:, :0],
+                part[:, None] == np.arange(1.0, _SEGMENTS),
+            ]
+        )
         e = self.rows.y @ self.fit.residual.T
         whole, filters = self.rows.whole, self.fit.filters
         gain, freedom = 0.0, 0
@@ -114,14 +284,6 @@ class State:
             solved, rank = gain_of(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
         return gain, freedom
-
-    def _smooth(self) -> list[int]:
-        used = list(range(PRODUCTS.stop))
-        return used + list(range(R.start, R.stop)) if self.data.gravity_W is not None else used
-
-    def _segments(self) -> Array:
-        part = np.linspace(0.0, _SEGMENTS, len(self.data.t), endpoint=False).astype(int)
-        return np.asarray(part[:, None] == np.arange(1, _SEGMENTS), float)
 
     def score(self, model: Model) -> float:
         """Return the first-order gain of twice the log likelihood by fitting a larger model."""

@@ -15,8 +15,15 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check.against_load import against_load, drift_finding, payload_finding
-from drake_teleop.logs.check.channels import channel_findings
+from drake_teleop.logs.check.against_load import (
+    GOOD_SHARE,
+    LoadFit,
+    against_load,
+    drift_finding,
+    load_fit,
+    payload_finding,
+    unexplained_share,
+)
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     MOTION_ERRORS,
@@ -24,8 +31,7 @@ from drake_teleop.logs.check.corrections import (
     correct_gravity_unit,
 )
 from drake_teleop.logs.check.imu_checks import against_itself, against_pose
-from drake_teleop.logs.check.load_fit import GOOD_SHARE, LoadFit, load_fit, unexplained_share
-from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.check.log_data import LogData, channel_findings
 from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import NO_YAML, Description, load_description
@@ -60,11 +66,7 @@ class Conventions:
 
 
 def check_file(path: Path) -> Conventions:
-    """Check a canonical log or a log description against its data.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be read.
-    """
+    """Check a canonical log or a log description against its data."""
     if path.suffix.lower() in FORMATS:
         table = read_table(path)
         return check_conventions(describe_canonical(path, table), str(path), {path: table})
@@ -163,11 +165,7 @@ def _is_suspicious(log: Log) -> bool:
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Check a description against its data; `tables` are already read tables by path.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be read.
-    """
+    """Check a description against its data; `tables` are already read tables by path."""
     with one_blas_thread():
         found = _check(LogData(description, source, dict(tables or {})), description)
     if Path(source).suffix.lower() not in FORMATS:

@@ -333,15 +333,13 @@ def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
     if _FILL_IN in found.columns or kind in ("force", "torque"):
         return group
     size = np.linalg.norm(np.hstack([table.raw(n, n) for n in found.columns]), axis=1)
-    usual, other = {
-        "specific_force": ("m/s^2", "g" if float(np.nanmedian(size)) < 3 else ""),
-        "angular_velocity": ("rad/s", "deg/s" if float(np.nanmax(size)) > 15 else ""),
-        "rotation_vector": ("rad", "deg" if float(np.nanmax(size)) > 15 else ""),
-        "euler": ("rad", "deg" if float(np.nanmax(size)) > 15 else ""),
-        "position": ("m", "mm" if float(np.nanmax(size)) > 20 else ""),
-    }[kind]
-    group["unit"] = other or usual
-    return group
+    if kind == "specific_force":
+        return group | {"unit": "g" if np.nanmedian(size) < 3 else "m/s^2"}
+    usual, other, limit = {
+        "angular_velocity": ("rad/s", "deg/s", 15),
+        "position": ("m", "mm", 20),
+    }.get(kind, ("rad", "deg", 15))
+    return group | {"unit": other if np.nanmax(size) > limit else usual}
 
 
 def _are_counts(table: Table, columns: list[str]) -> bool:
@@ -357,16 +355,12 @@ def _are_counts(table: Table, columns: list[str]) -> bool:
 def _pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
     if _width(table, found.get("orientation", _NOTHING)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
-    elif "quaternion_xyzw" in found:
-        orientation = {"columns": found["quaternion_xyzw"].columns, "form": "quaternion_xyzw"}
-    elif "matrix" in found:
-        orientation = {"columns": found["matrix"].columns, "form": "matrix"}
-    elif (euler := next((name for name in found if name in _EULER.values()), None)) is not None:
-        orientation = _group(table, "euler", found[euler])
-        orientation |= {"form": "euler", "axes": euler}
-    elif "rotation_vector" in found:
-        orientation = _group(table, "rotation_vector", found["rotation_vector"])
-        orientation["form"] = "rotation_vector"
+    elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
+        orientation = {"columns": found[form].columns, "form": form}
+    elif euler := next((name for name in found if name in _EULER.values()), None):
+        orientation = _group(table, "euler", found[euler]) | {"form": "euler", "axes": euler}
+    elif (name := "rotation_vector") in found:
+        orientation = _group(table, name, found[name]) | {"form": name}
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}

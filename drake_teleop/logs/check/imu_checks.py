@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import permutations, product
-
 import numpy as np
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import rotation_matrices, signed_permutations
+from drake_teleop.logs.check.against_load import GOOD_SHARE, MIN_IMPROVEMENT, VALID_SHARE
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Edit,
@@ -16,13 +15,11 @@ from drake_teleop.logs.check.corrections import (
     pose_edits,
     try_edit,
 )
-from drake_teleop.logs.check.load_fit import GOOD_SHARE, MIN_IMPROVEMENT, VALID_SHARE
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description, Imu
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
-from drake_teleop.logs.read.rotations import rotation_matrices
 
 DEGREE_RATIOS = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
@@ -64,32 +61,28 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
-    rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    given_alpha, derived_alpha = (
-        low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate)
-    )
+    given_alpha, derived_alpha = _angular_accelerations(log)
     sizes = float(np.linalg.norm(given_alpha)), float(np.linalg.norm(derived_alpha))
-    if (
-        min(sizes) == 0.0
-        or float(np.sum(given_alpha * derived_alpha)) < _MIN_CORRELATION * sizes[0] * sizes[1]
+    correlation = float(np.sum(given_alpha * derived_alpha))
+    if min(sizes) == 0.0 or correlation < _MIN_CORRELATION * sizes[0] * sizes[1]:
+        return None
+    ratio, (least, most) = sizes[0] / sizes[1], DEGREE_RATIOS
+    for wrong, quantity, unit, other in (
+        (ratio, "angular_acceleration", "rad/s^2", "deg/s^2"),
+        (1.0 / ratio, "angular_acceleration", "deg/s^2", "rad/s^2"),
+        (1.0 / ratio, "angular_velocity", "rad/s", "deg/s"),
     ):
-        return None
-    ratio = sizes[0] / sizes[1]
-    field, now = "angular_acceleration", imu.angular_acceleration.unit
-    if DEGREE_RATIOS[0] < ratio < DEGREE_RATIOS[1] and now == "rad/s^2":
-        unit = "deg/s^2"
-    elif DEGREE_RATIOS[0] < 1.0 / ratio < DEGREE_RATIOS[1] and now == "deg/s^2":
-        unit = "rad/s^2"
-    elif DEGREE_RATIOS[0] < 1.0 / ratio < DEGREE_RATIOS[1] and imu.angular_velocity.unit == "rad/s":
-        field, unit = "angular_velocity", "deg/s"
-    else:
-        return None
-    finding = Finding(
-        "degrees",
-        f"the angular acceleration is {ratio:.3g} times the derivative of the angular velocity;"
-        f" set imu.{field}.unit: {unit}",
-    )
-    return finding, f"imu.{field}.unit", unit
+        if least < wrong < most and getattr(imu, quantity).unit == unit:
+            text = f"the angular acceleration is {ratio:.3g} times the derivative of the angular"
+            line = f"imu.{quantity}.unit"
+            return Finding("degrees", f"{text} velocity; set {line}: {other}"), line, other
+    return None
+
+
+def _angular_accelerations(log: Log) -> tuple[Array, Array]:
+    rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
+    given = low_pass(log.angular_acceleration, log.dt, _BAND_HZ)
+    return given, low_pass(rate, log.dt, _BAND_HZ)
 
 
 def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
@@ -99,7 +92,7 @@ def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | Non
     if not given > _MIN_MISFIT:
         return None
     best, P = min(
-        ((_gravity_misfit(few, P, gravity), P) for P in _signed_permutations()),
+        ((_gravity_misfit(few, P, gravity), P) for P in signed_permutations()),
         key=lambda entry: entry[0],
     )
     if _MIN_RATIO * best > given:
@@ -123,16 +116,12 @@ def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | Non
 def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     if imu.angular_acceleration is None:
         return None
-    rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    given_alpha, derived_alpha = (
-        low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate)
-    )
+    given_alpha, derived_alpha = _angular_accelerations(log)
     size = float(np.linalg.norm(given_alpha) * np.linalg.norm(derived_alpha)) + 1e-300
     alike = given_alpha.T @ derived_alpha / size
-    best = max(_signed_permutations(), key=lambda P: float(np.sum(alike * P)))
-    if np.sum(alike * best) < _MIN_CORRELATION or np.trace(alike) > _MAX_OWN_SHARE * np.sum(
-        alike * best
-    ):
+    best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
+    largest = np.sum(alike * best)
+    if largest < _MIN_CORRELATION or np.trace(alike) > _MAX_OWN_SHARE * largest:
         return None
     axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
     return Finding(
@@ -141,34 +130,6 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
         f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or take it"
         " out",
     )
-
-
-def _signed_permutations() -> list[Array]:
-    return [
-        np.eye(3)[list(order)] * np.array(signs)[:, None]
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-
-
-@dataclass(frozen=True)
-class MeanGravity:
-    """Length of the mean specific force relative to gravity, and its standard deviation."""
-
-    ratio: float
-    deviation: float
-
-
-def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
-    """Return the length of the mean specific force, rotated by the gyroscope, relative to gravity.
-
-    `gravity` is in [m/s^2]. None for a short record.
-    """
-    forces = _mean_forces(log, np.eye(3))[0]
-    if len(forces) < _MIN_WINDOWS:
-        return None
-    ratios = np.linalg.norm(forces, axis=1) / gravity
-    return MeanGravity(float(np.mean(ratios)), float(np.std(ratios, ddof=1) / np.sqrt(len(ratios))))
 
 
 def _mean_forces(log: Log, P: Array) -> Array:
@@ -200,25 +161,26 @@ def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
 
 
 def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
-    found = mean_gravity(log, gravity)
-    if found is None or not 0.7 < found.ratio < 1.4:
+    forces = _mean_forces(log, np.eye(3))[0]
+    if len(forces) < _MIN_WINDOWS:
         return None
-    off = found.ratio - 1.0
-    if (
-        abs(off) < MIN_GRAVITY_ERROR + 3.0 * found.deviation
-        or abs(off) < _SIGNIFICANT * found.deviation
+    ratios = np.linalg.norm(forces, axis=1) / gravity
+    ratio, deviation = np.mean(ratios), np.std(ratios, ddof=1) / np.sqrt(len(ratios))
+    off = abs(ratio - 1.0)
+    if not 0.7 < ratio < 1.4 or off < max(
+        MIN_GRAVITY_ERROR + 3.0 * deviation, _SIGNIFICANT * deviation
     ):
         return None
     assert imu.specific_force is not None
-    measured_gravity = found.ratio * gravity
-    remedy = f"divide the columns of imu.specific_force by {found.ratio:.4f}, or calibrate them"
+    measured_gravity = ratio * gravity
+    remedy = f"divide the columns of imu.specific_force by {ratio:.4f}, or calibrate them"
     if imu.specific_force.unit != "g" and abs(measured_gravity / 9.80665 - 1.0) < 0.01:
         remedy = f"set gravity: {measured_gravity:.4g}"
     return Finding(
         "gravity",
         f"the accelerometer reads {measured_gravity:.4g} m/s^2 of gravity in the mean,"
-        f" {100 * abs(off):.2g} % (+- {100 * found.deviation:.1g})"
-        f" {'more' if off > 0 else 'less'} than the description says:"
+        f" {100 * off:.2g} % (+- {100 * deviation:.1g})"
+        f" {'more' if ratio > 1 else 'less'} than the description says:"
         f" the mass would be wrong by as much; {remedy}",
     )
 
@@ -260,22 +222,15 @@ def against_pose(
         finding, description = _imu_clock(description, given, data)
         findings.append(finding)
     if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
-        findings.append(
-            Finding(
-                "degrees",
-                f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
-                " set imu.angular_velocity.unit: deg/s",
-            )
-        )
+        text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
+        findings.append(Finding("degrees", f"{text} set imu.angular_velocity.unit: deg/s"))
         description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
     if given.mirrored:
-        findings.append(
-            Finding(
-                "swapped axes",
-                "the axes of the IMU are those of the pose mirrored: two columns are exchanged or"
-                " one has the wrong sign; correct imu.specific_force.columns",
-            )
+        text = (
+            "the axes of the IMU are those of the pose mirrored: two columns are exchanged or one"
+            " has the wrong sign; correct imu.specific_force.columns"
         )
+        findings.append(Finding("swapped axes", text))
     elif given.angle_deg > 10:
         assert description.imu is not None
         old = np.eye(3)
@@ -284,13 +239,9 @@ def against_pose(
         frame = np.array(given.right_angled if given.is_right_angled else given.R_SI) @ old
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
-        findings.append(
-            Finding(
-                kind,
-                f"the IMU is turned by {given.angle_deg:.0f} deg against S; set imu.frame: {shown}"
-                + ("" if given.is_right_angled else " (not a right-angled mounting)"),
-            )
-        )
+        text = f"the IMU is turned by {given.angle_deg:.0f} deg against S; set imu.frame: {shown}"
+        oblique = "" if given.is_right_angled else " (not a right-angled mounting)"
+        findings.append(Finding(kind, text + oblique))
         description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))
     return findings, given, description
 

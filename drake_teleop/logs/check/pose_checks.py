@@ -78,14 +78,12 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     if size < max(_SMALLEST_SHIFT, _SIGNIFICANT * deviation):
         return []
     place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
-    return [
-        Finding(
-            "pose frame",
-            f"the pose's origin is {1e3 * size:.0f} mm (+- {1e3 * deviation:.2g}) from the"
-            f" accelerometer; if imu.position is right, set pose.position_in_sensor:"
-            f" {place.tolist()}, otherwise set imu.position: {(0.0 - place).tolist()}",
-        )
-    ]
+    text = (
+        f"the pose's origin is {1e3 * size:.0f} mm (+- {1e3 * deviation:.2g}) from the"
+        f" accelerometer; if imu.position is right, set pose.position_in_sensor:"
+        f" {place.tolist()}, otherwise set imu.position: {(0.0 - place).tolist()}"
+    )
+    return [Finding("pose frame", text)]
 
 
 def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:

@@ -40,9 +40,9 @@ from drake_teleop.logs.dataset.dataset_files import (
     write_copy,
 )
 from drake_teleop.logs.dataset.episode_faults import Finding, name_faults, saturated_channels
-from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
     CALM_WIDTH,
+    EpisodeSignals,
     Hypothesis,
     calm_half,
     find_hypothesis,
@@ -97,9 +97,6 @@ def dataset_command(
         identify: identify the load from the episodes instead.
         description: log description whose `file` is omitted or one of the episodes.
         jobs: number of processes as in joblib.
-
-    Raises:
-        DrakeTeleopError: for an unusable dataset, load or description.
     """
     if (load is None) != identify:
         raise DrakeTeleopError(
@@ -139,7 +136,7 @@ def _streams(dataset: Dataset, description: Path | None) -> dict[str, Any]:
     data = read_yaml(description)
     if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
         raise DrakeTeleopError(
-            "has no wrench", where=str(description), remedy="see docs/logs.md for an example"
+            "has no wrench", where=str(description), remedy="see docs/log-description.md"
         )
     for name in _STREAMS:
         if isinstance(data.get(name), dict):

@@ -83,11 +83,7 @@ def _expanded(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Return the episodes of a dataset.
-
-    Raises:
-        DrakeTeleopError: for a folder or file that is no dataset.
-    """
+    """Return the episodes of a dataset."""
     if not path.exists():
         raise DrakeTeleopError("no such file or folder", where=str(path), remedy="check the path")
     with wrap_read_errors(path, "check that the dataset is complete"):

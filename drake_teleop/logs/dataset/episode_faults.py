@@ -9,20 +9,11 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.dataset.episode_verdict import Hypothesis
 from drake_teleop.logs.read.canonical import WRENCH
-from drake_teleop.logs.read.description import UNITS
+from drake_teleop.logs.read.description_fields import FORCE_UNITS, TORQUE_UNITS, UNITS
 
-_FORCE_UNITS = ("mN", "kN", "daN", "gf", "kgf", "ozf", "lbf")
-_TORQUE_UNITS = (
-    "mN m",
-    "kN m",
-    "daN m",
-    "N cm",
-    "gf cm",
-    "kgf cm",
-    "kgf m",
-    "ozf in",
-    "lbf in",
-    "lbf ft",
+_UNITS = (
+    ("force", "N", set(FORCE_UNITS) - {"N"}),
+    ("torque", "N m", set(TORQUE_UNITS) - {"N m", "N mm"}),  # N mm equals mN m
 )
 _UNIT_TOLERANCE, _SMALLEST_GAIN = 0.04, 0.06
 _SMALLEST_TURN_DEG = 4.0
@@ -89,8 +80,7 @@ def _turn_findings(M: Array, what: str) -> list[Finding]:
 
 def _unit_findings(gain: Array) -> list[Finding]:
     found = []
-    units = (("force", "N", _FORCE_UNITS), ("torque", "N m", _TORQUE_UNITS))
-    for factor, (what, si, names) in zip(gain, units, strict=True):
+    for factor, (what, si, names) in zip(gain, _UNITS, strict=True):
         if abs(factor - 1.0) < _SMALLEST_GAIN:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * UNITS[name])))

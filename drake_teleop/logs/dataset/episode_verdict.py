@@ -8,14 +8,19 @@ the frames, so that contact has no influence.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array
+from drake_teleop.common.numeric import Array, narrowest_half
+from drake_teleop.common.rotations import rotation_matrices, signed_permutations
+from drake_teleop.load.regressor import non_contact_wrench, regressor
+from drake_teleop.logs.pose_motion.splines import PoseSplines
+from drake_teleop.logs.read.canonical import Log
 
 STEPS = 8
 """Steps of the lag per frame."""
@@ -24,13 +29,7 @@ KINDS = ("sensor", "weight removed", "base")
 """Wrenches of the load: in S; without its weight; in the axes of the base."""
 CALM_WIDTH = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
-_SIGNED_PERMUTATIONS = np.array(
-    [
-        np.array(signs)[:, None] * np.eye(3)[list(order)]
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
-    ]
-)
+_SIGNED_PERMUTATIONS = np.array(signed_permutations())
 _FORCE, _TORQUE = slice(0, 3), slice(3, 6)
 _KEPT_SHARE, _ITERATIONS = 0.6, 4
 _COST, _COST_FRAMES = 0.25, 40.0  # required reduction of the log spread, for each deviation
@@ -89,12 +88,8 @@ def as_described(lag: float) -> Hypothesis:
 
 def calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
     """Return log half widths (6,) of the narrowest half of residuals (N, 6), and its centres."""
-    ordered = np.sort(residual, axis=0)
-    half = len(ordered) // 2
-    widths = ordered[half:] - ordered[: len(ordered) - half]
-    start, channels = np.argmin(widths, axis=0), np.arange(residual.shape[1])
-    centres = 0.5 * (ordered[start, channels] + ordered[start + half, channels])
-    return np.log(np.maximum(0.5 * widths[start, channels], floor)), centres
+    widths, centres = narrowest_half(residual)
+    return np.log(np.maximum(0.5 * widths, floor)), centres
 
 
 def find_hypothesis(
@@ -163,7 +158,8 @@ class Search:
             start = self.concentrate(plain, det=det, scale=True)
             yield start
             yield self.concentrate(replace(start, gain=one), det=det, scale=False)
-            for M in (np.eye(3), -np.eye(3), _nearest_permutation(start.force)):
+            nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force).sum()))
+            for M in (np.eye(3), -np.eye(3), nearest):
                 yield self.concentrate(replace(start, force=M, torque=M), det=0.0, scale=True)
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
@@ -286,10 +282,6 @@ def _gains(w: Array, p: Array, x: Hypothesis) -> Array:
     return np.maximum(gains, 1e-9)
 
 
-def _nearest_permutation(M: Array) -> Array:
-    return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmax((_SIGNED_PERMUTATIONS * M).sum((1, 2))))])
-
-
 def _deviations(x: Hypothesis, usual_lag: float) -> float:
     """Return the number of deviations from the usual description, weighted by their freedom."""
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
@@ -335,3 +327,73 @@ def offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | No
         if sharp and full and large and gain >= fewest // 2 and (best is None or gain > best[0]):
             best = gain, int(k), before, after
     return None if best is None else best[1:]
+
+
+_MARGIN = 2 * MAX_LAG_FRAMES  # frames at both ends of the finely sampled motion
+
+
+class Motion(NamedTuple):
+    """Motion of S: specific force, angular velocity and acceleration, gravity and R_WS."""
+
+    s: Array
+    omega: Array
+    alpha: Array
+    gravity: Array
+    R_WS: Array
+
+
+class EpisodeSignals:
+    """Wrench of one episode and its motion.
+
+    Args:
+        log: with orientation; not low-passed.
+        spacing: knot distance of the splines of the poses [frames].
+    """
+
+    def __init__(self, log: Log, spacing: float) -> None:
+        self.log = log
+        self._splines = None
+        if log.posed is not None:
+            poses = log.posed.poses
+            self._splines = PoseSplines(poses, spacing / poses.rate)
+        grid = np.arange(-_MARGIN * STEPS, (len(log) + _MARGIN) * STEPS) / STEPS
+        self._fine = self.motion(log.t[0] + grid * log.dt)
+
+    def motion(self, t: Array) -> Motion:
+        """Return the motion at times t (N,) [s]."""
+        log = self.log
+        if self._splines is None or log.posed is None:
+            assert log.gravity is not None and log.R_WS is not None
+            signals = (*log.motion, log.gravity, log.R_WS.reshape(-1, 9))
+            at = (np.array([np.interp(t, log.t, x) for x in y.T]).T for y in signals)
+            s, omega, alpha, gravity, R = at
+            return Motion(s, omega, alpha, gravity, R.reshape(-1, 3, 3))
+        g = log.posed.gravity_W
+        R = rotation_matrices(self._splines.quaternion(t), "quaternion_wxyz")
+        return Motion(*self._splines.motion(t, g), self._splines.gravity(t, g), R)
+
+    def delayed(self, lag: float) -> Motion:
+        """Return the motion (N, ...) at the frames, `lag` frames later."""
+        step = round((lag + _MARGIN) * STEPS)
+        if abs(step - (lag + _MARGIN) * STEPS) < 1e-6 and abs(lag) < _MARGIN:
+            rows = slice(step, step + STEPS * len(self.log), STEPS)
+            return Motion(*(x[rows] for x in self._fine))
+        return self.motion(self.log.t + lag * self.log.dt)
+
+    def regress(self, lag: float) -> Array:
+        """Return the regressor V (N, 6, 10), with the motion `lag` frames later."""
+        return regressor(*self.delayed(lag)[:3])
+
+    def predictor(self, phi: Array) -> Predict:
+        """Return reading and wrench of a load phi (10,) as a function of kind and lag [frames]."""
+
+        @cache
+        def predict(kind: str, lag: float) -> tuple[Array, Array]:
+            at = self.delayed(lag)
+            s = at.s + at.gravity if kind == "weight removed" else at.s
+            wrench = self.log.wrench
+            if kind == "base":
+                wrench = (wrench.reshape(-1, 2, 3) @ at.R_WS).reshape(-1, 6)
+            return wrench, non_contact_wrench(s, at.omega, at.alpha, phi)
+
+        return predict

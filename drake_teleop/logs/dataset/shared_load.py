@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
-from drake_teleop.load.contact.detection import RARE
-from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
-from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.contact.detection import RARE, fit_noise_floor
+from drake_teleop.load.contact.noise_floor import NoiseFloor, Samples, finite_covariance
 from drake_teleop.load.identification import Identification, worth_stating
-from drake_teleop.logs.contact import Samples
-from drake_teleop.logs.dataset.episode_signals import EpisodeSignals
 from drake_teleop.logs.dataset.episode_verdict import (
     CALM_WIDTH,
     STEPS,
+    EpisodeSignals,
     Hypothesis,
     Search,
     as_described,
@@ -62,9 +60,6 @@ def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     """Return the load of a dataset from some of its episodes, or the given load.
 
     Episodes with another load or wrong axes, and contact, have no influence if they are few.
-
-    Raises:
-        DrakeTeleopError: if no load of positive mass explains the episodes.
     """
     spacing = _best_spacing(logs)
     episodes = [EpisodeSignals(log, spacing) for log in logs]

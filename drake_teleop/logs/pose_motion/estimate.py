@@ -11,30 +11,32 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, checked, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
 from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
     Spectra,
     Window,
+    at_rate,
     averaged_splines,
     choose_spacing,
+    clock_rate,
     delay_deviation,
     fit_levels,
     fit_linear_model,
     guess_spacing,
 )
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     LEVER,
     LOAD,
     PARAMETERS,
     TURN,
+    ReadOff,
     RigidFit,
     State,
     fit_rigid,
+    read_off,
 )
 from drake_teleop.logs.pose_motion.spectra import (
     MAX_FREQUENCY_HZ,
@@ -155,7 +157,6 @@ def estimate_from_poses(
     p_SoPo_S: ArrayLike | None = (0.0, 0.0, 0.0),
     R_SP: ArrayLike | None = _IDENTITY,
     delay: float | None = None,
-    near: float = 0.0,
     gain: float = 0.0,
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
@@ -170,20 +171,16 @@ def estimate_from_poses(
         p_SoPo_S: (3,) origin of P [m], or None to estimate it.
         R_SP: (3, 3) rotation of P, or None to estimate it.
         delay: delay of the poses behind the wrench [s], or None to estimate it.
-        near: centre of the searched delays [s].
         gain: standard deviation of the sensor gains, such as 0.01.
         lost: (N,) True for excluded samples.
         imu: IMU data of S, used if they lower the cost.
-
-    Raises:
-        DrakeTeleopError: for wrong shapes, or if fewer than 100 instants remain.
     """
     with one_blas_thread():
-        found = _find_motion(
-            *(t, wrench, poses, gravity_W, near, delay, lost, imu), fewest=_MIN_INSTANTS
+        found, _, window = _find_motion(
+            *(t, wrench, poses, gravity_W, delay, lost, imu), fewest=_MIN_INSTANTS
         )
-        splines, late, grid = found.splines, found.last.delay, found.window.grid
-        window = replace(found.window, taper=_base_taper(grid, splines.poses, lost, late))
+        splines, late, grid = found.splines, found.delay_s, window.grid
+        window = replace(window, taper=_base_taper(grid, splines.poses, lost, late))
         spectra = window.spectra(splines, late)
         rejected, note = find_disturbances(spectra, splines.spacing)
         window = replace(window, taper=exclude(window.taper, rejected, grid.dt))
@@ -209,8 +206,8 @@ def estimate_from_poses(
             splines=splines,
             delay_s=spectra.delay + fit.state.tau,
             delay_deviation=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
-            clock_rate=found.rate,
-            imu_agrees=found.agrees,
+            clock_rate=found.clock_rate,
+            imu_agrees=found.imu_agrees,
             fit=fit,
             frame=_estimate_frame(free, start),
             free=free,
@@ -235,32 +232,15 @@ def motion_of_load(
     """Return the motion from poses of S with which an identified load fits a wrench best.
 
     `load` (6, 16) is from `load_coefficients`; other arguments as for `estimate_from_poses`.
-
-    Raises:
-        DrakeTeleopError: for wrong shapes, or if fewer than 32 instants remain.
     """
     with one_blas_thread():
-        found = _find_motion(
-            *(t, wrench, poses, gravity_W, 0.0, delay, lost, imu),
+        motion, last, _ = _find_motion(
+            *(t, wrench, poses, gravity_W, delay, lost, imu),
             fewest=_MIN_INSTANTS_OF_LOAD,
             load=load,
         )
-        return PoseMotion(
-            splines=found.splines,
-            delay_s=found.last.delay,
-            delay_deviation=0.0 if delay is not None else delay_deviation(found.last),
-            clock_rate=found.rate,
-            imu_agrees=found.agrees,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _FoundMotion:
-    splines: PoseSplines
-    last: Spectra
-    window: Window
-    rate: float
-    agrees: bool
+        known = delay is not None
+        return replace(motion, delay_deviation=0.0 if known else delay_deviation(last))
 
 
 def _find_motion(
@@ -268,19 +248,18 @@ def _find_motion(
     wrench: ArrayLike,
     poses: Poses,
     gravity_W: ArrayLike,
-    near: float,
     delay: float | None,
     lost: NDArray[np.bool_] | None,
     imu: Inertial | None,
     *,
     fewest: int,
     load: Array | None = None,
-) -> _FoundMotion:
+) -> tuple[PoseMotion, Spectra, Window]:
     t = checked("t", t, np.size(t))
     wrench = checked("wrench", wrench, len(t), 6)
     gravity = checked("gravity_W", gravity_W, 3)
     grid, poses = Grid.of(t, wrench, load), poses.continued()
-    known, guess = delay is not None, near if delay is None else delay
+    known, guess = delay is not None, delay or 0.0
     taper = _base_taper(grid, poses, lost, guess)
     if (taper > 0.5).sum() < fewest:
         raise DrakeTeleopError(
@@ -311,7 +290,8 @@ def _find_motion(
     if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
         imu_rows = compare_imu(PoseSplines(poses, imu_spacing), imu, gravity)
     last = part.spectra(chosen.at(spacing), late)
-    return _FoundMotion(PoseSplines(poses, spacing, imu_rows), last, whole, rate, agrees)
+    splines = PoseSplines(poses, spacing, imu_rows)
+    return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
 
 
 def _poses_near(poses: Poses, grid: Grid) -> Poses:

@@ -56,20 +56,13 @@ def compare_imu(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> ImuRow
         None if sensor is None or y is None else sensor.corrected(y[inside])
         for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
     )
-    imu_powers = [0.0 if sensor is None else sensor.power for sensor in sensors]
-    imu_rows = None
-    for _ in range(2):  # repeat with the orientation of poses and IMU
-        imu_rows = ImuRows.of(
-            PoseSplines(splines.poses, splines.spacing, imu_rows),
-            t[inside],
-            gravity_W,
-            s,
-            omega,
-            rate=rows.rate,
-            pose_powers=(powers[0], powers[1]),
-            own_powers=(imu_powers[0], imu_powers[1]),
-        )
-    return imu_rows
+    own = [0.0 if sensor is None else sensor.power for sensor in sensors]
+    imu_rows = ImuRows(t[inside], rows.rate, (powers[0], powers[1]), (own[0], own[1]))
+    imu_rows = imu_rows.oriented(
+        PoseSplines(splines.poses, splines.spacing), gravity_W, s, omega
+    )  # then by poses and IMU together
+    both = PoseSplines(splines.poses, splines.spacing, imu_rows)
+    return imu_rows.oriented(both, gravity_W, s, omega)
 
 
 def _fit_sensor(

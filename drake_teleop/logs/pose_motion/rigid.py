@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.batch.covariance import ARM, gain_effects
-from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.load.batch.uncertainty import ARM, gain_effects
+from drake_teleop.load.moments import centripetal_matrix, coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH, Levels
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
@@ -88,15 +88,10 @@ def motion_map(R: Array, r: Array) -> Array:
     M[1:7, SIGNALS:] = np.eye(6)
     M[7:10, 1:4] = M[7:10, 4:7] = R.T
     M[7:10, 7:10] = -R.T @ cross_matrix(r)
-    M[7:10, 10:16] = R.T @ _centripetal(r)
+    M[7:10, 10:16] = R.T @ centripetal_matrix(r)
     M[10:13, 7:10] = R.T
     M[13:19, 10:16] = _rotated_products(R)
     return M
-
-
-def _centripetal(r: Array) -> Array:
-    x, y, z = r
-    return np.array([[0.0, -x, -x, y, z, 0.0], [-y, 0.0, -y, x, 0.0, z], [-z, -z, 0.0, 0.0, x, y]])
 
 
 _PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -343,3 +338,61 @@ def _apply_step(state: State, step: Array) -> State:
 
 def _rotate(R: Array, rho: Array) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())
+
+
+_ITERATIONS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class ReadOff:
+    """Units, axes and masses that the free coefficients of a linear model of the wrench imply.
+
+    Attributes:
+        kappa: unit error of position; 1e-3 for mm described as m.
+        kappa_deviation: its standard deviation; inf if undetermined.
+        deviation: largest standard deviation of M_g (3, 3), force over minus gravity [kg].
+        R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
+        masses: (3,) singular values of M_g [kg].
+    """
+
+    kappa: float
+    kappa_deviation: float
+    deviation: float
+    R_SP: Array
+    masses: Array
+
+    @property
+    def usable(self) -> bool:
+        """Whether M_g is known to 5 % of the mass."""
+        return bool(self.deviation < 0.05 * self.masses.mean())
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the axes of wrench and poses are mirror images."""
+        return bool(np.linalg.det(self.R_SP) < 0.0)
+
+
+def read_off(fit: LinearFit) -> ReadOff:
+    """Return units, axes and masses that a fitted linear model implies."""
+    C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
+    M_a, M_g = C[:3, 1:4], C[:3, 4:7]
+    kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
+    determined = bool((variances[:3, 4:7] > 0.0).all())
+    U, masses, Vt = np.linalg.svd(M_g)
+    largest = float(np.sqrt(variances[:3, 4:7].max())) if determined else np.inf
+    return ReadOff(kappa, deviation, largest, U @ Vt, masses)
+
+
+def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[float, float]:
+    known = (variances_a > 0.0) & (variances_g > 0.0)
+    if not known.any():
+        return np.nan, np.inf
+    a, g, v_a, v_g = (x[known] for x in (a, g, variances_a, variances_g))
+    kappa = 0.0
+    for _ in range(_ITERATIONS):
+        weight = 1.0 / (v_a + kappa**2 * v_g)
+        information = float(weight @ np.maximum(g * g - v_g, 0.0))
+        if not information > 0.0:  # gravity is not observable
+            return np.nan, np.inf
+        kappa = float(weight @ (a * g)) / information
+    return kappa, information**-0.5

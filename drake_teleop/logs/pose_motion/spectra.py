@@ -228,7 +228,7 @@ class Levels:
 
         `used` (bands, 6) are degrees of freedom that parameters use.
         """
-        remaining = self._numbers
+        remaining = self.grouped(self.sizes)[:, None]
         if used is not None:
             remaining = np.maximum(
                 remaining - 0.5 * self.grouped(used), _MIN_REMAINING_SHARE * remaining
@@ -243,10 +243,6 @@ class Levels:
     @cached_property
     def _starts(self) -> NDArray[np.intp]:
         return np.flatnonzero(np.diff(self.group, prepend=-1))
-
-    @cached_property
-    def _numbers(self) -> Array:
-        return self.grouped(self.sizes)[:, None]
 
     def costs(self, power: Array) -> Array:
         """Return negative log likelihoods (..., 6) of noise powers (..., bands, 6), Eq. (T75)."""

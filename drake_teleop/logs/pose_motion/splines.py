@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -38,26 +38,16 @@ class ImuRows:
 
     t: Array
     rate: float
-    acceleration_W: Array | None
-    quaternion_rate: Array | None
     pose_powers: tuple[float, float]
     own_powers: tuple[float, float]
+    acceleration_W: Array | None = None
+    quaternion_rate: Array | None = None
 
-    @classmethod
-    def of(
-        cls,
-        splines: PoseSplines,
-        t: Array,
-        gravity_W: Array,
-        s: Array | None,
-        omega: Array | None,
-        *,
-        rate: float,
-        pose_powers: tuple[float, float],
-        own_powers: tuple[float, float],
+    def oriented(
+        self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuRows:
-        """Return IMU data from specific force s and omega (K, 3) in S, oriented by `splines`."""
-        q = splines.quaternion(t)
+        """Return the rows of specific force s and omega (K, 3) in S, oriented by `splines`."""
+        q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
         if s is not None:
@@ -66,7 +56,7 @@ class ImuRows:
             w, v = q[:, :1], q[:, 1:]
             real = -np.sum(v * omega, axis=1, keepdims=True)
             rates = 0.5 * np.hstack([real, w * omega + _cross(v, omega)])
-        return cls(t, rate, acceleration, rates, pose_powers, own_powers)
+        return replace(self, acceleration_W=acceleration, quaternion_rate=rates)
 
     def share(self, frequency: Array) -> tuple[Array, Array]:
         """Return the shares (K,) of position and rotation noise that remain, Eq. (T83)."""

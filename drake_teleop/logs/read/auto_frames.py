@@ -1,18 +1,22 @@
-"""Estimates for `auto` in the frames of IMU and pose of a log description."""
+"""Estimates for `auto` in a log description: frames of IMU and pose, direction of gravity."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.logs.causes.explain import explain
+from drake_teleop.logs.causes.instants import Instants, free_delay, instants
+from drake_teleop.logs.read.alignment import resample, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
-from drake_teleop.logs.read.mounting import Mounting, find_mounting
+from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
+from drake_teleop.logs.read.mounting import LeverArm, Mounting, find_mounting, lever_arm_from_wrench
 
 MAX_LAG_S = 0.05
 """Lag between the clocks of IMU and pose that causes a warning [s]."""
@@ -21,11 +25,7 @@ MAX_LAG_S = 0.05
 def describe_mounting(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """Return the description with estimates for `auto` in the IMU's frame and position, and notes.
-
-    Raises:
-        DrakeTeleopError: if the data do not determine a value.
-    """
+    """Return the description with estimates for `auto` in the IMU's mounting, and notes."""
     imu = description.imu
     assert imu is not None
 
@@ -142,11 +142,7 @@ def _format_mm(lever: LeverArm) -> str:
 def describe_pose_frame(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """Return the description with estimates for `auto` in the pose frame, and notes.
-
-    Raises:
-        DrakeTeleopError: if the data do not determine a value.
-    """
+    """Return the description with estimates for `auto` in the pose frame, and notes."""
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 
     pose = description.pose
@@ -200,3 +196,63 @@ def _result_note(name: str, value: Any, deviation: str) -> str:
         f"pose.{name} found, standard deviation {deviation}; write it into the description as"
         f" pose.{name}: {written}"
     )
+
+
+def log_instants(log: Log) -> Instants:
+    """Return block means of a log's wrench and motion."""
+    gravity = None
+    motion: tuple[Array, ...] = log.motion
+    if log.R_WS is not None and log.gravity_W is not None:
+        gravity, motion = log.gravity_W, (*log.motion, log.R_WS)
+    return instants(log.t, log.wrench, motion, gravity, log.bridged)
+
+
+def weight_wrench(weight: Array, gravity: Array) -> Array:
+    """Return the wrench (N, 6) of a weight [m, m c] at rest, for gravity (N, 3) in S, Eq. (1)."""
+    return np.hstack([-weight[0] * gravity, np.cross(weight[1:], -gravity)])
+
+
+def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
+    """Return the log with the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] added.
+
+    `motion_log` is the same log with motion, from which the delay is estimated and removed.
+    """
+    assert motion_log.gravity is not None
+    at = np.clip(log.t + free_delay(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1])
+    return replace(
+        log,
+        wrench=log.wrench + weight_wrench(weight, resample(at, motion_log.t, motion_log.gravity)),
+    )
+
+
+_MAX_DEVIATION_DEG = 2.0
+
+
+def describe_gravity(
+    description: Description, source: str, read: Callable[[Description], Log]
+) -> tuple[Description, tuple[str, ...]]:
+    """Return the description with an estimate for `gravity: auto`, and notes."""
+    start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
+    log, deviation = read(start), np.inf
+    explanation = explain(
+        log_instants(log), lambda delay_s: log_instants(undelayed(log, delay_s)), ("gravity",)
+    )
+    if explanation.theta[6] > 0.0:
+        change, covariance = explanation.state.extension("gravity")
+        estimated = description.gravity_W - change
+        estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
+        across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
+        spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
+        deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
+    if not deviation < _MAX_DEVIATION_DEG:
+        raise DrakeTeleopError(
+            "the data do not determine the direction of gravity",
+            where=f"{source}:gravity",
+            remedy="record the load in more orientations, touching nothing; or give the vector",
+        )
+    gravity = tuple((np.round(estimated, 4) + 0.0).tolist())
+    note = (
+        f"gravity found, standard deviation {deviation:.2g} deg; write it into the description as"
+        f" gravity: {list(gravity)}"
+    )
+    return description.model_copy(update={"gravity": gravity}), (note,)

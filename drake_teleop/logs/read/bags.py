@@ -39,25 +39,14 @@ _TOO_LARGE, _CUT_REMEDY = (
     "its uncompressed size is too large",
     "cut it, or write the topics one by one",
 )
-_GROUP_NAMES = {
-    "force": "force",
-    "torque": "torque",
-    "linear_acceleration": "linear_acceleration",
-    "angular_velocity": "angular_velocity",
-    "orientation": "orientation",
-    "rotation": "orientation",
-    "position": "position",
-    "translation": "position",
-}
+_GROUPS = ("force", "torque", "linear_acceleration", "angular_velocity", "orientation", "position")
+_GROUP_NAMES = {name: name for name in _GROUPS}
+_GROUP_NAMES |= {"rotation": "orientation", "translation": "position"}
 _STREAM_TYPES = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
     "pose": (
-        "PoseStamped",
-        "PoseWithCovarianceStamped",
-        "TransformStamped",
-        "Odometry",
-        "Pose",
+        *("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry", "Pose"),
         "TFMessage",
     ),
 }
@@ -80,11 +69,7 @@ def is_bag(path: Path) -> bool:
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """Return the topics of a bag, sorted by name.
-
-    Raises:
-        DrakeTeleopError: if it cannot be read.
-    """
+    """Return the topics of a bag, sorted by name."""
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
@@ -96,11 +81,7 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
-    """Return the messages of a topic as a table, for TF of one child frame.
-
-    Raises:
-        DrakeTeleopError: if bag, topic or child frame are missing, or the child frame is ambiguous.
-    """
+    """Return the messages of a topic as a table, for TF of one child frame."""
     with _open_bag(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
         if not connections:
@@ -113,7 +94,8 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         pairs = (
             (received, part)
             for connection, received, raw in reader.messages(connections)
-            for part in _split_transforms(reader.deserialize(raw, connection.msgtype))
+            for message in [reader.deserialize(raw, connection.msgtype)]
+            for part in getattr(message, "transforms", [message])
         )
         blocks = _read_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
@@ -130,11 +112,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """Return the table of a stream of a description: its file, or its topic of a bag.
-
-    Raises:
-        DrakeTeleopError: for an unreadable file, or a bag without a topic.
-    """
+    """Return the table of a stream of a description: its file, or its topic of a bag."""
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):
@@ -238,10 +216,6 @@ def _limit_memory() -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def _split_transforms(message: Any) -> list[Any]:
-    return getattr(message, "transforms", [message])
 
 
 def _read_blocks(

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_table
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.clocks import MIN_RATE_HZ
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.logs.read.tables import Table
 
 WRENCH = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
@@ -140,11 +140,7 @@ class Log:
 
 
 def write_log(log: Log, path: str | Path) -> None:
-    """Write a log as a canonical table.
-
-    Raises:
-        DrakeTeleopError: unless the path ends in .csv or .parquet.
-    """
+    """Write a log as a canonical table."""
     import polars as pl
 
     path = Path(path)
@@ -161,13 +157,10 @@ def write_log(log: Log, path: str | Path) -> None:
 
 
 def describe_canonical(path: Path, table: Table) -> Description:
-    """Return the description of a canonical table (columns `t`, `f_x` ... of docs/logs.md).
+    """Return the description of a canonical table (columns `t`, `f_x` ...).
 
     Rows are static poses if `t` is absent, or if they are slower than 5 Hz and gravity turns by
     more than 10 deg in a fifth of the steps.
-
-    Raises:
-        DrakeTeleopError: if wrench or motion is absent.
     """
 
     def present(names: Sequence[str]) -> bool:
@@ -180,7 +173,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
         raise DrakeTeleopError(
             "is not a canonical log: it has none of the columns t, f_x ... tau_z",
             where=str(path),
-            remedy="describe it in a YAML file (docs/logs.md); `drake-teleop inspect` drafts one",
+            remedy="describe it in a YAML file; `drake-teleop inspect` drafts one",
         )
     table.numbers(WRENCH, 6, str(path))
     fields: dict[str, dict[str, Any]] = {

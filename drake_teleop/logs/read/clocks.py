@@ -67,9 +67,6 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     """Return checked and corrected times of a stream's rows (see module `clocks`).
 
     A row is repeated if it equals the previous row in all `columns`.
-
-    Raises:
-        DrakeTeleopError: for stamps that decrease or are too uneven, or an implausible rate.
     """
     if time.column is None:
         assert time.rate is not None

@@ -43,7 +43,8 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     if (text := _normalize(path, source, head)) is not None:
         source, head = text, text[:_HEAD_BYTES]
     lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
-    before = _count_comment_lines(lines)
+    table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
+    before = next(table, 0)
     rest = lines[before:]
     separator = _find_separator(rest[0]) if rest else ","
     if separator == " " and any(line != " ".join(line.split()) for line in rest):
@@ -58,7 +59,8 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         source,
         has_header=header,
         separator=separator,
-        decimal_comma=separator in ";\t" and _has_decimal_commas(rest, separator),
+        decimal_comma=separator in ";\t"
+        and any(_DECIMAL_COMMA.fullmatch(cell) for line in rest for cell in line.split(separator)),
         skip_lines=before,
         try_parse_dates=True,
     )
@@ -99,11 +101,6 @@ def _parse(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
     return parse(infer_schema_length=None)
 
 
-def _count_comment_lines(lines: list[str]) -> int:
-    table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
-    return next(table, 0)
-
-
 def _find_separator(line: str) -> str:
     bare = _QUOTED.sub("", line).strip()
     if ";" in bare or "\t" in bare:
@@ -127,7 +124,3 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _has_decimal_commas(lines: list[str], separator: str) -> bool:
-    return any(_DECIMAL_COMMA.fullmatch(cell) for line in lines for cell in line.split(separator))

@@ -1,4 +1,4 @@
-"""Log descriptions: YAML files that specify files, columns, units and frames (docs/logs.md).
+"""Log descriptions: YAML files of files, columns, units and frames (docs/log-description.md).
 
 A number x of a file becomes a quantity in S by
 
@@ -21,6 +21,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.rotations import EULER_AXES
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
@@ -43,9 +44,8 @@ from drake_teleop.logs.read.description_fields import (
     Torque,
     Weight,
 )
-from drake_teleop.logs.read.rotations import EULER_AXES
 
-NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
+NO_YAML = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
 
 
@@ -357,18 +357,14 @@ def json_schema() -> str:
 
 
 def load_description(path: str | Path) -> Description:
-    """Read a log description; its paths are relative to its folder.
-
-    Raises:
-        DrakeTeleopError: naming file and field.
-    """
+    """Read a log description; its paths are relative to its folder."""
     path = Path(path)
     if not os.path.exists(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     data = read_yaml(path)
     if not isinstance(data, dict):
         raise DrakeTeleopError(
-            "holds no fields", where=str(path), remedy="see docs/logs.md for an example"
+            "holds no fields", where=str(path), remedy="see docs/log-description.md"
         )
     try:
         description = Description.model_validate(data)
@@ -394,7 +390,7 @@ def _validation_error(error: ValidationError, path: Path) -> DrakeTeleopError:
     location = [part for part in outer if _is_field(part)]
     location += [last] if unknown or _is_field(last) else []
     where = f"{path}:{'.'.join(map(str, location))}" if location else str(path)
-    remedy = "see docs/logs.md for the fields and their units"
+    remedy = "docs/log-description.md lists fields and units"
     if unknown:
         known = list(_fields_at(location[:-1]))
         near = difflib.get_close_matches(str(location[-1]), known, n=1)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, field_validator
 
-from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
+from drake_teleop.common.rotations import nearest_rotation, rotation_error
 
 ROTATION_TOLERANCE = 0.01
 """Largest deviation of entries of R^T R from the identity."""
@@ -38,17 +38,17 @@ UNITS = {
     "ozf in": 0.007061551814228644,
     "lbf in": 0.1129848290276167,
     "lbf ft": 1.3558179483314004,
-    "m/s^2": 1.0,
     "rad": 1.0,
-    "deg": np.pi / 180,
     "rad/s": 1.0,
-    "deg/s": np.pi / 180,
     "rad/s^2": 1.0,
+    "deg": np.pi / 180,
+    "deg/s": np.pi / 180,
     "deg/s^2": np.pi / 180,
     "m": 1.0,
     "cm": 1e-2,
     "mm": 1e-3,
     "in": 0.0254,
+    "m/s^2": 1.0,
     "mm/s^2": 1e-3,
 }
 """SI value of each unit, except "g", the magnitude of the described gravity."""
@@ -184,19 +184,9 @@ class Torque(_Quantity):
     """Columns of a torque and their unit."""
 
     unit: Literal[
-        "N m",
-        "mN m",
-        "kN m",
-        "daN m",
-        "N cm",
-        "N mm",
-        "gf cm",
-        "kgf cm",
-        "kgf m",
-        "ozf in",
-        "lbf in",
-        "lbf ft",
-    ] = "N m"
+        "N m", "mN m", "kN m", "daN m", "N cm", "N mm",
+        "gf cm", "kgf cm", "kgf m", "ozf in", "lbf in", "lbf ft",
+    ] = "N m"  # fmt: skip
 
 
 class Acceleration(_Quantity):

@@ -1,29 +1,266 @@
-"""Rotation, position and clock of an IMU on the sensor, by comparison with the pose, Eq. (T20).
-
-Without positions only rotation and clock are found.
-"""
+"""Rotation, position and clock of an IMU, from the pose or from a load's wrench, (T20) to (T22)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.alignment import low_passed, resample
-from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.imu_clock import best_shift, clock_drift, signal_pairs
-from drake_teleop.logs.read.jackknife import solve
-from drake_teleop.logs.read.lever_arm import (
-    COMPARED_SAMPLES,
-    CUTOFF_HZ,
-    MAX_UNEXPLAINED,
-    LeverArm,
-    common_times,
-    lever_matrix,
-    observable_axes,
+from drake_teleop.common.numeric import Array, parabola_minimum
+from drake_teleop.common.rotations import right_angled_rotations, rotation_matrices
+from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.regressor import regressor
+from drake_teleop.logs.read.alignment import (
+    estimate_delay,
+    low_pass,
+    low_passed,
+    measured,
+    resample,
+    undelayed,
 )
-from drake_teleop.logs.read.rotations import right_angled_rotations, rotation_matrices
+from drake_teleop.logs.read.canonical import Log
+
+# Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
+_MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
+Pairs = list[tuple[Array, Array]]
+"""Signal of the pose and of the IMU, for each sensor, see `signal_pairs`."""
+
+
+def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
+    """Return pairs of signals (N, 3): of the pose at times `t`, and of the IMU on its own clock."""
+    pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
+    if gyroscope:
+        pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
+    return pairs
+
+
+def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
+    """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
+
+    Any affine map of the IMU's axes is permitted. Effects linear in `arm` (N, k) are removed.
+    """
+    U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
+    U = U[:, singular > 1e-3 * singular[0]]
+
+    def without_arm(x: Array) -> Array:
+        return x - U @ (U.T @ x)
+
+    expected, sensed = [without_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
+
+    def cost(shift: float) -> float:
+        moved = without_arm(resample(t + shift, t_imu, sensed))
+        return sum(
+            _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
+        )
+
+    step = 0.01
+    shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
+    costs = np.array([cost(shift) for shift in shifts])
+    best = int(np.argmin(costs))
+    lag = float(shifts[best])
+    if 0 < best < len(shifts) - 1:
+        lag += step * parabola_minimum(*costs[best - 1 : best + 2])
+    return lag
+
+
+def clock_drift(
+    t: Array, pairs: Pairs, t_imu: Array, lag: float, independent: float
+) -> tuple[float, float]:
+    """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
+
+    `lag` [s] is a constant start, `independent` the number of independent samples. A drift that is
+    insignificant or below 10 ms in total is 0.
+    """
+    tau = t - t.mean()
+    found = np.array([lag, 0.0])
+    start = cost = np.inf
+    for step in range(10):
+        rows, left, cost = [], [], 0.0
+        for y, x in pairs:
+            at = t + found[0] + found[1] * tau
+            moved, h = resample(at, t_imu, x), 0.01
+            rate = (resample(at + h, t_imu, x) - resample(at - h, t_imu, x)) / (2 * h)
+            basis = np.column_stack([np.ones(len(t)), moved])
+            Q = np.linalg.qr(basis)[0]
+            mapped = np.linalg.lstsq(basis, y, rcond=1e-6)[0][1:]
+            # Effects of a small shift that a change of the map cannot reproduce.
+            effects = [rate @ mapped, tau[:, None] * (rate @ mapped)]
+            size = np.sqrt(y.var(axis=0).sum() + 1e-12)
+            rows.append(np.stack([(e - Q @ (Q.T @ e)).ravel() / size for e in effects], axis=1))
+            left.append(((y - y.mean(axis=0)) - (moved - moved.mean(axis=0)) @ mapped) / size)
+            cost += float(left[-1].var(axis=0).sum())
+        if step == 0:
+            start = cost
+        residual = np.concatenate([r.ravel() for r in left])
+        found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
+    gain = independent * np.log(start / (cost + 1e-300))
+    total_drift_s = abs(found[1]) * float(t[-1] - t[0])
+    if gain < _MIN_LIKELIHOOD_RATIO or total_drift_s < _MIN_DRIFT_S:
+        return lag, 0.0
+    return float(found[0]), float(found[1])
+
+
+def _unexplained_share(y: Array, x: Array) -> float:
+    """Return the share of the variance of y (N, 3) that no affine map of x explains."""
+    y, x = y - y.mean(axis=0), x - x.mean(axis=0)
+    both, total = x.T @ y, float((y * y).sum()) + 1e-12 * len(y)
+    explained = (both * (np.linalg.pinv(x.T @ x, rcond=1e-12, hermitian=True) @ both)).sum()
+    return float((y * y).sum() - explained) / total
+
+
+_BLOCKS = 20
+# Directions with smaller singular values, relative to the largest, are undetermined.
+RANK = 1e-5
+_MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
+
+
+def solve(
+    residual: Callable[[Array], Array], x: Array, linear: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the solution x (n,) and its standard deviations (n,); inf if undetermined.
+
+    Args:
+        residual: function of x that returns residuals (N, 3 k).
+        x: start.
+        linear: (N, 3 k, m) constant derivatives by the last m parameters.
+    """
+    linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
+    rows, channels, _ = linear.shape
+    found = _fit(residual, x, linear)
+    found = _fit(residual, found.x, linear)  # with updated weights
+    return found.x, jackknife(found.jac, found.fun, channels * (rows // _BLOCKS))
+
+
+def _fit(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
+    from scipy.optimize import approx_fprime, least_squares
+
+    errors, others = residual(x), len(x) - linear.shape[2]
+    power = errors.reshape(len(errors), -1, 3).var(axis=(0, 2))
+    sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
+    known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
+
+    def weighted(z: Array) -> Array:
+        return (residual(z) / sigma).ravel()
+
+    def derivatives(z: Array) -> Array:
+        found = approx_fprime(z[:others], lambda y: weighted(np.append(y, z[others:])))
+        return np.hstack([found, known])
+
+    return least_squares(weighted, x, jac=derivatives, x_scale="jac", max_nfev=_MAX_EVALUATIONS)
+
+
+def jackknife(jacobian: Array, residual: Array, width: int) -> Array:
+    """Return jackknife standard deviations (n,) of the parameters, for blocks of `width` rows."""
+    size = np.linalg.norm(jacobian, axis=0) + 1e-300
+    _, singular, Vt = np.linalg.svd(jacobian / size, full_matrices=False)
+    known = singular > RANK * singular[0]
+    basis = Vt[known].T
+    J = (jacobian / size) @ basis
+    gram, steps = J.T @ J, []
+    for start in range(0, len(J) - width + 1, width):
+        part, error = J[start : start + width], residual[start : start + width]
+        steps.append(np.linalg.lstsq(gram - part.T @ part, part.T @ error, rcond=1e-12)[0])
+    spread = (np.array(steps) - np.mean(steps, axis=0)) @ basis.T / size
+    deviations = np.sqrt((len(steps) - 1) / len(steps) * np.sum(spread**2, axis=0))
+    unknown = np.linalg.norm(Vt[~known], axis=0) > 1e-3
+    return np.where(unknown, np.inf, deviations)
+
+
+MAX_LEVER_DEVIATION = 0.005
+"""Largest standard deviation of a determined coordinate [m]."""
+MAX_UNEXPLAINED = 0.05
+"""Largest unexplained share of the variance of a valid fit."""
+CUTOFF_HZ = 8.0
+"""Cut-off of the low-pass on all signals [Hz]."""
+COMPARED_SAMPLES = 1500
+"""Number of compared samples."""
+# Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
+_MIN_SIGNAL_RATIO = 20.0
+
+
+@dataclass(frozen=True)
+class LeverArm:
+    """Estimated position of the accelerometer.
+
+    Attributes:
+        p_SoIo_S: (3,) position relative to the described one, in S [m].
+        deviations: (3,) standard deviations [m]; inf if undetermined.
+        source: "pose" or "wrench".
+    """
+
+    p_SoIo_S: Array
+    deviations: Array
+    source: str
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """Booleans (3,): True where the standard deviation is below 5 mm."""
+        return self.deviations < MAX_LEVER_DEVIATION
+
+
+def lever_arm_from_wrench(log: Log) -> LeverArm | None:
+    """Return the position of the accelerometer, fitted with offsets, load and delay, Eq. (T21).
+
+    None for a poor fit (contact), or few samples outside of gaps.
+    """
+    cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
+    delay = estimate_delay(log, None) or 0.0
+    smooth = low_passed(undelayed(log, delay), cutoff)
+    margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
+    t = common_times(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
+    if len(t) < COMPARED_SAMPLES // 10:
+        return None
+    wrench = resample(t, smooth.t, smooth.wrench)
+
+    def residual(x: Array) -> Array:
+        s, omega, alpha = (resample(t + x[3], smooth.t, signal) for signal in smooth.motion)
+        s = s - lever_matrix(omega, alpha) @ x[:3]
+        return contact_wrench(wrench, x[4:10], s, omega, alpha, x[10:])
+
+    motion = [resample(t, smooth.t, signal) for signal in smooth.motion]
+    V = regressor(*motion)
+    size = np.linalg.norm(V - V.mean(axis=0), axis=(0, 1)) + 1e-12
+    centred = ((V - V.mean(axis=0)) / size).reshape(-1, 10)
+    phi = np.linalg.lstsq(centred, (wrench - wrench.mean(axis=0)).ravel(), rcond=RANK)[0] / size
+    offsets = (wrench - V @ phi).mean(axis=0)
+    x, deviations = solve(residual, np.concatenate([np.zeros(4), offsets, phi]))
+    left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual(x), wrench))
+    if (left > MAX_UNEXPLAINED * whole).any():
+        return None
+    observable = observable_axes(lever_matrix(*motion[1:]), smooth, cutoff)
+    return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
+
+
+def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
+    """Return evenly spaced times at which all logs have samples."""
+    t = np.linspace(start, stop, COMPARED_SAMPLES)
+    known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
+    return t[np.all(known, axis=0)]
+
+
+def lever_matrix(omega: Array, alpha: Array) -> Array:
+    """Return the matrix K (N, 3, 3): K p is the acceleration of a point p relative to the origin.
+
+    Eq. (T20), for omega and alpha (N, 3).
+    """
+    W = cross_matrix(omega)
+    return cross_matrix(alpha) + W @ W
+
+
+def observable_axes(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
+    """Return (3,) True for axes along which the motion far exceeds its noise."""
+    alpha = log.angular_acceleration
+    above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
+    noise = above.var(axis=0) / 7
+    K = K - K.mean(axis=0)
+    information = np.einsum("nij,nik->jk", K, K) / len(K)
+    alone = 1 / np.diag(np.linalg.pinv(information, rcond=1e-12, hermitian=True))
+    return alone > _MIN_SIGNAL_RATIO * (noise.sum() - noise)
+
 
 RIGHT_ANGLED_DEG = 5.0
 """Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, number
+from drake_teleop.common.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
@@ -22,7 +23,13 @@ from drake_teleop.logs.read.alignment import (
     spacing,
     uniform_times,
 )
-from drake_teleop.logs.read.auto_frames import describe_mounting, describe_pose_frame
+from drake_teleop.logs.read.auto_frames import (
+    describe_gravity,
+    describe_mounting,
+    describe_pose_frame,
+    restore_weight,
+    weight_wrench,
+)
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, gaps, read_clock
@@ -35,8 +42,6 @@ from drake_teleop.logs.read.description import (
     Wrench,
     load_description,
 )
-from drake_teleop.logs.read.gravity import describe_gravity, restore_weight, weight_wrench
-from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
 from drake_teleop.logs.read.streams import (
     MAX_VALUES,
     MINIMUM_SAMPLES,
@@ -265,8 +270,7 @@ class _Reader:
     def _imu(self, stream: Imu, pose: Stream | None) -> Stream:
         table = self._table(stream)
         clock = self._clock("imu", stream, table)
-        raw_t = clock.t
-        t = uniform_times(raw_t)
+        raw_t, t = clock.t, uniform_times(clock.t)
         dt = spacing(t)
 
         def vectors(field: str, sign: float = 1.0) -> Array | None:
@@ -274,9 +278,8 @@ class _Reader:
             if quantity is None:
                 return None
             values = self._vectors("imu", field, quantity, table, clock.total, sign)
-            return self._to_S(
-                "imu", stream.frame, resample(t, raw_t, clock.select(values)), t, pose
-            )
+            values = resample(t, raw_t, clock.select(values))
+            return self._to_S("imu", stream.frame, values, t, pose)
 
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
@@ -386,8 +389,8 @@ class _Reader:
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
         if len(found_gaps):
-            half_window = self._half_window(float(np.median(np.diff(t))))
-            self._gaps.append(found_gaps + np.array([-half_window, half_window]))
+            half = self._half_window(float(np.median(np.diff(t))))
+            self._gaps.append(found_gaps + np.array([-half, half]))
         return clock
 
     def _half_window(self, dt: float) -> float:

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.read.alignment import low_pass, resample, spacing, uniform_times
-from drake_teleop.logs.read.description import Description, Orientation
-from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
-from drake_teleop.logs.read.rotations import (
+from drake_teleop.common.rotations import (
     WIDTHS,
     nearest_rotation,
     quaternions,
     rotation_error,
     rotation_matrices,
 )
+from drake_teleop.logs.pose_motion.poses import Inertial, Poses
+from drake_teleop.logs.read.alignment import low_pass, resample, spacing, uniform_times
+from drake_teleop.logs.read.description import Description, Orientation
+from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.tables import Table
 
 MINIMUM_SAMPLES = 16
@@ -121,11 +121,7 @@ class Orientations:
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
-        """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z].
-
-        Raises:
-            DrakeTeleopError: for a row that is not a rotation.
-        """
+        """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z]."""
         if not self._orientation.form.startswith("quaternion"):
             return quaternions(self.rotations(rows))
         q = self._columns[rows]
@@ -150,11 +146,7 @@ class Orientations:
 
 
 def common_time(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
-    """Return uniform times at the wrench's rate, within the time spans of all streams.
-
-    Raises:
-        DrakeTeleopError: if the streams have fewer than 16 samples in common.
-    """
+    """Return uniform times at the wrench's rate, within the time spans of all streams."""
     start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
     stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
     spans = "; ".join(

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
 from drake_teleop.common.parquet_sizes import check_parquet
+from drake_teleop.logs.read.array_files import read_mat
 from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.mat_file import read_mat
 from drake_teleop.logs.read.tables import Table
 
 if TYPE_CHECKING:

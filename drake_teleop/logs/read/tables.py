@@ -7,8 +7,9 @@ import math
 from collections import UserDict
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +17,9 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
-if TYPE_CHECKING:
-    pass
-
-_TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
-FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
 MAX_NUMBER = 1e25
 """Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
-_CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
-_Column = TypeVar("_Column")
-_MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _MAX_DECIMALS = 12
-_MAX_CELLS_IN_MEMORY = 2**24
-"""Number of cells above which columns of a Parquet file are read on access."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +72,7 @@ class Table:
     def numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
-        """Return the numbers (N, width) of the named columns, side by side.
-
-        Raises:
-            DrakeTeleopError: if a column is absent, a cell is not finite, or `width` or `rows`
-                differ.
-        """
+        """Return the numbers (N, width) of the named columns, side by side."""
         columns = [self._column(str(name), where) for name in names]
         self._check_rows(names, columns, where, rows)
         found = sum(column.shape[1] for column in columns)
@@ -117,24 +103,18 @@ class Table:
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> Array:
-        """Return the numbers (N, k) of a column, with NaN and infinity; `where` names it in errors.
-
-        Raises:
-            DrakeTeleopError: if the column is absent or a cell is not a number.
-        """
+        """Return the numbers (N, k) of a column, with NaN and infinity; errors name `where`."""
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
-        numbers = self._numbers(name)
+        column = self.columns[name]
+        numbers = _as_numbers(column, partial(self._cell_error, name))
+        numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
         self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
     def single(self, name: str | int, where: str) -> Array:
-        """Return the numbers (N,) of a column, with NaN and infinity.
-
-        Raises:
-            DrakeTeleopError: as `raw`, or if the column has several numbers in a row.
-        """
+        """Return the numbers (N,) of a column, with NaN and infinity."""
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(
@@ -191,11 +171,6 @@ class Table:
                 remedy="cut the log before it or repair the rows",
             )
         return numbers
-
-    def _numbers(self, name: str) -> Array:
-        column = self.columns[name]
-        numbers = _as_numbers(column, lambda row, cell: self._cell_error(name, row, cell))
-        return numbers.reshape(len(column), math.prod(numbers.shape[1:]))
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(

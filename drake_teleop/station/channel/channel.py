@@ -3,7 +3,6 @@
 In every period both ends run one step of the method; their packets pass the network.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
 from dataclasses import dataclass
 
@@ -365,7 +364,7 @@ class TeleopChannel(LeafSystem):
     Args:
         R_WB: (3, 3) alignment of the master's base with the world.
         scales: (2,) scale of translation and rotation, slave over master.
-        force_scale: scale of force, slave to master.
+        force_scale: scale of the contact force (force scale times gamma), slave to master.
         start: (7,) pose X_WS of the slave at the start.
         period: time between packets [s].
     """

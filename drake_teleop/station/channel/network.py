@@ -5,7 +5,6 @@ ROBIO 2008. Losses follow a Gilbert-Elliott chain. Random numbers are hashes of 
 step).
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 from pathlib import Path

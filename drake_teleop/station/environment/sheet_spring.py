@@ -3,7 +3,6 @@
 The first bending mode is one degree of freedom.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 from xml.etree import ElementTree
 

@@ -11,7 +11,6 @@ Section across the slot, M is the middle of its mouth, z up::
                 floor
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,7 +3,6 @@
 The block stands on balls in its corners, because a contact of two boxes is a single point.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 from itertools import product
 

@@ -1,9 +1,8 @@
 """Haptic devices by name: the paper's Phantom, and others by data sheets.
 
-A comment above `FIGURES` has the source of each number. Grippers and buttons are not modelled.
+A comment above the table has the sources of the numbers. Grippers and buttons are not modelled.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import copy
 import dataclasses
 import math
@@ -94,79 +93,38 @@ class DeviceFigures:
     )
 
 
-def _data_sheet(
-    mass: float, friction: float, force: float, size: list[float], **others: Any
-) -> Any:
-    return DeviceFigures(
-        apparent_mass=mass, friction=friction, peak_force=force, size=size, **others
-    )
+_FREE_TURN, _NO_TURN = DeviceFigures().turn, [0.0, 0.0, 0.0]
+_OMEGA_SIZE, _OMEGA_TURN = [0.11, 0.113, 0.113], np.radians([120.0, 70.0, 160.0]).tolist()
+_OMEGA_STEP = math.radians(0.09)
 
-
-_NO_ROTATION = [0.0, 0.0, 0.0]
-_OMEGA_SIZE = [0.11, 0.113, 0.113]
-_OMEGA_ROTATION = np.radians([120.0, 70.0, 160.0]).tolist()  # D
-_OMEGA_READING = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
-
-# Sources: D is the manufacturer's value, from memory; E is an estimate. A workspace is the largest
-# box in the real one: in a cylinder of 160 x 110 mm (omega) or a ball of 450 mm (Virtuose), D.
-#
-# | name | mass at the grip | friction | peak force | workspace, depth x width x height |
-# |---|---|---|---|---|
-# | geomagic_touch | 45 g D | 0.26 N D | 3.3 N D | 70 x 160 x 120 mm D |
-# | omega_3, _6, _7 | 0.25, 0.3, 0.35 kg E | 0.3 N E | 12 N D | 110 x 113 x 113 mm E |
-# | falcon | 0.2 kg E | 0.5 N E | 8.9 N D | 102 mm cube D |
-# | haply_inverse3 | 0.2 kg E | 0.15 N E | 10 N D | 200 x 340 x 190 mm E |
-# | virtuose_6d | 1 kg E | 1 N E | 35 N D | 260 mm cube E |
-#
-# | name | position step | rotation step | device rate |
-# |---|---|---|---|
-# | geomagic_touch | 55 um, 450 dpi D | 2 mrad E | 1 kHz D |
-# | omega_3, _6, _7 | 10 um D | 0.09 degrees D | 4 kHz D |
-# | falcon | 64 um, 400 dpi D | - | 1 kHz D |
-# | haply_inverse3 | 20 um E | 2 mrad E | 4 kHz E |
-# | virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
-#
-# Only the Virtuose displays torque (3.1 N m D); omega.3 and Falcon do not rotate.
-
+# Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
+# position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
+# workspaces (the largest box in a cylinder of 160 x 110 mm, omega, or a ball of 450 mm, Virtuose),
+# mass and friction of the Touch, turns and steps of the omegas, position steps of Touch and Falcon,
+# rates but the Inverse3's, and the Virtuose's torque. The rest are estimates.
+# Only the Virtuose displays torque; omega.3 and Falcon do not rotate.
+_SHEETS: dict[str, tuple[Any, ...]] = {
+    # name            kg     N     N     m                   rad         m        rad          Hz
+    "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _FREE_TURN, 5.5e-5, 2e-3, 1000.0),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE, _NO_TURN, 1e-5, _OMEGA_STEP, 4000.0),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE, _OMEGA_TURN, 1e-5, _OMEGA_STEP, 4000.0),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE, _OMEGA_TURN, 1e-5, _OMEGA_STEP, 4000.0),
+    "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN, 6.35e-5, 0.0, 1000.0),
+    "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _FREE_TURN, 2e-5, 2e-3, 4000.0),
+    "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _FREE_TURN, 2e-5, 2e-4, 1000.0),
+}  # fmt: skip
+_COLUMNS = (
+    *("apparent_mass", "friction", "peak_force", "size"),
+    *("turn", "resolution", "turn_resolution", "rate_hz"),
+)
 #: Data sheets by name, for `Master.figures`.
 FIGURES: dict[str, DeviceFigures] = {
-    "geomagic_touch": _data_sheet(
-        0.045,
-        0.26,
-        3.3,
-        [0.07, 0.16, 0.12],
-        resolution=5.5e-5,
-        turn_resolution=2e-3,
-        rate_hz=1000.0,
-    ),
-    "omega_3": _data_sheet(0.25, 0.3, 12.0, _OMEGA_SIZE, turn=_NO_ROTATION, **_OMEGA_READING),
-    "omega_6": _data_sheet(0.3, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
-    "omega_7": _data_sheet(0.35, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
-    "falcon": _data_sheet(
-        0.2, 0.5, 8.9, [0.102] * 3, turn=_NO_ROTATION, resolution=6.35e-5, rate_hz=1000.0
-    ),
-    "haply_inverse3": _data_sheet(
-        0.2,
-        0.15,
-        10.0,
-        [0.2, 0.34, 0.19],
-        resolution=2e-5,
-        turn_resolution=2e-3,
-        rate_hz=4000.0,
-    ),
-    "virtuose_6d": _data_sheet(
-        1.0,
-        1.0,
-        35.0,
-        [0.26] * 3,
-        inertia=5e-3,
-        friction_torque=0.03,
-        peak_torque=[3.1] * 3,
-        resolution=2e-5,
-        turn_resolution=2e-4,
-        rate_hz=1000.0,
-    ),
+    name: DeviceFigures(**dict(zip(_COLUMNS, copy.deepcopy(row), strict=True)))
+    for name, row in _SHEETS.items()
 }
+FIGURES["virtuose_6d"] = dataclasses.replace(
+    FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
+)
 
 
 @settings

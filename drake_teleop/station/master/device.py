@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, sound
+from drake_teleop.common.blocks import sound
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import put
 from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step, twist_into
-from drake_teleop.station.master.force_display import ForceDisplay, initial_display
+from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
 
 _MAX_PERIOD_S = 1e-3  # s, slower than any haptic device
@@ -20,7 +20,7 @@ _MAX_FRICTION_STEP = 2.0
 
 
 @njit(cache=True, borrows=True)
-def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
+def _advance(device, work, stages, state, pose, twist, display, hand_wrench, drive, period):
     put(display, 6, drive, 6, drive.shape[0] - 6)
     if sound(hand_wrench) and sound(drive[:6]):
         step(state, hand_wrench, drive[:6], device, period, work, stages)
@@ -56,7 +56,7 @@ def check_period(
         )
 
 
-class MasterDevice(LeafSystem):
+class MasterDevice(DeviceBlock):
     """Haptic device with the hand's passive mass, advanced once per period.
 
     Each period is one classical Runge-Kutta step of the nonlinear dynamics with held inputs.
@@ -82,43 +82,12 @@ class MasterDevice(LeafSystem):
             violates a joint limit.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = ()
 
     def __init__(self, period: float, device: HapticDevice, q_initial: NDArray[np.float64]) -> None:
-        super().__init__()
         check_period(device, q_initial, period)
-        self._period = period
-        self._numbers = device.numbers
-        self._work = np.zeros((2, 6, 6))
-        self._stages = np.zeros((3, 12))
-        self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
-        # A separate port for the display's memory would cost a further call.
-        display = initial_display(q_initial, device.numbers)
-        self._drive = self.DeclareVectorInputPort("drive", len(display))
-        # Pose and twist are states because they are read more often than they change.
-        state = np.concatenate([q_initial, np.zeros(6)])
-        for name, start in (
-            ("state", state),
-            ("pose_master", device.forward_kinematics(q_initial)),
-            ("twist_master", np.zeros(6)),
-            ("for_display", display),
-        ):
-            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        _advance(
-            discrete_state.get_mutable_value(0),
-            discrete_state.get_mutable_value(1),
-            discrete_state.get_mutable_value(2),
-            discrete_state.get_mutable_value(3),
-            self._hand_wrench.Eval(context),
-            self._drive.Eval(context),
-            self._numbers,
-            self._period,
-            self._work,
-            self._stages,
-        )
+        constants = device.numbers, np.zeros((2, 6, 6)), np.zeros((3, 12))
+        super().__init__(period, device, q_initial, _advance, constants)
 
 
 def AddDevice(

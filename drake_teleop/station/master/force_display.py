@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
 from drake_teleop.common.compiled import njit
@@ -132,6 +134,55 @@ def _fade(device, numbers, period, drive):
             drive[_CHANGED] = 1.0
     if not fault:
         drive[_FAULT] = _RESUMING
+
+
+class DeviceBlock(LeafSystem):
+    """Base class of haptic devices as blocks: state, pose, twist and vector for the display.
+
+    Args:
+        device: `HapticDevice` or `LeaderDevice`.
+        q_initial: joint positions at the start, at rest.
+        advance: compiled function of `constants`, the four states, hand wrench, drive and period;
+            it writes the states after one period.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(
+        self,
+        period: float,
+        device: Any,
+        q_initial: NDArray[np.float64],
+        advance: Callable[..., None],
+        constants: tuple[Any, ...],
+    ) -> None:
+        super().__init__()
+        self._advance, self._constants, self._period = advance, constants, period
+        self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
+        # A separate port for the display's memory would cost a further call.
+        display = initial_display(device.display_axes(q_initial), device.numbers)
+        self._drive = self.DeclareVectorInputPort("drive", len(display))
+        # Pose and twist are states because they are read more often than they change.
+        for name, start in (
+            ("state", np.concatenate([q_initial, np.zeros(len(q_initial))])),
+            ("pose_master", device.forward_kinematics(q_initial)),
+            ("twist_master", np.zeros(6)),
+            ("for_display", display),
+        ):
+            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        self._advance(
+            *self._constants,
+            discrete_state.get_mutable_value(0),
+            discrete_state.get_mutable_value(1),
+            discrete_state.get_mutable_value(2),
+            discrete_state.get_mutable_value(3),
+            self._hand_wrench.Eval(context),
+            self._drive.Eval(context),
+            self._period,
+        )
 
 
 class ForceDisplay(LeafSystem):

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context
 
-from drake_teleop.common.blocks import ONE_DICT, sound
+from drake_teleop.common.blocks import sound
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross, put, quaternion_of, three
 from drake_teleop.station.master.dynamics import DisplayDevice
-from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display
+from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, display_into
 from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.slave.arm import (
     DAMPING,
@@ -289,7 +289,7 @@ def joint_parameters(
     return np.array([*rows, np.full(len(home), carried)])
 
 
-class LeaderArm(LeafSystem):
+class LeaderArm(DeviceBlock):
     """Leader arm with the hand's passive mass, advanced once per period.
 
     .. pydrake_system::
@@ -309,35 +309,11 @@ class LeaderArm(LeafSystem):
         q_initial: (n,) joint positions at the start, at rest.
     """
 
-    __slots__ = ONE_DICT
+    __slots__ = ()
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        super().__init__()
-        self._constants = (*device.constants, _hand_weight(device))
-        self._period = period
-        self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
-        display = initial_display(device.display_axes(q_initial), device.numbers)
-        self._drive = self.DeclareVectorInputPort("drive", len(display))
-        for name, start in (
-            ("state", np.concatenate([q_initial, np.zeros(device.num_joints)])),
-            ("pose_master", device.forward_kinematics(q_initial)),
-            ("twist_master", np.zeros(6)),
-            ("for_display", display),
-        ):
-            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        step_leader(
-            *self._constants,
-            discrete_state.get_mutable_value(0),
-            discrete_state.get_mutable_value(1),
-            discrete_state.get_mutable_value(2),
-            discrete_state.get_mutable_value(3),
-            self._hand_wrench.Eval(context),
-            self._drive.Eval(context),
-            self._period,
-        )
+        constants = (*device.constants, _hand_weight(device))
+        super().__init__(period, device, q_initial, step_leader, constants)
 
 
 def _hand_weight(device: LeaderDevice) -> float:

@@ -1,6 +1,5 @@
 """Leader arm, which the operator holds as a haptic device, from a model file."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -1,6 +1,5 @@
 """The simulated operator: intended path of the hand, followed through the hand's impedance."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

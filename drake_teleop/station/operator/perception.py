@@ -9,7 +9,6 @@ u_expected reaches the absolute threshold and the Weber fraction of recent expec
 `docs/operator.md`.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 

@@ -1,6 +1,5 @@
 """Tasks and movement parameters of the operator; sources in `docs/operator.md`."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 from typing import TypeAlias

@@ -76,15 +76,17 @@ _MAX_STIFFNESS, _MIN_STIFFNESS = 2500.0, 50.0  # N/m
 _LEAD_STEPS = 2.0
 _OFFSET_FADE_S = 0.3
 _FRICTION_MEMORY_S = 1.0
-_FRICTION_ROUND_TRIPS = 30.0
+_FRICTION_LAG_S, _SLIP_SPEED = 0.1, 1e-3
 _MAX_PREDICTION_N = 3.0
 _MAX_REMEMBERED_N = 10.0
 _SAME_WALL_M, _SAME_WALL_COSINE = 5e-3, 0.7
 _REMOVED_DEPTH_M, _REMOVED_FORCE_N, _REMOVED_MIN_DEPTH_M = 3e-3, 1.0, 1e-3
 _UNMET_DEPTH_M, _UNMET_IMPULSE_NS = 0.3e-3, 0.03
 _FORWARD_LEVEL = 0.5  # of the master's reserve
+_LEAST_LEVEL = 0.05  # of the master's reserve
 _DRAIN_RATE = 50.0  # 1/s
-_RECOVERY_S = 0.02
+_RELEASE_M = 0.03
+_RECOVERY_S = 0.2
 _HAND_ACCELERATION = 5.0  # m/s^2
 _DRAG_SPEED = 0.02  # m/s
 _REST_S = 0.1
@@ -98,7 +100,11 @@ _places.vector(NORMAL.stop - OWN_VELOCITY.start)
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
 _OFFSET, _INWARD = _places.vector(6), _places.vector(6)
 _WALL_STIFFNESS, _WALL_DEPTH, _UNMET_IMPULSE = _places.number(), _places.number(), _places.number()
-_FRICTION_WRENCH, _MAX_FRICTION = _places.vector(6), _places.vector(2)
+# Modelled friction at the motion of the hand and of the slave; measured minus modelled friction.
+_FRICTION_AT_HAND, _FRICTION_AT_SLAVE = _places.vector(6), _places.vector(6)
+_FRICTION_REST, _FRICTION_CONE = _places.vector(6), _places.vector(2)
+_RETREAT = _places.number()  # of the hand out of the wall since its last rest
+_LAST_SLAVE_POSE, _SLAVE_STEP = _places.vector(7), _places.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
 _WORK_ON_HAND, _WITHHELD_SHARE = _places.vector(2), _places.vector(2)
 _DRAG_ACTIVE = _places.vector(2)
@@ -256,8 +262,10 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         else:
             put(offset, 0, offset_to_slave, 0, 6)
         memory[IN_CONTACT] = 1.0
-        memory[_MAX_FRICTION][:] = 0.0
-        memory[_FRICTION_WRENCH][:] = 0.0
+        memory[_FRICTION_CONE][:] = 0.0
+        for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
+            memory[friction] = 0.0
+        put(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
     fade = 1.0 - min(T / _OFFSET_FADE_S, 1.0)
     for i in range(6):
         offset[i] *= fade
@@ -268,15 +276,15 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     if size > 0.0:
         change = k * penetration + damper * (hand_speed - speed)
         force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTION_N)
-    force_ratio = min(max(force, 0.0) / max(size, 1e-12), 1.0)
+    # A hand that was let go moves out of a soft wall without end, so its force fades.
+    retreat = max(memory[_RETREAT] + work_along(normal, dx), 0.0)
+    if abs(hand_speed) < _DRAG_SPEED:
+        retreat *= 1.0 - min(T / _REST_S, 1.0)
+    memory[_RETREAT] = retreat
+    force *= max(1.0 - retreat / _RELEASE_M, 0.0)
+    _find_slave_step(received, memory)
     for g in range(2):
-        _update_friction(g, T, size, force_ratio, contact_wrench, received, dx, p, memory)
-    # As n rotates, a part of the friction force turns along n, where only `force` acts.
-    friction = memory[_FRICTION_WRENCH]
-    component = dot(friction, normal, 0) / max(dot(normal, normal, 0), 1e-12)
-    for i in range(3):
-        friction[i] -= component * normal[i]
-    _add_friction(dx, force_ratio, p, memory, wrench)
+        _add_friction(g, T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
     if k > _MIN_STIFFNESS:
@@ -286,32 +294,41 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 
 @njit(cache=True)
-def _update_friction(g, T, size, force_ratio, contact_wrench, received, dx, p, memory):
-    normal, friction, largest = memory[NORMAL], memory[_FRICTION_WRENCH], memory[_MAX_FRICTION]
-    # A torque's weight in the metric is 0 where rotation is not transmitted.
-    metric, displacement, total = max(p[METRIC][g], 1e-12), work_along(normal, dx), 0.0
-    spring = _MAX_STIFFNESS / metric
-    share = min(T / max(2.0 * _OFFSET_FADE_S, _FRICTION_ROUND_TRIPS * received[ROUND_TRIP]), 1.0)
-    for i in range(3 * g, 3 * g + 3):
-        across = contact_wrench[i] - size * normal[i]
-        total += across * across
-        friction[i] += share * (across - friction[i])
-        friction[i] -= spring * (dx[i] - displacement * metric * normal[i])
-    decay = min(T / max(_FRICTION_MEMORY_S, _FRICTION_ROUND_TRIPS * received[ROUND_TRIP]), 1.0)
-    largest[g] = max(largest[g] * (1.0 - decay), math.sqrt(total))
-    limit(friction, g, force_ratio * largest[g])
+def _find_slave_step(received, memory):
+    """Write the displacement of the received pose since the last step into the memory."""
+    last = memory[_LAST_SLAVE_POSE]
+    difference_into(received[POSE], last, memory[_SLAVE_STEP])
+    put(last, 0, received, POSE.start, 7)
 
 
 @njit(cache=True)
-def _add_friction(dx, force_ratio, p, memory, wrench):
-    normal, displacement = memory[NORMAL], work_along(memory[NORMAL], dx)
-    for g in range(2):
-        metric = max(p[METRIC][g], 1e-12)
-        spring = _MAX_STIFFNESS / metric
-        for i in range(3 * g, 3 * g + 3):
-            across = dx[i] - displacement * metric * normal[i]
-            wrench[i] = memory[_FRICTION_WRENCH][i] - spring * across
-        limit(wrench, g, force_ratio * memory[_MAX_FRICTION][g])
+def _add_friction(g, T, size, force, received, dx, p, memory, wrench):
+    """Write the friction of group `g` into `wrench`: model of the hand plus the model's error."""
+    normal, contact, z = memory[NORMAL], received[WRENCH], memory[_SLAVE_STEP]
+    near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
+    # A torque's weight in the metric is 0 where rotation is not transmitted.
+    metric, cone = max(p[METRIC][g], 1e-12), memory[_FRICTION_CONE]
+    spring, step, slave_step = (
+        _MAX_STIFFNESS / metric,
+        work_along(normal, dx),
+        work_along(normal, z),
+    )
+    lag = cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED)
+    share, total = T / max(lag, _FRICTION_LAG_S), 0.0
+    for i in range(3 * g, 3 * g + 3):
+        across = contact[i] - size * normal[i]
+        total += across * across
+        inward = metric * normal[i]
+        far[i] -= spring * (z[i] - slave_step * inward) + share * far[i]
+        rest[i] += share * (across - far[i] - rest[i])
+        near[i] -= spring * (dx[i] - step * inward) + share * near[i]
+    decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
+    cone[g] = max(cone[g] * (1.0 - decay), math.sqrt(total) / size)
+    limit(far, g, cone[g] * size)
+    limit(near, g, cone[g] * force)
+    for i in range(3 * g, 3 * g + 3):
+        wrench[i] = near[i] + rest[i] - spring * (dx[i] - step * metric * normal[i])
+    limit(wrench, g, cone[g] * force)
 
 
 @njit(cache=True)
@@ -337,7 +354,9 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
         cost = size * max(dot(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
             cost += size * _HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
-    most = min(T * _DRAIN_RATE, 1.0) * max(memory[LEDGER][g] - MARGIN * p[SLAVE_RESERVE][g], 0.0)
+    most = min(T * _DRAIN_RATE, 1.0) * max(
+        memory[LEDGER][g] - _LEAST_LEVEL * p[MASTER_RESERVE][g], 0.0
+    )
     share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _RECOVERY_S)
     if share * cost > most:
         share = most / cost
@@ -350,7 +369,7 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
 @njit(cache=True)
 def _opposing_share(g, dx, T, p, memory):
     """Return the share of a wrench against the motion that the master's energy permits, 0 to 1."""
-    if memory[LEDGER][g] >= MARGIN * p[SLAVE_RESERVE][g]:
+    if memory[LEDGER][g] >= _LEAST_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]
     along, speed = dot(velocity, dx, g), length(velocity, g)

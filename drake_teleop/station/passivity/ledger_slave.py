@@ -53,7 +53,7 @@ from drake_teleop.station.passivity.packet import (
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
 MARGIN = 0.03  #: share of the slave's reserve that is never used
 SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold in contact
-_MIN_KEPT_RESERVE = 0.1
+_MIN_KEPT_RESERVE = 0.05
 _STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
 _CAPACITY = 4.0  # over the reserve
 _FILTER_S = 3e-3
@@ -69,7 +69,7 @@ _SHARE_FILTER_S, _SHARE_DEADBAND = 0.02, 0.1
 _REMOVAL_FORCE_N = 0.3
 _DIRECTION_FILTER_S = 3.0
 _SLIP_FADE_S, _FRICTION_MEMORY_S = 0.6, 1.0
-_GAIN_RISE_S, _MAX_GAIN, _GAIN_FALL_S = 0.5, 10.0, 1.0
+_GAIN_RISE_S, _MIN_GAIN, _MAX_GAIN, _GAIN_FALL_S = 0.5, 0.1, 10.0, 1.0
 _COMMAND_FILTER_S, _MAX_ACCELERATION, _BRAKING_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
 _FEEDFORWARD_S = 0.02
 _SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
@@ -265,13 +265,17 @@ def _max_displayed_stiffness(received, T, p, memory):
         fill_level += p[METRIC][g] * dot(normal, normal, g) * level
     max_silence = max(_FEEDFORWARD_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP])
     max_silence = min(max_silence, _MAX_SILENCE_S)
-    if memory[IN_CONTACT] == 0.0 or memory[_LONGEST_SILENCE] >= max_silence:
+    goal = _MAX_GAIN * fill_level - 1.0
+    if memory[_LONGEST_SILENCE] >= max_silence:
+        goal = min(goal, 0.0)
+    if memory[IN_CONTACT] == 0.0:
         memory[_EXTRA_GAIN] = 0.0
     else:
-        change = (_MAX_GAIN - 1.0) * fill_level - memory[_EXTRA_GAIN]
+        change = max(goal, _MIN_GAIN - 1.0) - memory[_EXTRA_GAIN]
         memory[_EXTRA_GAIN] += T / (_GAIN_RISE_S if change > 0.0 else _GAIN_FALL_S) * change
-    increased = min((1.0 + memory[_EXTRA_GAIN]) * base, _MAX_DISPLAYED_STIFFNESS)
-    return max(_MIN_DISPLAYED_STIFFNESS, base, increased)
+    gain = 1.0 + memory[_EXTRA_GAIN]
+    least = max(_MIN_DISPLAYED_STIFFNESS, base) * min(gain, 1.0)
+    return max(least, min(gain * base, _MAX_DISPLAYED_STIFFNESS))
 
 
 @njit(cache=True)

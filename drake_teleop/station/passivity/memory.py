@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-MEMORY = 160  #: length of the memory vector of one end
+MEMORY = 180  #: length of the memory vector of one end
 PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` fills
 
 

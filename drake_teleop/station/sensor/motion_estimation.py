@@ -9,7 +9,6 @@ It is specific force s of the origin So, angular velocity omega and acceleration
 Faster paths wait for the slowest one, so that a sample belongs to one instant.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 
 import numpy as np

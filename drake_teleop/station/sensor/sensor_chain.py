@@ -10,7 +10,6 @@ The accelerometer with origin Ao and axes A measures specific force and angular 
 low-pass is analog or mechanical (`before_noise`), or digital as in the JR3 (`after_converter`).
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import copy
 import dataclasses
 from dataclasses import dataclass, field

@@ -21,8 +21,8 @@ from pydrake.multibody.tree import (
 )
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.model_tree import WORLD
-from drake_teleop.station.slave.repair_report import listed
+from drake_teleop.station.slave.model.model_tree import WORLD
+from drake_teleop.station.slave.model.repair_report import listed
 
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.

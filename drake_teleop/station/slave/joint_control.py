@@ -3,7 +3,6 @@
 Computed torque decouples the joints.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass

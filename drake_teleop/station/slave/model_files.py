@@ -25,11 +25,11 @@ from drake_teleop.station.slave.drake_errors import (
     raise_logged_errors,
     translate_drake_errors,
 )
-from drake_teleop.station.slave.mjcf_repair import repair_mjcf
-from drake_teleop.station.slave.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.repaired_model import RepairedModel
-from drake_teleop.station.slave.sdf_repair import repair_sdf
-from drake_teleop.station.slave.urdf_repair import Purpose, repair_urdf
+from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
+from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.repair_report import RepairedModel
+from drake_teleop.station.slave.model.sdf_repair import repair_sdf
+from drake_teleop.station.slave.model.urdf_repair import Purpose, repair_urdf
 
 _XACRO = "run it through xacro first, and give the URDF that comes out"
 _REPAIRS = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}

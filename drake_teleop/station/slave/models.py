@@ -23,8 +23,8 @@ from drake_teleop.station.slave.chain_joints import (
     weld_other_joints,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
+from drake_teleop.station.slave.model.urdf_repair import Purpose
 from drake_teleop.station.slave.model_files import read_model
-from drake_teleop.station.slave.urdf_repair import Purpose
 
 _MAX_NAMES = 12  # names of frames in an error: the most similar ones
 

@@ -21,14 +21,13 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.rotations import quaternions
+from drake_teleop.common.rotations import quaternions
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.arm import FRICTION, ArmModel, forward_kinematics, pose_into
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
-from drake_teleop.station.slave.model_check import check_size
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact

@@ -9,7 +9,6 @@ The generator respects speed and acceleration limits and brakes in time. Without
 joint yields in contact by torque / (inertia w^2). See docs/station.md for sources and omissions.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
 from dataclasses import dataclass
 

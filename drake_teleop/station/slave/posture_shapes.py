@@ -37,7 +37,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, Several
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.meshes import AddSkeleton
+from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.plant import (
     HashableByValue,
     NominalSlave,

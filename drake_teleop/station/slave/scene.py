@@ -4,7 +4,6 @@ Bodies may be attached by joints with springs and damping. Free roots are welded
 float.
 """
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

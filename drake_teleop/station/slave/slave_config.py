@@ -1,6 +1,5 @@
 """Settings of the slave in a scenario: arm, base pose, start, tool and payload."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,6 +1,5 @@
 """Tool on the wrist sensor: the paper's, from a model file, or from mass, inertia and shapes."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
 from pathlib import Path
 

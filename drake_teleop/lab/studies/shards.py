@@ -1,0 +1,95 @@
+"""Shards of a study: disjoint groups of its chunks for computers that share only a file system.
+
+Shard K/N runs every N-th chunk into the folder `shards/K-of-N` of the study. `merge_shards` links
+their parts into the study's own table, so that the bytes are those of one process.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import whole_file
+from drake_teleop.lab.studies.processes import Chunk
+from drake_teleop.lab.studies.store import Store, check_identity
+
+_FOLDER = re.compile(r"([1-9]\d*)-of-([1-9]\d*)")
+_MAX_LISTED_SHARDS = 20
+
+
+class Shard(NamedTuple):
+    """Shard `number` (from 1) of `total`."""
+
+    number: int
+    total: int
+
+    def folder(self, out: Path) -> Path:
+        """Return the folder of this shard; `out` is the folder of the study."""
+        return out / "shards" / f"{self.number}-of-{self.total}"
+
+    def chunks(self, chunks: Sequence[Chunk]) -> list[Chunk]:
+        """Return the chunks of this shard; raise DrakeTeleopError if there are none."""
+        if self.total > len(chunks):
+            raise DrakeTeleopError(
+                f"the study has only {len(chunks)} groups of runs",
+                where=f"shard {self.number}/{self.total}",
+                remedy=f"give at most {len(chunks)} shards",
+            )
+        return list(chunks[self.number - 1 :: self.total])
+
+
+def parse_shard(text: str) -> Shard:
+    """Return the shard of a text such as "3/8"; raise DrakeTeleopError if it is invalid."""
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
+    if not found or not 1 <= int(found[1]) <= int(found[2]):
+        raise DrakeTeleopError(
+            f"{text!r} is not K/N with 1 <= K <= N", where="shard", remedy="give one, such as 3/8"
+        )
+    return Shard(int(found[1]), int(found[2]))
+
+
+def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
+    """Link the parts of all shards in `out` into its table.
+
+    Raises:
+        DrakeTeleopError: without shards, or if one is of another study or version; or if chunks are
+            missing, with the shards that contain them.
+    """
+    names = [_FOLDER.fullmatch(path.name) for path in (out / "shards").glob("*")]
+    shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
+    if not shards:
+        raise DrakeTeleopError("has no shards", where=str(out), remedy="run study --shard K/N")
+    for shard in sorted(shards):
+        folder = shard.folder(out)
+        check_identity(folder, identity)
+        for part in Store(folder / "runs.parquet").parts():
+            _link(part, store.folder / part.name, store.folder)
+    store.remove_damaged_parts()
+    finished = store.finished()
+    missing = [k for k, chunk in enumerate(chunks) if chunk[0]["run"] not in finished]
+    if missing:
+        count = max(shard.total for shard in shards)
+        numbers = sorted({k % count + 1 for k in missing})
+        listed = ",".join(map(str, numbers[:_MAX_LISTED_SHARDS]))
+        more = ",..." if len(numbers) > _MAX_LISTED_SHARDS else ""
+        runs = sum(len(chunks[k]) for k in missing)
+        raise DrakeTeleopError(
+            f"{runs} of {sum(map(len, chunks))} runs are missing",
+            where=str(out),
+            remedy=f"run shards {listed}{more} of {count} again, then merge",
+        )
+
+
+def _link(part: Path, path: Path, aside: Path) -> None:
+    if path.exists():
+        return
+    with whole_file(path, aside=aside) as temporary:
+        try:
+            os.link(part, temporary)
+        except OSError:  # a file system without links
+            shutil.copyfile(part, temporary)

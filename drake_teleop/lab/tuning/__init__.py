@@ -1,0 +1,1 @@
+"""Choice of passivity method and force scales for a station, hands, walls and a network."""

@@ -1,0 +1,274 @@
+"""Trials of settings: a hand swings, presses on a wall and holds, in the whole station or one axis.
+
+Both trials are the work of a study (`lab.studies.runs`); the values of a run are the fields of
+`Settings`, a grip and a wall.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.fft import dct
+from scipy.optimize import bisect
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.lab.analysis.analyze import sampling_of
+from drake_teleop.lab.analysis.cut_loop import cut_loop, unstable_multipliers
+from drake_teleop.lab.analysis.figures import with_grip
+from drake_teleop.lab.analysis.one_axis import Axis
+from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
+from drake_teleop.lab.comparison.delayed_contact import delayed_contact, station_figures
+from drake_teleop.lab.comparison.one_dof import (
+    OneDof,
+    Task,
+    figures,
+    operators_intent,
+    run_one_dof,
+)
+from drake_teleop.lab.studies.design import Values
+from drake_teleop.lab.tuning.stated_set import StatedSet
+from drake_teleop.station.master.data_sheets import FIGURES
+from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.passivity.tdpa import charged
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import simulate
+from drake_teleop.station.station import MakeTeleopStation
+
+MAX_REST_FORCE_N = 0.05
+"""Largest rendered force above `REST_BAND_HZ` of a station at rest, free or pressing, rms [N]."""
+REST_BAND_HZ = 5.0
+MIN_SHARE = 0.9
+"""Smallest accepted rendered force, as a share of the scaled contact force."""
+SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
+TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
+_REST_S, _JUDGED_S = 1.5, 0.8  # s, from the press to the judged time; length of that time
+_CALM_S = 0.1  # s, from the end of the swing until the hand is at rest
+_MAX_DEPTH, _DEVICE_SHARE = 0.02, 0.6  # m; share of the device's peak force that is used
+_SLIP_SPEED = 1e-3  # m/s, of the leaf; Drake's default
+_LOW_PASS_DELAY = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
+_MIN_GAMMA, _RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
+_LINEAR_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
+AS_GIVEN = "as given"
+"""Name in place of a method: passivity and scales of the user's scenario."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings that `tune` chooses."""
+
+    method: str
+    gamma: float
+    sigma_inertia: float
+    low_pass_hz: float
+
+    def passivity(self, stated: StatedSet) -> PassivityConfig:
+        """Return the passivity method, for the hands of the set."""
+        hand = GRIPS[stated.hands[-1]]
+        stiffness = [hand.stiffness, hand.rotational_stiffness]
+        known = dataclasses.replace(charged(), hand_stiffness=stiffness)
+        return PassivityConfig(method=self.method, charged_tdpa=known)
+
+    def apply(self, base: Scenario, stated: StatedSet) -> Scenario:
+        """Return the scenario with these settings."""
+        sensor = base.wrist_sensor
+        if not sensor.ideal:
+            sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
+        scaling = dataclasses.replace(
+            base.force_scaling,
+            sigma=0.0,
+            eta=None,
+            gamma=self.gamma,
+            sigma_weight=0.0,
+            sigma_inertia=self.sigma_inertia,
+        )
+        return replace(
+            base, wrist_sensor=sensor, force_scaling=scaling, passivity=self.passivity(stated)
+        )
+
+
+def settings_of(values: Values) -> Settings:
+    """Return the settings among the values of a run."""
+    names = [entry.name for entry in dataclasses.fields(Settings)]
+    return Settings(**{name: values[name] for name in names})  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class StationTrial:
+    """Work of a study: one press in the whole station.
+
+    Args:
+        given: scenario of the user, with its own passivity and scales.
+        base: the same, see `stated_set.base_of`.
+        estimate: (16,) load estimate.
+    """
+
+    given: Scenario
+    base: Scenario
+    stated: StatedSet
+    estimate: Array
+
+    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+        """Return `TRIAL_MEASURES` of one run."""
+        grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
+        as_given = values["method"] == AS_GIVEN
+        scenario = self.given if as_given else settings_of(values).apply(self.base, self.stated)
+        scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
+        channel = self.base.channel
+        task = short_task(sum(line.delay for line in channel.lines()))
+        setup, _ = delayed_contact(
+            scenario,
+            channel,
+            scenario.passivity,
+            wall,
+            task=task,
+            depth=press_depth(self.base, grip),
+        )
+        setup = replace(setup, sheet_spring__slip=_SLIP_SPEED)
+        station = MakeTeleopStation(setup, load_estimate=self.estimate)
+        try:
+            result = simulate(station, setup.simulation, progress=False)
+        except DrakeTeleopError:  # it left its joint ranges
+            return dict.fromkeys(TRIAL_MEASURES, 0.0) | {"threshold_N": np.inf}
+        found = station_figures(result, setup, task)
+        hold = (result.t >= task.release - task.judged) & (result.t < task.release)
+        scaling = scenario.force_scaling
+        gain = scaling.force_scale * scaling.scales().gamma
+        contact = float(result["true_contact_wrench_W"][hold, 2].mean())
+        felt = result["force_to_master"][hold, 2]
+        free = (result.t >= task.swung + _CALM_S) & (result.t < task.press)
+        period = result.t[1] - result.t[0]
+        free_felt = result["force_to_master"][free, :3].T
+        rest_force = max(
+            rms_above(felt, period, REST_BAND_HZ),
+            *(rms_above(force, period, REST_BAND_HZ) for force in free_felt),
+        )
+        share = max(1.0 + found.force_error, 0.0) if np.isfinite(found.force_error) else 0.0
+        human = self.base.operator.perception
+        smallest = max(human.absolute_threshold, human.weber_fraction * found.free_force)
+        return {
+            "rests": float(found.stable),
+            "rest_force_N": rest_force,
+            "share": share,
+            "free_force_N": found.free_force,
+            "contact_N": abs(contact),
+            "threshold_N": (smallest + 2 * rest_force) / (gain * share) if share else np.inf,
+        }
+
+
+@dataclass(frozen=True)
+class GammaSearch:
+    """Work of a study: the largest gamma that is stable in one axis at all corners of the set.
+
+    `base`: scenario, see `stated_set.base_of`. `caps`: largest gamma by low-pass [Hz].
+    """
+
+    base: Scenario
+    stated: StatedSet
+    caps: dict[float, float]
+
+    def __call__(self, values: Values, seed: int) -> dict[str, float]:
+        """Return `SEARCH_MEASURES` of one method, share of inertia and low-pass."""
+        settings = settings_of(values | {"gamma": 1.0})
+        axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
+        axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
+        linear = self._linear_limit(axis, settings)
+        cap = self.caps[settings.low_pass_hz] * self.stated.aims.margin
+        if settings.method == "none":
+            cap = min(cap, linear)
+        shares: dict[float, float] = {}
+
+        def stable(log_gamma: float) -> float:
+            gamma = float(np.exp(log_gamma))
+            found = [
+                self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
+            ]
+            shares[gamma] = min(found)
+            return 1.0 if shares[gamma] >= MIN_SHARE else -1.0
+
+        low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
+        limit = high
+        if stable(high) < 0:
+            limit = bisect(stable, low, high, xtol=_RESOLUTION) if stable(low) > 0 else -np.inf
+        accepted = [gamma for gamma, share in shares.items() if share >= MIN_SHARE]
+        gamma = max((g for g in accepted if g <= np.exp(limit) * 1.001), default=0.0)
+        share = shares.get(gamma, 0.0)
+        return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
+
+    def _linear_limit(self, axis: Any, settings: Settings) -> float:
+        """Return the largest gamma without a method, from the Diagram's sampled one-axis loop."""
+        sampling = sampling_of(self.base)
+        if sampling.low_pass_hz is not None:
+            sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
+        stable = np.ones(len(_LINEAR_GAMMAS), dtype=bool)
+        for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
+            held = dataclasses.replace(
+                with_grip(axis, grip), wall_stiffness=wall, gamma=_LINEAR_GAMMAS
+            )
+            stable &= unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
+        return float(_LINEAR_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
+
+    def share_in_one_axis(
+        self, axis: Axis, settings: Settings, gamma: float, grip: str, wall: float, seed: int
+    ) -> float:
+        """Return the rendered share of the contact force; 0 if the axis does not come to rest."""
+        forward, backward = self.base.channel.lines()
+        hand = GRIPS[grip]
+        shown = {entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(Axis)}
+        model = OneDof(**shown | {
+            "hand_mass": hand.mass, "hand_damping": hand.damping,
+            "hand_stiffness": hand.stiffness, "wall_stiffness": wall, "gamma": gamma,
+        })  # fmt: skip
+        added = 0.0 if self.base.wrist_sensor.ideal else _LOW_PASS_DELAY / settings.low_pass_hz
+        task = short_task(forward.delay + backward.delay)
+        run = run_one_dof(
+            model,
+            settings.passivity(self.stated),
+            forward,
+            dataclasses.replace(backward, delay=backward.delay + added),
+            seed=seed,
+            intent=operators_intent(task),
+        )
+        found = figures(run, model, task)
+        hold = (run.t >= task.release - task.judged) & (run.t < task.release)
+        quiet = rms_above(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
+        return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
+
+
+def short_task(round_trip: float) -> Task:
+    """Return the times of a swing, a rest and a press that is held, for a round trip [s]."""
+    pressed = 1.8 + 2 * round_trip
+    release = pressed + _REST_S + _JUDGED_S + 2 * round_trip
+    return Task(
+        swing=0.1,
+        swung=0.8,
+        press=pressed - 0.5,
+        pressed=pressed,
+        release=release,
+        released=release + 0.1,
+        end=release,
+        judged=_JUDGED_S,
+    )
+
+
+def press_depth(base: Scenario, grip: str) -> float:
+    """Return the displacement [m] into a wall that the device can render to the grip."""
+    sheet = base.master.figures or FIGURES.get(base.master.model)
+    peak = FORCE_LIMIT if sheet is None else sheet.peak_force
+    return min(_MAX_DEPTH, _DEVICE_SHARE * peak / GRIPS[grip].stiffness)
+
+
+def rms_above(x: Array, period: float, frequency: float) -> float:
+    """Return the rms of the part of x (N,) above a frequency [Hz]; infinite for invalid x."""
+    if not np.isfinite(x).all() or len(x) < 4:
+        return float("inf")
+    t = np.linspace(-1.0, 1.0, len(x))
+    # The cosine transform continues x evenly, so that slow motion stays below the frequency.
+    spectrum = dct(x - np.polyval(np.polyfit(t, x, 2), t), norm="ortho")
+    high = np.arange(len(x)) / (2 * len(x) * period) > frequency
+    return float(np.sqrt(np.sum(spectrum[high] ** 2) / len(x)))

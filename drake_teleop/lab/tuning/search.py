@@ -1,0 +1,231 @@
+"""Search of settings: linear limit, one axis, then the whole station at the edges of the set."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.studies.design import Factor, Study, Value
+from drake_teleop.lab.studies.runs import run_study
+from drake_teleop.lab.tuning.press_trial import (
+    AS_GIVEN,
+    MAX_REST_FORCE_N,
+    MIN_SHARE,
+    SEARCH_MEASURES,
+    TRIAL_MEASURES,
+    GammaSearch,
+    Settings,
+    StationTrial,
+    settings_of,
+)
+
+METHODS = ("none", "ledger", "charged_tdpa", "wave")
+"""Candidates; the others are dominated by them or render less than `MIN_SHARE` of the force."""
+SIGMAS = (0.0, 0.3)
+"""Shares of inertia: a larger one helps the hand to hold a wall, and masks the contact."""
+WALL_FACTORS = (1.2, 2.0)
+"""Factors of the stiffest wall, at which the limits of the settings are searched."""
+_LOW_PASSES = (100.0, 50.0)  # Hz, below the sensor's own
+_HALVINGS, _CLOSE = 4, 1.15  # of gamma until the station holds; ratio where the bisection ends
+_QUIET_SHARE = 0.8  # share of the largest force at rest that noise may use
+
+Row = dict[str, Any]
+Execute = Callable[[str, Study, Any], list[Row]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Result of the search.
+
+    Attributes:
+        settings: chosen settings.
+        search: rows of the search in one axis, with the predicted `threshold_N` and `gamma`.
+        given: rows of the user's settings at the stiffest wall.
+        inside: rows of the chosen settings at the corners, at the gamma times the margin.
+        limits: rows at the chosen gamma, at the stiffest wall and beyond it.
+    """
+
+    settings: Settings
+    search: list[Row]
+    given: list[Row]
+    inside: list[Row]
+    limits: list[Row]
+
+
+def search_settings(trial: StationTrial, execute: Execute) -> Found:
+    """Return the settings with the smallest detection threshold that the station holds.
+
+    Raises:
+        DrakeTeleopError: if no settings are stable in the whole set.
+    """
+    base, stated = trial.base, trial.stated
+    own = base.wrist_sensor.bandwidth_hz
+    ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
+    stiffest = stated.walls[1]
+    given = execute(
+        "as_given", _study([AS_GIVEN], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES), trial
+    )
+    quiet = execute(
+        "noise", _study(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES), trial
+    )
+    noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
+    low_passes = [own]
+    if not base.wrist_sensor.ideal:
+        low_passes += [f for f in _LOW_PASSES if stated.aims.min_low_pass_hz <= f < own]
+    noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
+    highest = 1 / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
+    caps = {f: min(_QUIET_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
+    study = Study(
+        factors=[
+            Factor(field="method", words=list(METHODS)),
+            Factor(field="sigma_inertia", values=list(SIGMAS)),
+            Factor(field="low_pass_hz", values=low_passes),
+        ],
+        measures=SEARCH_MEASURES,
+    )
+    rows = execute("search", study, GammaSearch(base, stated, caps))
+    search = [_with_threshold(row, trial, noises) for row in rows]
+    candidates = _best_of_each_method(search)
+    found: list[tuple[float, Settings, list[Row]]] = []
+    for row in candidates:
+        if found and found[0][0] <= row["threshold_N"]:
+            break
+        gamma, inside = _station_limit(settings_of(row), trial, execute)
+        if inside:
+            chosen = dataclasses.replace(settings_of(row), gamma=gamma)
+            found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
+            found.sort(key=lambda entry: entry[0])
+    if not found:
+        raise DrakeTeleopError(
+            "no settings were stable at all corners of the set",
+            where="tune",
+            remedy="state firmer hands, softer walls or a faster network",
+        )
+    _, chosen, inside = found[0]
+    walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
+    limits = execute("limits", _study_of(dataclasses.asdict(chosen), ends, walls), trial)
+    return Found(chosen, search, given, inside, limits)
+
+
+def _best_of_each_method(search: list[Row]) -> list[Row]:
+    """Return the row of each method with the smallest threshold, the smallest first."""
+    best: dict[str, Row] = {}
+    for row in sorted(search, key=lambda row: float(row["threshold_N"])):
+        if row["gamma"] > 0.0:
+            best.setdefault(row["method"], row)
+    return list(best.values())
+
+
+def _station_limit(
+    settings: Settings, trial: StationTrial, execute: Execute
+) -> tuple[float, list[Row]]:
+    """Return the largest gamma that the station holds with the margin, and its rows there.
+
+    gamma is halved until the station holds, then bisected; no rows: it never held.
+    """
+    margin, ends = trial.stated.aims.margin, [c[0] for c in trial.stated.corners]
+    hands = list(dict.fromkeys(ends))
+    tries = 0
+
+    def rows_at(gamma: float) -> list[Row]:
+        nonlocal tries
+        tried = dataclasses.asdict(settings) | {"gamma": margin * gamma}
+        rows: list[Row] = []
+        # The stiffest wall first: it fails more often.
+        for wall in dict.fromkeys(trial.stated.walls[::-1]):
+            name = f"station_{settings.method}_{tries}_{wall:.0f}"
+            rows += execute(name, _study_of(tried, hands, [wall]), trial)
+            if not all(holds(row, margin) for row in rows):
+                rows = []
+                break
+        tries += 1
+        return rows
+
+    gamma, failed, inside = settings.gamma, 0.0, []
+    for _ in range(1 + _HALVINGS):
+        inside = rows_at(gamma)
+        if inside:
+            break
+        gamma, failed = gamma / 2, gamma
+    if not inside:
+        return gamma, []
+    while failed > _CLOSE * gamma:
+        middle = float(np.sqrt(gamma * failed))
+        if rows := rows_at(middle):
+            gamma, inside = middle, rows
+        else:
+            failed = middle
+    return gamma, inside
+
+
+def holds(row: Mapping[str, Any], margin: float = 1.0) -> bool:
+    """Return True if the station rests, quietly, and renders the contact force."""
+    quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
+    return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)
+
+
+def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
+    """Return a function that runs a named study in a folder of `out`, or continues it."""
+
+    def execute(name: str, study: Study, work: Any) -> list[Row]:
+        found = run_study(study, out / name, work, basis, jobs=jobs, progress=progress)
+        for row in found.rows(named=True):
+            if row["error"]:
+                raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
+        return found.rows(named=True)
+
+    return execute
+
+
+def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
+    """Return the row with gamma, reduced by the margin, and the predicted detection threshold."""
+    gamma = row["gamma_limit"] / trial.stated.aims.margin
+    human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
+    masked = row["sigma_inertia"] * scale * _load_force(trial)
+    smallest = max(human.absolute_threshold, human.weber_fraction * masked)
+    noise = 2 * noises[row["low_pass_hz"]] * gamma
+    rendered = scale * gamma * row["share"]
+    threshold = (smallest + noise) / rendered if rendered > 0.0 else np.inf
+    return row | {"gamma": gamma, "threshold_N": float(threshold)}
+
+
+def _load_force(trial: StationTrial) -> float:
+    """Return the rms of the load's inertial force in the swing of the trial [N]."""
+    amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
+    return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
+
+
+def _study_of(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
+    numbers = (settings[name] for name in ("gamma", "sigma_inertia", "low_pass_hz"))
+    return _study([settings["method"]], *numbers, hands, walls, TRIAL_MEASURES)
+
+
+def _study(
+    methods: list[str],
+    gamma: float,
+    sigma: float,
+    low_pass: float,
+    hands: list[str],
+    walls: list[float],
+    measures: list[str],
+) -> Study:
+    values: dict[str, list[Value]] = {
+        "method": [*methods],
+        "gamma": [gamma],
+        "sigma_inertia": [sigma],
+        "low_pass_hz": [low_pass],
+        "hand": [*hands],
+        "wall": [*walls],
+    }
+    factors = [
+        Factor(field=name, words=listed) if isinstance(listed[0], str)  # type: ignore[arg-type]
+        else Factor(field=name, values=listed)  # type: ignore[arg-type]
+        for name, listed in values.items()
+    ]  # fmt: skip
+    return Study(factors=factors, measures=measures)

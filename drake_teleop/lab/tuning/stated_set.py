@@ -1,0 +1,114 @@
+"""Set of hands, walls and network for which a station is tuned."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drake_teleop.common.errors import DrakeTeleopError, suggestion
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
+from drake_teleop.station.scenario import Scenario, replace
+
+_MIN_WALL, _MAX_WALL = 100.0, 60e3  # N/m, range of the leaf's model
+_MAX_STEP_S = 2e-3  # longer than the events' period; else tiny steps precede the events
+
+
+@dataclass(frozen=True)
+class TunedTask:
+    """What the settings of a task must reach.
+
+    Args:
+        margin: factor of the loop gain that must still be stable.
+        min_low_pass_hz: lowest bandwidth of the sensor; a lower one delays the contact force.
+    """
+
+    margin: float
+    min_low_pass_hz: float
+
+
+TASKS = {
+    "press": TunedTask(1.1, 50.0),
+    "touch": TunedTask(1.1, 100.0),
+    "insert": TunedTask(1.5, 50.0),
+}
+"""Tasks by name. A peg jams between two walls, which doubles the stiffness: a larger margin."""
+
+
+@dataclass(frozen=True)
+class StatedSet:
+    """Hands, walls and task for which the settings must hold.
+
+    Args:
+        hands: names of grips, softest first.
+        walls: lowest and highest stiffness [N/m].
+        task: key of `TASKS`.
+    """
+
+    hands: tuple[str, ...]
+    walls: tuple[float, float]
+    task: str
+
+    @property
+    def corners(self) -> list[tuple[str, float]]:
+        """Softest and firmest grip at the softest and stiffest wall; the hardest ones first."""
+        hands = dict.fromkeys((self.hands[0], self.hands[-1]))
+        return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
+
+    @property
+    def aims(self) -> TunedTask:
+        """Requirements of the task."""
+        return TASKS[self.task]
+
+
+def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
+    """Return the set of these grips, walls [kN/m] and this task.
+
+    Raises:
+        DrakeTeleopError: for an unknown name or a stiffness outside 0.1 to 60 kN/m.
+    """
+    for what, names, known in (("hands", hands, tuple(GRIPS)), ("task", (task,), tuple(TASKS))):
+        for name in names:
+            if name not in known:
+                remedy = suggestion(name, known, f"choose among {', '.join(known)}")
+                raise DrakeTeleopError(f"'{name}' is unknown", where=what, remedy=remedy)
+    if not hands:
+        raise DrakeTeleopError("there is no grip", where="hands", remedy="give light, for instance")
+    limits = f"{_MIN_WALL / 1e3:g} to {_MAX_WALL / 1e3:g} kN/m"
+    for wall in walls:
+        if not (math.isfinite(wall) and _MIN_WALL <= 1e3 * wall <= _MAX_WALL):
+            raise DrakeTeleopError(f"{wall:g} kN/m is outside {limits}", where="walls")
+    if not walls:
+        raise DrakeTeleopError(
+            "there is no wall", where="walls", remedy="give 0.5,20, for instance"
+        )
+    ordered = tuple(name for name in GRIPS if name in hands)
+    return StatedSet(ordered, (1e3 * min(walls), 1e3 * max(walls)), task)
+
+
+def base_of(scenario: Scenario, network: str | None) -> Scenario:
+    """Return the scenario over this network, without environment, task and passivity method.
+
+    Raises:
+        DrakeTeleopError: for an unknown network.
+    """
+    if network is not None and network not in PRESETS:
+        remedy = suggestion(network, PRESETS, f"choose among {', '.join(PRESETS)}")
+        raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)
+    scaling = scenario.force_scaling
+    simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)
+    return replace(
+        scenario.without_environment(),
+        simulation=simulation,
+        channel=scenario.channel if network is None else Channel(network=network),
+        passivity=PassivityConfig(),
+        force_scaling=ForceScalingConfig(sigma=0.0, force_scale=scaling.force_scale),
+        contact_detection=None,
+        operator__intent=[],
+        operator__task=None,
+    )

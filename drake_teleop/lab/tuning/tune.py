@@ -1,0 +1,213 @@
+"""`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
+
+`summary.json` contains
+
+============ =====================================================================================
+settings     method, gamma, sigma_weight, sigma_inertia, force_scale, low_pass_hz
+stated       hands, walls [N/m], network, task
+figures      share: rendered over scaled contact force, least of the set; threshold_N: smallest
+             contact force at the tool that the operator detects; given_threshold_N: the same with
+             the scenario's own settings, null if it fails; margin: factor of gamma that was stable;
+             fails_at: hand and wall [N/m] of the first failure beyond the set, or null
+sentences    the answer in sentences
+search       list: method, sigma_inertia, low_pass_hz, gamma_limit, linear_limit, share, threshold_N
+trials       list: rows of `press_trial.TRIAL_MEASURES` in the whole station
+============ =====================================================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from drake_teleop.common.files import (
+    make_folder,
+    output_folder,
+    write_json,
+    write_picture,
+    write_text,
+)
+from drake_teleop.common.html import embedded, render
+from drake_teleop.common.progress import show_progress
+from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
+from drake_teleop.lab.identified_load import identified_load
+from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
+from drake_teleop.lab.tuning.search import Found, holds, search_settings, studies_in
+from drake_teleop.lab.tuning.stated_set import StatedSet, base_of, stated_set
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.scenario_reference import commented, write_scenario
+
+
+def tune(
+    scenario: str | Path | Scenario,
+    out: str | Path = "out/tune",
+    *,
+    hands: Sequence[str] = ("light", "firm"),
+    walls: Sequence[float] = (0.5, 20.0),
+    network: str | None = None,
+    task: str = "press",
+    jobs: int = -1,
+    quiet: bool = True,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Choose passivity method and force scales; write tuned.yaml, summary.json and report.html.
+
+    Args:
+        scenario: shipped name, YAML file, or scenario.
+        out: folder of the results; the same call continues an interrupted one.
+        hands: grips; settings hold from the softest to the firmest.
+        walls: stiffnesses [kN/m]; settings hold from the lowest to the highest.
+        network: preset; None: channel of the scenario.
+        task: press, touch or insert.
+        jobs: number of processes; -1: one for each core.
+        quiet: True hides the sentences and progress bars; `progress` False only the bars.
+
+    Returns:
+        The content of summary.json; the module lists it.
+
+    Raises:
+        DrakeTeleopError: for an invalid set, or if no settings are stable.
+    """
+    given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
+    out, stated = Path(out), stated_set(hands, walls, task)
+    base = base_of(given, network)
+    make_folder(out)
+    shown = progress and not quiet
+    with show_progress(shown) as stage:
+        load = identified_load(base, stage)
+    own = dataclasses.replace(given, contact_detection=None)
+    own = replace(own, simulation=base.simulation, operator=base.operator, channel=base.channel)
+    trial = StationTrial(own, base, stated, load.estimate)
+    basis = {
+        "given": commented(given),
+        "base": commented(base),
+        "stated": dataclasses.asdict(stated),
+        "estimate": load.estimate.tolist(),
+    }
+    found = search_settings(trial, studies_in(out, basis, jobs, shown))
+    tuned = dataclasses.replace(
+        replace(found.settings.apply(base, stated), simulation=given.simulation),
+        operator=given.operator,
+        sheet_spring=given.sheet_spring,
+        slot=given.slot,
+        environment=given.environment,
+        contact_detection=given.contact_detection,
+    )
+    summary = _summary(found, tuned, stated, network)
+    with output_folder(out):
+        write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
+        picture = draw_trade_off(found, summary)
+        write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
+        page = render(
+            "drake_teleop.lab.tuning",
+            "report.html.j2",
+            summary=summary,
+            picture=embedded(out / "trade_off.png"),
+        )
+        write_text(out / "report.html", page)
+        write_json(out / "summary.json", summary)
+    if not quiet:
+        _print(summary, out)
+    return summary
+
+
+def _summary(
+    found: Found, tuned: Scenario, stated: StatedSet, network: str | None
+) -> dict[str, Any]:
+    at_edge = [row for row in found.limits if row["wall"] <= stated.walls[1]]
+    scale = tuned.force_scaling.force_scale
+    failed = [row for row in found.limits if not holds(row)]
+    worst_given = max(row["threshold_N"] for row in found.given)
+    figures = {
+        "share": min(row["share"] for row in [*found.inside, *at_edge]),
+        "threshold_N": max(row["threshold_N"] for row in at_edge),
+        "given_threshold_N": worst_given if all(map(holds, found.given)) else None,
+        "rest_force_N": max(row["rest_force_N"] for row in at_edge),
+        "margin": stated.aims.margin,
+        "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}
+        if failed
+        else None,
+        "beyond_N_per_m": max(row["wall"] for row in found.limits),
+    }
+    settings = dataclasses.asdict(found.settings) | {"sigma_weight": 0.0, "force_scale": scale}
+    about = {
+        "hands": list(stated.hands),
+        "walls": list(stated.walls),
+        "network": network or tuned.channel.network,
+        "task": stated.task,
+    }
+    return {
+        "settings": settings,
+        "stated": about,
+        "figures": figures,
+        "sentences": _sentences(found.settings, figures, about, scale),
+        "search": found.search,
+        "trials": [*found.given, *found.inside, *found.limits],
+    }
+
+
+def _sentences(
+    chosen: Settings, figures: dict[str, Any], about: dict[str, Any], scale: float
+) -> list[str]:
+    low, high = (1e-3 * wall for wall in about["walls"])
+    hands = " to ".join(dict.fromkeys((about["hands"][0], about["hands"][-1])))
+    before = figures["given_threshold_N"]
+    instead = "the scenario's own settings fail in this set"
+    if before is not None:
+        instead = f"with the scenario's own settings it is {before:.2f} N"
+    lines = [
+        f"Take passivity.method {chosen.method}, gamma {chosen.gamma:.2f}, sigma_weight 0, "
+        f"sigma_inertia {chosen.sigma_inertia:g}, force_scale {scale:.4g}, and a low-pass of "
+        f"{chosen.low_pass_hz:g} Hz.",
+        f"The station is stable for a {hands} grip at walls of {low:g} and {high:g} kN/m over "
+        f"{about['network']}, also with gamma {figures['margin']:g} times as large.",
+        f"It renders {figures['share']:.2f} of the scaled contact force at least; above 5 Hz the "
+        f"force at rest has {figures['rest_force_N']:.3f} N rms.",
+        f"The smallest contact force that the operator detects is {figures['threshold_N']:.2f} N "
+        f"at the tool; {instead}.",
+    ]
+    fails = figures["fails_at"]
+    if fails is None:
+        last = f"No failure was found up to walls of {figures['beyond_N_per_m'] / 1e3:g} kN/m."
+    else:
+        wall = fails["wall_N_per_m"] / 1e3
+        last = f"It first fails with a {fails['hand']} grip at a wall of {wall:g} kN/m."
+    return [*lines, last]
+
+
+def draw_trade_off(found: Found, summary: dict[str, Any]) -> Figure:
+    """Draw the detection threshold against the margin of gamma for each method."""
+    with plot_style():
+        figure = Picture(figsize=(6.4, 4.0))
+        axes = figure.subplots()
+        margins = np.geomspace(1.0, 4.0, 50)
+        for colour, method in zip(
+            COLOURS, dict.fromkeys(r["method"] for r in found.search), strict=False
+        ):
+            rows = [r for r in found.search if r["method"] == method and r["gamma_limit"] > 0.0]
+            if not rows:
+                continue
+            best = min(rows, key=lambda row: float(row["threshold_N"]))
+            at_limit = best["threshold_N"] * best["gamma"] / best["gamma_limit"]
+            axes.plot(margins, at_limit * margins, color=colour, label=method)
+        figures = summary["figures"]
+        axes.plot(figures["margin"], figures["threshold_N"], "o", color=BLACK, label="chosen")
+        axes.set_yscale("log")
+        axes.set_xlabel("margin: factor by which gamma may grow")
+        axes.set_ylabel("smallest detected contact force [N]")
+        axes.legend()
+    return figure
+
+
+def _print(summary: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+
+    console = Console()
+    for line in summary["sentences"]:
+        console.print(line, highlight=False, markup=False)
+    console.print(f"written to {out}; run {out / 'tuned.yaml'}", highlight=False, markup=False)

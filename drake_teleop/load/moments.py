@@ -1,0 +1,226 @@
+"""Second moments of a record, from which all least squares estimates follow, Eq. (T4).
+
+They are the mean of z z^T (19, 19). Row c of the regressor [E V] is T_c z with constant T_c:
+
+    z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
+
+with wrench F and w = omega.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, checked_rows
+from drake_teleop.load.regressor import regressor
+
+_MAX_BLOCKS = 1024
+CHUNK = 2**15
+"""Samples per pass over a long record."""
+# Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
+# `normal_equations`.
+_MIN_EIGENVALUE, _MIN_EXCITATION = 1e-12, 1e-9
+# Indices of the products w_i w_j in z.
+_PRODUCTS = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations of white measurement noise, independent between channels.
+
+    Attributes:
+        wrench: (6,) [N, N m]; None to estimate it from the residual.
+        s, omega, alpha: (3,), or a number for all axes [m/s^2, rad/s, rad/s^2].
+        walk: (12,), or 0: step per sample of random walks of [wrench, s, alpha].
+    """
+
+    wrench: ArrayLike | None = None
+    s: ArrayLike = 0.0
+    omega: ArrayLike = 0.0
+    alpha: ArrayLike = 0.0
+    walk: ArrayLike = 0.0
+    motion: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        walk = checked("noise.walk", np.broadcast_to(self.walk, 12), 12)
+        if (walk < 0.0).any():
+            raise DrakeTeleopError("is negative", where="noise.walk")
+        rows = []
+        for name in ("s", "omega", "alpha"):
+            std = checked(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
+            if (std < 0.0).any():
+                raise DrakeTeleopError("is negative", where=f"noise.{name}")
+            rows.append(std)
+        object.__setattr__(self, "motion", np.stack(rows))
+        if self.wrench is not None and not (checked("noise.wrench", self.wrench, 6) > 0.0).all():
+            raise DrakeTeleopError("is not positive throughout", where="noise.wrench")
+
+
+class Moments:
+    """Sum over a record of z z^T (19, 19), z = [1, wrench, s, alpha, products of omega].
+
+    The sums of z over equal blocks of samples show the correlation of noise in time.
+    """
+
+    def __init__(self) -> None:
+        self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_BLOCKS, 19))
+        # Index of the open block, samples of a full block, samples of the open block.
+        self._state = np.array([0, 1, 0])
+
+    @property
+    def samples(self) -> float:
+        """Number of samples, or the sum of their weights."""
+        return float(self._sums[0, 0])
+
+    @property
+    def mean(self) -> Array:
+        """Mean of z z^T (19, 19) over the record."""
+        if self.samples < 3:
+            raise DrakeTeleopError(
+                f"{self.samples:.3g} samples cannot determine a load",
+                remedy="give at least 3, in different orientations",
+            )
+        return self._sums / self.samples
+
+    def add(
+        self,
+        wrench: ArrayLike,
+        s: ArrayLike,
+        omega: ArrayLike,
+        alpha: ArrayLike,
+        weights: ArrayLike | None = None,
+    ) -> None:
+        """Add N samples with arguments as for `identify`, or a single one, with `weights` (N,)."""
+        _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+        n = rows[0].shape[0]
+        weight = np.ones(n) if weights is None else checked("weights", weights, n)
+        for start in range(0, n, CHUNK):
+            part = np.zeros((19, 19))
+            chunk = (table[start : start + CHUNK] for table in (*rows, weight))
+            _accumulate(*chunk, part, self._blocks, self._state)
+            self._sums += part + np.triu(part, 1).T
+
+    def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
+        """Return the mean noise covariance (19, 19) of z, for wrench noise (6,) [N, N m].
+
+        z are the signals of `Moments`.
+        """
+        Q = np.zeros((19, 19))
+        std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
+        Q[np.arange(1, 13), np.arange(1, 13)] = std**2
+        products = self.mean[0, _PRODUCTS]
+        jacobian = np.zeros((3, 3, 19))  # derivative of z by w_k, coefficient of w_i
+        for i in range(3):
+            for j in range(3):
+                jacobian[j, i, _PRODUCTS[i, j]] += 1.0 + (i == j)
+        for k in range(3):
+            Q += noise.motion[1, k] ** 2 * jacobian[k].T @ products @ jacobian[k]
+        return Q
+
+    @staticmethod
+    def walk_covariance(noise: Noise) -> Array:
+        """Return the covariance (19, 19) of a random-walk step of the signals z."""
+        Q = np.zeros((19, 19))
+        Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
+        return Q
+
+
+@cache
+def coefficients() -> Array:
+    """Return the constant T (6, 16, 19) with regressor [E V] = T z, z the signals of `Moments`."""
+    T, unit, zero = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
+    T[np.arange(6), np.arange(6), 0] = 1.0
+    T[:, 6:, 7:10] = np.moveaxis(regressor(unit, zero, zero), 0, -1)
+    T[:, 6:, 10:13] = np.moveaxis(regressor(zero, zero, unit), 0, -1)
+    T[:, 6:, 13:16] = np.moveaxis(regressor(zero, unit, zero), 0, -1)
+    for k, (i, j) in enumerate([(0, 1), (0, 2), (1, 2)]):
+        both = regressor(zero, unit[i] + unit[j], zero)
+        T[:, 6:, 16 + k] = both - regressor(zero, unit[[i, j]], zero).sum(axis=0)
+    T.flags.writeable = False
+    return T
+
+
+def centripetal_matrix(r: Array) -> Array:
+    """Return C (..., 3, 6): C z[13:19] is the acceleration omega x (omega x r) of r (..., 3)."""
+    x, y, z = np.moveaxis(r, -1, 0)
+    o = np.zeros_like(x)
+    rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
+    """Return the Gram matrix (16, 16), sum of W_cd T_c Z T_d^T, and the right-hand side (16,).
+
+    Z (19, 19) is a mean or a noise covariance of z, W (6, 6) the weights between channels.
+    """
+    T = coefficients()
+    TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
+    WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
+    gram = TZ.transpose(1, 0, 2).reshape(16, -1) @ WT.transpose(1, 0, 2).reshape(16, -1).T
+    right = np.einsum("cjd,cd->j", TZ[:, :, 1:7], W)
+    return 0.5 * (gram + gram.T), right
+
+
+def residual_covariance(Z: Array, theta: Array) -> Array:
+    """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta, theta = [offsets; phi].
+
+    Z (19, 19) is a mean of z z^T or a noise covariance of z.
+    """
+    L = -np.einsum("cjk,j->ck", coefficients(), theta)
+    L[np.arange(6), np.arange(1, 7)] += 1.0
+    S = L @ Z @ L.T
+    return 0.5 * (S + S.T)
+
+
+def excited_columns(Z: Array) -> NDArray[np.bool_]:
+    """Return (16,) booleans: True for parameters whose column of [E V] exceeds rounding errors."""
+    return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
+
+
+def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
+    """Return R (n, rank) with R^T gram R = 1; R R^T right is the minimum-norm solution."""
+    scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
+    eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
+    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept]), np.float64)
+
+
+@njit(cache=True)
+def _accumulate(wrench, s, omega, alpha, weights, sums, blocks, state):
+    """Add samples to the upper half of the sums of z z^T, and to those of z per block.
+
+    A full table of blocks is halved by joining pairs.
+    """
+    z = np.empty(19)
+    last, length, filled = state
+    for i in range(wrench.shape[0]):
+        if filled == length:
+            last, filled = last + 1, 0
+        if last == blocks.shape[0]:
+            last, length = last // 2, 2 * length
+            for b in range(last):
+                blocks[b] = blocks[2 * b] + blocks[2 * b + 1]
+            blocks[last:] = 0.0
+        filled += 1
+        z[0] = 1.0
+        for k in range(6):
+            z[1 + k] = wrench[i, k]
+        for k in range(3):
+            z[7 + k] = s[i, k]
+            z[10 + k] = alpha[i, k]
+            z[13 + k] = omega[i, k] * omega[i, k]
+        z[16] = omega[i, 0] * omega[i, 1]
+        z[17] = omega[i, 0] * omega[i, 2]
+        z[18] = omega[i, 1] * omega[i, 2]
+        for j in range(19):
+            weighted = weights[i] * z[j]
+            blocks[last, j] += weighted
+            for k in range(j, 19):
+                sums[j, k] += weighted * z[k]
+    state[0], state[1], state[2] = last, length, filled

@@ -1,0 +1,189 @@
+"""Files of the C99 kernel for an identified load, with a test vector from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from drake_teleop.common.html import render
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.version import __version__
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causal import design_low_pass
+from drake_teleop.robots import compensation_step as step
+from drake_teleop.robots.compensator import STALE_S, Compensator
+from drake_teleop.robots.controller.translator import HELPERS, Translator
+from drake_teleop.robots.streams import VALUES, Reading
+
+PACKAGE = "drake_teleop.robots.controller"
+CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
+"""Options of a C compiler for the bits of Python."""
+KERNEL = ("wrench_compensator.h", "wrench_compensator.c")
+_VECTOR_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
+_VECTOR_READINGS = 1000
+_TORQUES_SMALLER = np.repeat([1.0, 0.05], 3)
+_SETTINGS = (
+    *("phi", "offsets", "sigma_weight", "sigma_inertia", "gamma", "low_pass", "low_pass_count"),
+    *("range", "largest", "noise_limits", "stale_steps", "tare_steps"),
+)  # in the order of the C structure
+
+Files = Mapping[str, str | bytes]
+
+
+@cache
+def kernel() -> str:
+    """Return the text of wrench_compensator.c."""
+    c = Translator()
+    row, out = (VALUES + 6,), (12,)
+    c.add(step.value_problem, values=(VALUES,), largest=(VALUES,), limits=(6,))
+    c.add(
+        step.scales_into, sigma_weight="double", sigma_inertia="double", gamma="double", scales=(4,)
+    )
+    c.add(
+        step.eliminate_into,
+        values=(VALUES,),
+        gravity=(3,),
+        offsets=(6,),
+        phi=(10,),
+        nothing=(10,),
+        scales=(4,),
+        low_pass=("low_pass_count",),
+        memory=(2, *out),
+        rest=(1, *row),
+        at="int",
+        out=out,
+    )
+    c.add(step.clip, wrenches=out, limits=(6,))
+    c.add(step.add_to_statistics, row=row, count="double", mean=row, squares=row)
+    c.add(step.tare_into, count="double", mean=row, squares=row, noise_limits=(6,), offsets=(6,))
+    c.add(design_low_pass, dt="double", tangent="double", ahead_s="double", low_pass=(7,))
+    return rendered("wrench_compensator.c", kernel=c.text, helpers=HELPERS)
+
+
+def header() -> str:
+    """Return the text of wrench_compensator.h."""
+    return template("wrench_compensator.h")
+
+
+class Target(NamedTuple):
+    """Load and loop of an export.
+
+    Attributes:
+        dt: period of the readings [s].
+        cutoff_hz, largest: see `Compensator`.
+        sign: -1 if the sensor reports the wrench of the load on the sensor, else 1.
+        notes: warnings for the user.
+    """
+
+    found: Identification
+    dt: float
+    cutoff_hz: float | None
+    largest: Array | None
+    sign: int
+    notes: list[str]
+
+    def settings(self, largest: Array | None = None, **scales: Any) -> str:
+        """Return a C initializer of `wrench_compensator_settings`."""
+        loop = self.loop(largest, **scales)
+        values = {
+            "sigma_weight": 0.0,
+            "sigma_inertia": 0.0,
+            "gamma": 1.0,
+            **scales,
+            **loop.settings,
+        }
+        return "".join(f"    {_literal(values[name])}, /* {name} */\n" for name in _SETTINGS)
+
+    def loop(self, largest: Array | None = None, **scales: Any) -> Compensator:
+        """Return a compensator for this load."""
+        largest = self.largest if largest is None else largest
+        return Compensator(self.found, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
+
+
+def c99_files(target: Target) -> Files:
+    """Return the files of the format `c99` by name."""
+    return {
+        **kernel_files(target),
+        "test_vector.h": _test_vector(target),
+        "test_wrench_compensator.c": template("test_wrench_compensator.c"),
+        "CMakeLists.txt": template("CMakeLists.txt"),
+        "README.md": rendered(
+            "README.c99.md",
+            rate=f"{1.0 / target.dt:g}",
+            period=f"{target.dt:g}",
+            notes=target.notes,
+            count=_VECTOR_READINGS,
+        ),
+    }
+
+
+def kernel_files(target: Target) -> Files:
+    """Return the C code and the load's header by name."""
+    load = rendered("load.h", dt=repr(target.dt), settings=target.settings(), notes=target.notes)
+    return dict(zip((*KERNEL, "load.h"), (header(), kernel(), load), strict=True))
+
+
+def template(name: str) -> str:
+    """Return a shipped file."""
+    return resources.files(PACKAGE).joinpath(f"templates/{name}").read_text(encoding="utf-8")
+
+
+def rendered(name: str, **values: Any) -> str:
+    """Return a shipped template with its values; nothing is escaped."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, str):
+            return Markup(value)
+        return [plain(each) for each in value] if isinstance(value, (list, tuple)) else value
+
+    values = {key: plain(value) for key, value in ({"version": __version__} | values).items()}
+    return render(PACKAGE, f"templates/{name}.j2", **values) + "\n"
+
+
+def _test_vector(target: Target) -> str:
+    inputs, largest = _simulated_readings(target)
+    python = target.loop(largest, **_VECTOR_SCALES)
+    outputs = [
+        python.step(Reading(k, t, row[:VALUES], gravity=row[VALUES:]), t)
+        for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
+    ]
+    return rendered(
+        "test_vector.h",
+        settings=target.settings(largest, **_VECTOR_SCALES),
+        inputs=[_literal(row) for row in inputs],
+        outputs=[_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
+        flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",
+    )
+
+
+def _simulated_readings(target: Target) -> tuple[Array, Array]:
+    """Return readings with gravity (N, 18), and a range of the sensor (6,) that some exceed.
+
+    The load moves and touches something; single readings and a longer series are invalid.
+    """
+    phase = 2.0 * np.pi * np.arange(_VECTOR_READINGS)[:, None] / _VECTOR_READINGS
+    omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
+    alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])
+    down = np.array([3.0, -4.0, -8.0]) + omega
+    motion = 5.0 * alpha - down, omega, alpha
+    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TORQUES_SMALLER
+    wrench = non_contact_wrench(*motion, target.found.phi) + target.found.offsets + contact
+    readings = np.round(np.hstack([wrench, *motion, down]), 6)
+    largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)
+    readings[100:103, 7], readings[200, 0], readings[201, 12] = np.nan, np.inf, 1e7
+    first = _VECTOR_READINGS // 2
+    readings[first : first + round(2.0 * STALE_S / target.dt) + 2, 5] = np.nan
+    return readings, largest
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        text = ", ".join(repr(float(x)) for x in value)
+        return "{" + text.replace("nan", "NAN").replace("inf", "INFINITY") + "}"
+    return repr(value)

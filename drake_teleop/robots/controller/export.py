@@ -1,0 +1,70 @@
+"""Export of an identified load with the compensation itself, as a folder of files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import make_folder, whole_file
+from drake_teleop.load.identification import Identification
+from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.controller.c99 import Files, Target, c99_files
+from drake_teleop.robots.controller.fmu import fmu_files
+from drake_teleop.robots.controller.ros2_filter import ros2_filter_files
+from drake_teleop.robots.export import in_sensor_frame, refuse_removed_weight
+
+FORMATS: dict[str, Callable[[Target], Files]] = {
+    "c99": c99_files,
+    "fmu": fmu_files,
+    "ros2_filter": ros2_filter_files,
+}
+"""Functions that return the files of a format."""
+
+
+def export_controller(
+    found: Identification,
+    to: str,
+    out: Path,
+    *,
+    rate_hz: float | None,
+    cutoff_hz: float | None = 30.0,
+    largest: tuple[float, float] | None = None,
+    sensor_pose: Sequence[float] | None = None,
+    sign: int = -1,
+) -> list[str]:
+    """Write the files of the format `to`, a key of `FORMATS`; return warnings.
+
+    Args:
+        rate_hz: rate of the readings.
+        cutoff_hz: cut-off of the low-pass; None: no low-pass.
+        largest: range of the sensor: force [N], torque [N m].
+        sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
+
+    Raises:
+        DrakeTeleopError: without a rate, for a sensor's pose, for a wrench without the load's
+            weight, or for a folder that is not writable.
+    """
+    if rate_hz is None:
+        raise DrakeTeleopError(
+            f"is required by {to}", where="rate", remedy="give the rate of the readings in Hz"
+        )
+    if sensor_pose is not None:
+        raise in_sensor_frame(to)
+    refuse_removed_weight(found, to)
+    notes = [
+        f"{name} is that of a point mass: it is not identified" for name in usable_phi(found)[1]
+    ]
+    if largest is None:
+        notes.append("no range of the sensor was given: saturation is not detected")
+    whole = None if largest is None else np.repeat(np.array(largest, float), 3)
+    files = FORMATS[to](Target(found, 1.0 / rate_hz, cutoff_hz, whole, sign, notes))
+    for name, content in files.items():
+        path = out / name
+        make_folder(path.parent)
+        with whole_file(path) as temporary:
+            data = content.encode() if isinstance(content, str) else content
+            temporary.write_bytes(data)
+    return notes

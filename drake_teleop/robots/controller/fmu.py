@@ -1,0 +1,166 @@
+"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of the kernel with a load."""
+
+from __future__ import annotations
+
+import io
+import platform
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from pathlib import Path
+from uuid import NAMESPACE_URL, uuid5
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from drake_teleop.common.version import __version__
+from drake_teleop.robots.controller.c99 import CFLAGS, Files, Target, kernel_files, template
+
+_NAME = "wrench_compensator"
+_WRENCH = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+_UNITS = {
+    "N": {"kg": "1", "m": "1", "s": "-2"},
+    "N.m": {"kg": "1", "m": "2", "s": "-2"},
+    "m/s2": {"m": "1", "s": "-2"},
+    "rad/s": {"rad": "1", "s": "-1"},
+    "rad/s2": {"rad": "1", "s": "-2"},
+    "kg": {"kg": "1"},
+    "kg.m": {"kg": "1", "m": "1"},
+    "kg.m2": {"kg": "1", "m": "2"},
+}
+_PLATFORMS = {"2.0": "linux64", "3.0": "x86_64-linux"}
+
+
+def fmu_files(target: Target) -> Files:
+    """Return two FMUs by name: sources, and binaries for Linux if there is a C compiler.
+
+    A missing compiler is added to the notes of `target`.
+    """
+    compiler = shutil.which("cc")
+    if platform.system() != "Linux" or platform.machine() != "x86_64":
+        compiler = None
+    if compiler is None:
+        target.notes.append("the FMUs contain sources only: there is no C compiler for linux64")
+    kernel = dict(kernel_files(target))
+    token = str(uuid5(NAMESPACE_URL, "".join(map(str, kernel.values()))))
+    kernel["token.h"] = f'#define TOKEN "{token}"\n'
+    kernel["fmu.h"] = template("fmu.h")
+    return {
+        f"{_NAME}_fmi{version[0]}.fmu": _fmu(target, kernel, version, token, compiler)
+        for version in ("2.0", "3.0")
+    }
+
+
+def _fmu(target: Target, kernel: Files, version: str, token: str, compiler: str | None) -> bytes:
+    sources = {**kernel, f"fmi{version[0]}.c": template(f"fmi{version[0]}.c")}
+    files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
+    compiled = [name for name in sources if name.endswith(".c")]
+    files["modelDescription.xml"] = _description(target, version, token, compiled)
+    if version == "3.0":
+        build = Element("fmiBuildDescription", fmiVersion="3.0")
+        configuration = SubElement(build, "BuildConfiguration", modelIdentifier=_NAME)
+        group = SubElement(configuration, "SourceFileSet", language="C99")
+        for name in compiled:
+            SubElement(group, "SourceFile", name=name)
+        files["sources/buildDescription.xml"] = _xml(build)
+    if compiler is not None:
+        binary = f"binaries/{_PLATFORMS[version]}/{_NAME}.so"
+        files[binary] = _shared_library(compiler, sources, compiled)
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)  # without the time
+    return content.getvalue()
+
+
+def _shared_library(compiler: str, sources: Files, compiled: list[str]) -> bytes:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in sources.items():
+            (folder / file).write_text(str(text), encoding="utf-8")
+        options = [*CFLAGS, "-shared", "-fPIC", "-fvisibility=hidden", "-s"]
+        command = [compiler, *options, *compiled, "-o", "library.so"]
+        subprocess.run(command, cwd=folder, check=True)
+        return (folder / "library.so").read_bytes()
+
+
+def _description(target: Target, version: str, token: str, compiled: list[str]) -> str:
+    new = version == "3.0"
+    root = Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": version,
+            "modelName": _NAME,
+            "instantiationToken" if new else "guid": token,
+            "description": "Wrist wrench without weight and inertia of the load",
+            "generationTool": f"drake_teleop {__version__}",
+        },
+    )
+    simulation = SubElement(root, "CoSimulation", modelIdentifier=_NAME)
+    if new:
+        simulation.set("fixedInternalStepSize", repr(target.dt))
+    else:
+        files = SubElement(simulation, "SourceFiles")
+        for name in compiled:
+            SubElement(files, "File", name=name)
+    units = SubElement(root, "UnitDefinitions")
+    for unit, base in _UNITS.items():
+        SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", base)
+    SubElement(root, "DefaultExperiment", stepSize=repr(target.dt))
+    variables = SubElement(root, "ModelVariables")
+    listed = _variables(target)
+    for reference, (name, causality, unit, start) in enumerate(listed):
+        common = {"name": name, "valueReference": str(reference), "causality": causality}
+        common["variability"] = "tunable" if causality == "parameter" else "discrete"
+        values = {} if start is None else {"start": repr(start)}
+        values |= {"unit": unit} if unit else {}
+        if new:
+            SubElement(variables, "Int32" if name == "flags" else "Float64", common | values)
+        else:
+            variable = SubElement(variables, "ScalarVariable", common)
+            SubElement(variable, "Integer" if name == "flags" else "Real", values)
+    if new:
+        time = {"name": "time", "valueReference": str(len(listed)), "causality": "independent"}
+        SubElement(variables, "Float64", time | {"variability": "continuous"})
+    outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
+    structure = SubElement(root, "ModelStructure")
+    _list_unknowns(structure, outputs, new)
+    return _xml(root)
+
+
+def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
+    """List value references (FMI 3.0) or places, counted from 1 (FMI 2.0)."""
+    for tag in ("Output", "InitialUnknown"):
+        group = structure if new else SubElement(structure, f"{tag}s")
+        for k in outputs:
+            if new:
+                SubElement(group, tag, valueReference=str(k))
+            else:
+                SubElement(group, "Unknown", index=str(k + 1))
+
+
+def _variables(target: Target) -> list[tuple[str, str, str, float | None]]:
+    """Return name, causality, unit and start value in the order of fmu.h."""
+    wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH]
+    vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
+    motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
+    found = target.loop().settings
+    phi_units = ["kg", *["kg.m"] * 3, *["kg.m2"] * 6]
+    phi_names = ("m", "mc_x", "mc_y", "mc_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
+    phi = zip(phi_names, phi_units, found["phi"], strict=True)
+    offsets = zip(wrench, found["offsets"], strict=True)
+    return [
+        *((name, "input", unit, 0.0) for name, unit in (*wrench, *motion)),
+        *((f"contact_{name}", "output", unit, None) for name, unit in wrench),
+        *((f"scaled_{name}", "output", unit, None) for name, unit in wrench),
+        ("flags", "output", "", None),
+        ("sigma_weight", "parameter", "", 0.0),
+        ("sigma_inertia", "parameter", "", 0.0),
+        ("gamma", "parameter", "", 1.0),
+        *((name, "parameter", unit, float(value)) for name, unit, value in phi),
+        *((f"offset_{name}", "parameter", unit, float(x)) for (name, unit), x in offsets),
+    ]
+
+
+def _xml(root: Element) -> str:
+    indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"

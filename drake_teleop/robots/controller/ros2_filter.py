@@ -1,0 +1,27 @@
+"""ROS 2 package with the kernel as a filter of wrenches."""
+
+from __future__ import annotations
+
+from drake_teleop.robots.controller.c99 import Files, Target, kernel_files, rendered, template
+
+_NAME = "wrench_compensator_filter"
+_FOLDER = "ros2_filter"
+
+
+def ros2_filter_files(target: Target) -> Files:
+    """Return the files of the package by name."""
+    shipped = {
+        f"{_NAME}.xml": f"{_NAME}.xml",
+        "package.xml": "package.xml",
+        "CMakeLists.txt": "CMakeLists.txt",
+        f"src/{_NAME}.cpp": f"{_NAME}.cpp",
+    }
+    kernel = dict(kernel_files(target))
+    sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
+    kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
+    values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
+    return {
+        **{name: template(f"{_FOLDER}/{file}") for name, file in shipped.items()},
+        **{f"src/{name}": text for name, text in kernel.items()},
+        "README.md": rendered(f"{_FOLDER}/README.md", **values),
+    }

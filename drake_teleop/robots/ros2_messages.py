@@ -1,0 +1,162 @@
+"""Conversion of ROS 2 messages to parts, shared by the sources by rclpy and by zenoh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.vectors import multiply, rotate
+from drake_teleop.robots.address import Address
+from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Part
+
+WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+KINDS = {
+    WRENCH: WRENCH_STAMPED,
+    "tf": "tf2_msgs/msg/TFMessage",
+    POSE: "geometry_msgs/msg/PoseStamped",
+    IMU: "sensor_msgs/msg/Imu",
+    JOINTS: "sensor_msgs/msg/JointState",
+}
+_STREAMS = {"tf": POSE}
+_MAX_FRAMES = 64  # frames in a chain
+SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
+"""Parameters of a source's address."""
+
+
+def domain_of(address: Address) -> int:
+    """Return the ROS domain in an address, by default 0; raise DrakeTeleopError if invalid."""
+    text = address.parameter("domain") or "0"
+    if not (text.isdecimal() and text.isascii() and int(text) <= 232):
+        raise DrakeTeleopError(f"domain={text!r} is not 0 to 232", where=address.text)
+    return int(text)
+
+
+def topic_of(address: Address, text: str) -> str:
+    """Return a topic name without leading slash; raise DrakeTeleopError if invalid."""
+    topic = text.strip("/")
+    if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
+        raise DrakeTeleopError(
+            f"{text!r} is not a topic",
+            where=address.text,
+            remedy="give one, such as zenoh://HOST/ft_sensor/wrench",
+        )
+    return topic
+
+
+def source_topics(
+    address: Address, joints: tuple[str, ...]
+) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
+    """Return the topics in an address by name (see `KINDS`), the frames of `tf`, and the streams.
+
+    Args:
+        joints: names of the arm's joints.
+
+    Raises:
+        DrakeTeleopError: if a topic or `tf` is invalid, or joint names are missing.
+    """
+    topics = {WRENCH: topic_of(address, address.path)}
+    for stream in (POSE, IMU, JOINTS):
+        if (text := address.parameter(stream)) is not None:
+            topics[stream] = topic_of(address, text)
+    frames: tuple[str, ...] = ()
+    if (text := address.parameter("tf")) is not None:
+        frames, topics["tf"] = tuple(text.split(",")), "tf"
+        if len(frames) != 2 or not all(frames):
+            raise DrakeTeleopError("tf is not PARENT,CHILD", where=address.text)
+    if JOINTS in topics and not joints:
+        raise DrakeTeleopError(
+            "joint positions need the model of the arm",
+            where=address.text,
+            remedy="give --model and --sensor-frame",
+        )
+    return topics, frames, tuple(_STREAMS.get(name, name) for name in topics)
+
+
+def damaged(name: str) -> Part:
+    """Return the part for an invalid message; `name`: see `KINDS`."""
+    return DAMAGED_WRENCH._replace(stream=_STREAMS.get(name, name))
+
+
+class MessageConverter:
+    """Converter of ROS 2 messages to parts (samples of single streams).
+
+    Args:
+        sign: see `Address.sign`.
+        frames: parent and child frame of the pose from `/tf`; empty for none.
+        joints: names of the joints, in the order of the values.
+    """
+
+    def __init__(
+        self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
+    ) -> None:
+        self._sign, self._frames, self._joints = sign, frames, joints
+        self._links: dict[str, tuple[str, Array]] = {}
+
+    def parts_of(self, name: str, data: Any, number: int) -> list[Part]:
+        """Return the parts of a message with ROS's fields; `name`: see `KINDS`."""
+        if name == "tf":
+            samples = self._transform_pose(data)
+        else:
+            values = self._values(name, data)
+            samples = [] if values is None else [(data.header.stamp, values)]
+        return [
+            Part(_STREAMS.get(name, name), number, stamp.sec + 1e-9 * stamp.nanosec, values)
+            for stamp, values in samples
+        ]
+
+    def add_transforms(self, data: Any) -> None:
+        """Store the transforms of a TFMessage; those of `/tf_static` yield no pose."""
+        for each in data.transforms:
+            X = each.transform
+            self._links[each.child_frame_id] = (
+                each.header.frame_id,
+                _pose(X.translation, X.rotation),
+            )
+
+    def _values(self, name: str, data: Any) -> Array | None:
+        if name == WRENCH:
+            wrench = data.wrench
+            return self._sign * np.array([*_xyz(wrench.force), *_xyz(wrench.torque)])
+        if name == POSE:
+            return _pose(data.pose.position, data.pose.orientation)
+        if name == JOINTS:
+            positions = dict(zip(data.name, data.position, strict=False))
+            if not self._joints or not all(joint in positions for joint in self._joints):
+                return None
+            return np.array([positions[joint] for joint in self._joints], float)
+        return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
+
+    def _transform_pose(self, data: Any) -> list[tuple[Any, Array]]:
+        newest = {each.child_frame_id: each for each in data.transforms}
+        self.add_transforms(data)
+        if not self._frames:
+            return []
+        parent, frame = self._frames
+        pose, stamp = np.array([1.0, 0, 0, 0, 0, 0, 0]), None
+        for _ in range(_MAX_FRAMES):
+            if frame == parent:
+                return [] if stamp is None else [(stamp, pose)]
+            if frame not in self._links:
+                break
+            if frame in newest:
+                stamp = newest[frame].header.stamp
+            frame, link = self._links[frame]
+            pose = _compose(link, pose)
+        return []
+
+
+def _xyz(v: Any) -> tuple[float, float, float]:
+    return v.x, v.y, v.z
+
+
+def _pose(p: Any, q: Any) -> Array:
+    return np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
+
+
+def _compose(a: Array, b: Array) -> Array:
+    q = tuple(a[:4].tolist())
+    p = rotate(q, tuple(b[4:].tolist()))
+    return np.array([*multiply(q, tuple(b[:4].tolist())), *(a[4:] + p)])

@@ -1,0 +1,186 @@
+"""`drake-teleop ros2`: `compensate` as a ROS 2 node with services and parameters.
+
+=============== ===============================================================================
+service         std_srvs/Trigger; `message` contains the result or the reason of a refusal
+~/tare          set the offsets; at rest, without contact
+~/load          read the file of the parameter `load`
+~/calibrate     record until the tolerance `until` is met, and use the load; answers at the end
+parameter
+sigma, gamma    scales of the scaled wrench; sigma_weight and sigma_inertia, if negative: sigma
+load, until     file of the load; tolerances and
+seconds         largest length [s] of the record of a calibration
+=============== ===============================================================================
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.identification import Identification
+from drake_teleop.robots.calibration import DEFAULT_TOLERANCE
+from drake_teleop.robots.compensate import compensate_command
+from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.ros2 import parse_address, shared_node
+from drake_teleop.robots.ros2_messages import SOURCE_PARAMETERS, domain_of
+
+_SCALES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
+_CALIBRATE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
+
+
+class ServedCompensator:
+    """Compensator that the services and parameters of a node replace and change.
+
+    Args:
+        node: node of rclpy.
+        make: function from a load to a compensator.
+        load: file of the load.
+        calibrate: function from tolerance and seconds to the arguments of `calibrate`.
+        out: folder of the calibration.
+        scales: sigma and gamma.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        make: Callable[[Identification], Compensator],
+        load: Path,
+        calibrate: Callable[[str, float], list[str]],
+        out: Path,
+        scales: dict[str, float],
+    ) -> None:
+        from std_srvs.srv import Trigger
+
+        self._node, self._make, self._calibrate, self._out = node, make, calibrate, out
+        self._current = make(Identification.load(load))
+        self._pool = ThreadPoolExecutor(1)
+        self._process: subprocess.Popen[str] | None = None
+        for name in _SCALES:
+            node.declare_parameter(name, float(scales[name]))
+        node.declare_parameter("load", str(load))
+        node.declare_parameter("until", DEFAULT_TOLERANCE)
+        node.declare_parameter("seconds", 120.0)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(lambda _: self._set_scales())
+        node.create_service(Trigger, "~/tare", self._answer(lambda: self._current.tare()))
+        node.create_service(Trigger, "~/load", self._answer(self._load))
+        node.create_service(Trigger, "~/calibrate", self._answer_calibration)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._current, name)
+
+    def close(self) -> None:
+        """End a calibration that runs."""
+        if self._process is not None:
+            self._process.terminate()
+        self._pool.shutdown()
+
+    def _value(self, name: str) -> Any:
+        return self._node.get_parameter(name).value
+
+    def _set_scales(self) -> None:
+        sigma, gamma, *others = (self._value(name) for name in _SCALES)
+        weight, inertia = (None if value < 0.0 else value for value in others)
+        self._current.set_scales(sigma, gamma, weight, inertia)
+
+    def _check(self, parameters: list[Any]) -> Any:
+        from rcl_interfaces.msg import SetParametersResult
+
+        for each in parameters:
+            separate = each.name in _SCALES[2:]
+            if each.name in _SCALES and not (
+                math.isfinite(each.value) and (separate or each.value >= 0.0)
+            ):
+                reason = f"{each.name}: {each.value} is not a finite number of at least 0"
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def _answer(self, act: Callable[[], str]) -> Callable[[Any, Any], Any]:
+        def answer(_request: Any, response: Any) -> Any:
+            try:
+                response.message = act()
+            except DrakeTeleopError as error:
+                response.message = f"refused: {error}"
+            response.success = not response.message.startswith("refused")
+            return response
+
+        return answer
+
+    def _load(self) -> str:
+        compensator = self._make(load := Identification.load(self._value("load")))
+        self._current = compensator
+        self._set_scales()
+        return f"done: {load.mass:.4g} kg"
+
+    async def _answer_calibration(self, _request: Any, response: Any) -> Any:
+        from rclpy.parameter import Parameter
+        from rclpy.task import Future
+
+        if self._process is not None:
+            response.message = "refused: a calibration runs already"
+            return response
+        words = [sys.executable, "-c", _CALIBRATE]
+        words += self._calibrate(self._value("until"), self._value("seconds"))
+        process = self._process = subprocess.Popen(
+            words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        ended: Any = Future(executor=self._node.executor)
+        self._pool.submit(lambda: ended.set_result(process.communicate()[1]))
+        said, status = await ended, process.returncode
+        self._process = None
+        if status == 0:
+            path = str(self._out / "identification.json")
+            self._node.set_parameters([Parameter("load", value=path)])
+            return self._answer(self._load)(None, response)
+        advice = "interrupted"
+        if status == 1:
+            summary = json.loads((self._out / "summary.json").read_text(encoding="utf-8"))
+            advice = f"the tolerance is not met: {summary['advice'] or summary['doubts']}"
+        elif said.strip():
+            advice = said.strip().splitlines()[-1]
+        response.message = f"refused: {advice}"
+        return response
+
+
+def ros2_command(
+    source: str,
+    load: Path,
+    sink: str,
+    out: Path,
+    *,
+    calibrate: Callable[[str, float], list[str]],
+    **options: Any,
+) -> None:
+    """Run the command `ros2` until Ctrl-C; `options` are those of `compensate_command`.
+
+    Args:
+        out: folder of the calibrations.
+        calibrate: function from tolerance and seconds [s] to the arguments of `calibrate`.
+
+    Raises:
+        DrakeTeleopError: if an argument is invalid, or rclpy is missing.
+    """
+    for address in (source, sink):
+        if not address.startswith("ros2://"):
+            raise DrakeTeleopError("is not ros2://TOPIC", where=address)
+    node = shared_node(domain_of(parse_address(source, SOURCE_PARAMETERS)))
+    scales = {name: -1.0 if options.get(name) is None else options[name] for name in _SCALES}
+    served: list[ServedCompensator] = []
+
+    def serve(make: Callable[[Identification], Compensator]) -> Any:
+        served.append(ServedCompensator(node.node, make, load, calibrate, out, scales))
+        return served[0]
+
+    try:
+        compensate_command(source, load, sink, serve=serve, **options)
+    finally:
+        for each in served:
+            each.close()
+        node.close()

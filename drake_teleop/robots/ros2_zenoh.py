@@ -1,0 +1,223 @@
+"""Experimental source and sink for ROS 2 with rmw_zenoh, by eclipse-zenoh, without ROS.
+
+A topic has the key `DOMAIN/TOPIC/TYPE/HASH`. Messages are CDR, with number, send time and sender
+attached.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import struct
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.common.errors import require_library
+from drake_teleop.common.numeric import Array
+from drake_teleop.robots.address import Address
+from drake_teleop.robots.ros2_messages import (
+    KINDS,
+    SOURCE_PARAMETERS,
+    WRENCH_STAMPED,
+    MessageConverter,
+    damaged,
+    domain_of,
+    source_topics,
+    topic_of,
+)
+from drake_teleop.robots.streams import Compensated, Part
+
+PORT = 7447
+_NUMBER = struct.Struct("<qq")
+_ATTACHMENT = struct.Struct("<qqB16s")
+_OLD_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
+_MAX_QUEUED = 4096  # queued messages; newer ones are dropped
+_NODE = "drake_teleop"
+
+
+def require_libraries(where: str) -> None:
+    """Raise DrakeTeleopError, for the address `where`, if a library is missing."""
+    require_library("zenoh", "eclipse-zenoh", "ros", where)
+    require_library("rosbags", "rosbags", "ros", where)
+
+
+def message_types() -> Any:
+    """Return the store of ROS 2 message types of rosbags."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def open_session(address: Address) -> Any:
+    """Return a session with the zenoh router at `address`, which may start later."""
+    import zenoh
+
+    config = zenoh.Config()
+    retry = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
+    for key, value in {
+        "mode": "client",
+        "connect/endpoints": [f"tcp/{address.host}:{address.port}"],
+        "connect/timeout_ms": 0,
+        "connect/exit_on_failure": False,
+        "connect/retry": retry,
+        "scouting/multicast/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
+    """Return the zenoh key of a topic, by default with any hash (ROS Humble has none)."""
+    return f"{domain}/{topic}/{_dds(kind)}/{hashed}"
+
+
+def liveliness_tokens(
+    domain: int, session: str, node: str, topic: str, kind: str, hashed: str
+) -> list[str]:
+    """Return the liveliness tokens of a node with one publisher."""
+    here = f"@ros2_lv/{domain}/{session}/0"
+    name = "%" + topic.replace("/", "%")
+    return [
+        f"{here}/0/NN/%/%/{node}",
+        f"{here}/1/MP/%/%/{node}/{name}/{_dds(kind)}/{hashed}/::,10:,:,:,,",
+    ]
+
+
+def attachment(number: int, ns: int, sender: bytes) -> bytes:
+    """Return the attachment of a message, as in rmw_zenoh since 0.2.4; `ns`: send time."""
+    return _ATTACHMENT.pack(number, ns, len(sender), sender)
+
+
+def message_number(attached: bytes) -> int | None:
+    """Return the message number in an attachment; None if it is absent."""
+    if len(attached) == _ATTACHMENT.size:
+        return int(_NUMBER.unpack_from(attached)[0])
+    if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
+        return int(struct.unpack_from("<q", attached, len(_OLD_PREFIX))[0])
+    return None
+
+
+def _dds(kind: str) -> str:
+    package, _, name = kind.split("/")
+    return f"{package}::msg::dds_::{name}_"
+
+
+class Messages(MessageConverter):
+    """Converter of ROS 2 messages in CDR; for the arguments see `MessageConverter`."""
+
+    def __init__(
+        self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
+    ) -> None:
+        from rosbags.serde.errors import SerdeError
+
+        super().__init__(sign, frames, joints)
+        self._types, self._damaged = message_types(), SerdeError
+        self._counts = dict.fromkeys(KINDS, 0)
+        for name in KINDS:  # creates the deserializers before the first message
+            self.parts(name, b"", b"")
+        self._counts = dict.fromkeys(KINDS, 0)
+
+    def parts(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
+        """Return the parts of a CDR message, flagged if it is invalid; `name`: see `KINDS`."""
+        self._counts[name] += 1
+        number = message_number(attachment)
+        if number is None:
+            number = self._counts[name]
+        try:
+            data = self._types.deserialize_cdr(message, KINDS[name])
+        except self._damaged:
+            return [damaged(name)]
+        return self.parts_of(name, data, number)
+
+
+class ZenohSource:
+    """Source at zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
+
+    The first TOPIC is a WrenchStamped. `/tf` must contain all frames between PARENT and CHILD.
+    """
+
+    def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
+        parsed = Address(address, PORT, allowed=SOURCE_PARAMETERS)
+        self.dt, sign, domain = dt, parsed.sign(), domain_of(parsed)
+        topics, frames, self.streams = source_topics(parsed, joints)
+        require_libraries(address)
+        self.messages = Messages(sign, frames, joints)
+        self._queue: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
+        self._session = open_session(parsed)
+        for stream, topic in topics.items():
+            self._session.declare_subscriber(
+                topic_key(domain, topic, KINDS[stream]), self._callback(stream)
+            )
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `PartSource`."""
+        found: list[Part] = []
+        try:
+            found += self.messages.parts(*self._queue.get(timeout=timeout_s))
+            while len(found) < _MAX_QUEUED:
+                found += self.messages.parts(*self._queue.get_nowait())
+        except queue.Empty:
+            pass
+        return found
+
+    def close(self) -> None:
+        """See `PartSource`."""
+        self._session.close()
+
+    def _callback(self, stream: str) -> Callable[[Any], None]:
+        def enqueue(sample: Any) -> None:
+            if self._queue.qsize() < _MAX_QUEUED:
+                attachment = sample.attachment
+                attachment = b"" if attachment is None else attachment.to_bytes()
+                self._queue.put((stream, sample.payload.to_bytes(), attachment))
+
+        return enqueue
+
+
+class ZenohSink:
+    """Sink for WrenchStamped at zenoh://HOST[:PORT]/TOPIC[?frame=NAME&wrench=scaled&domain=N].
+
+    Messages contain the send time, because stale zeros have no other. Flags are not sent.
+    """
+
+    def __init__(self, address: str) -> None:
+        parsed = Address(address, PORT, allowed=("frame", "wrench", "domain"))
+        domain, topic = domain_of(parsed), topic_of(parsed, parsed.path)
+        which = parsed.choice("wrench", ("contact", "scaled"))
+        require_libraries(address)
+        self._types, self._which = message_types(), which
+        self._frame = parsed.parameter("frame") or ""
+        hashed = self._types.hash_rihs01(WRENCH_STAMPED)
+        self._session = open_session(parsed)
+        session = str(self._session.info.zid())
+        self._sender, self._number = bytes.fromhex(session.rjust(32, "0"))[:16], 0
+        self._tokens = [
+            self._session.liveliness().declare_token(token)
+            for token in liveliness_tokens(domain, session, _NODE, topic, WRENCH_STAMPED, hashed)
+        ]
+        self._publisher = self._session.declare_publisher(
+            topic_key(domain, topic, WRENCH_STAMPED, hashed), express=True
+        )
+
+    def write(self, out: Compensated) -> None:
+        """See `Sink`."""
+        ns = time.time_ns()
+        self._number += 1
+        message = self.message(getattr(out, self._which), ns)
+        self._publisher.put(message, attachment=attachment(self._number, ns, self._sender))
+
+    def message(self, wrench: Array, ns: int) -> bytes:
+        """Return a WrenchStamped in CDR; `wrench` (6,) [N, N m], `ns`: its time stamp [ns]."""
+        kinds = self._types.types
+        vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]
+        header = kinds["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)
+        parts = (vector(*map(float, part)) for part in np.split(wrench, 2))
+        both = kinds["geometry_msgs/msg/Wrench"](*parts)
+        return bytes(self._types.serialize_cdr(kinds[WRENCH_STAMPED](header, both), WRENCH_STAMPED))
+
+    def close(self) -> None:
+        """See `Sink`."""
+        self._session.close()

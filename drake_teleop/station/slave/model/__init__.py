@@ -1,0 +1,1 @@
+"""Model files of arms, tools and scenes: their repair, so that Drake reads them."""

@@ -1,0 +1,139 @@
+"""Repair of masses and inertias of links."""
+
+from __future__ import annotations
+
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.model.model_tree import WORLD
+from drake_teleop.station.slave.model.repair_report import RepairReport
+
+_ENTRIES = {
+    "ixx": (0, 0),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyy": (1, 1),
+    "iyz": (1, 2),
+    "izz": (2, 2),
+}
+# Relative changes of an inertia: rounding below the first, suspicious above the second.
+_ROUNDING, _SUSPICIOUS = 1e-3, 0.05
+_NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
+# Margin of corrected moments against rounding in Drake's check, relative to the largest one.
+_MARGIN = 1e-9
+
+
+def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
+    """Give a link a mass and an inertia that a body can have; state what changed.
+
+    Nothing depends on those of links at rest: they are removed if impossible. Return whether the
+    file gives the link neither.
+    """
+    name, inertial = link.get("name", ""), link.find("inertial")
+    if inertial is None or inertial.find("mass") is None:
+        if is_sdf:
+            report.state("1 kg, the default of SDF, for", name)
+        elif inertial is not None:
+            link.remove(inertial)
+        return not is_sdf
+    if name == WORLD:
+        link.remove(inertial)
+        return False
+    text = _mass_text(inertial)
+    mass, inertia = number(text), _inertia(inertial, is_sdf=is_sdf)
+    fault = ""
+    if not 0.0 <= mass <= MAX_VALUE:
+        fault = f"mass {text} kg is not between 0 and {MAX_VALUE:g} kg"
+    elif not (np.abs(inertia) <= MAX_VALUE).all():
+        fault = f"an entry of its inertia is no number up to {MAX_VALUE:g} kg m^2"
+    no_mass = not fault and mass == 0.0
+    if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
+        link.remove(inertial)
+        what = "an impossible inertia left out, as no joint of the arm moves the link, of"
+        report.state(what, name)
+    elif fault:
+        report.refuse(f"link {name}: {fault}")
+    else:
+        if no_mass and inertia.any():
+            report.repair("an inertia without a mass left out of", name)
+        nearest = np.zeros((3, 3)) if no_mass else possible_inertia(inertia, name, report)
+        link.remove(inertial)
+        _write(link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf)
+    return not at_rest and not inertia.any()
+
+
+def _mass_text(inertial: Element) -> str:
+    mass = inertial.find("mass")
+    return "" if mass is None else (mass.get("value") or mass.text or "").strip()
+
+
+def _inertia(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
+    element, tensor = inertial.find("inertia"), np.zeros((3, 3))
+    if element is None:
+        return np.eye(3) if is_sdf else tensor
+    for name, (row, column) in _ENTRIES.items():
+        default = "1" if is_sdf and row == column else "0"
+        text = element.get(name) or element.findtext(name) or default
+        tensor[row, column] = tensor[column, row] = number(text)
+    return tensor
+
+
+def possible_inertia(
+    inertia: NDArray[np.float64], name: str, report: RepairReport
+) -> NDArray[np.float64]:
+    """Return the nearest inertia tensor (3, 3) that the link `name` can have; state a change."""
+    nearest, change = nearest_possible_inertia(inertia)
+    if 0.0 < change <= _ROUNDING or 0.0 < change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
+        report.state("an inertia corrected for rounding of", name)
+    elif change:
+        what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
+        warning = "warning: " if change > _SUSPICIOUS else ""
+        report.repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
+    return nearest
+
+
+def _write(
+    link: Element,
+    pose: Element | None,
+    mass: float,
+    inertia: NDArray[np.float64],
+    *,
+    is_sdf: bool,
+) -> None:
+    inertial = SubElement(link, "inertial")
+    if pose is not None:
+        inertial.append(pose)
+    entries = {name: f"{inertia[place]:.17g}" for name, place in _ENTRIES.items()}
+    if is_sdf:
+        SubElement(inertial, "mass").text = f"{mass:.17g}"
+        element = SubElement(inertial, "inertia")
+        for name, text in entries.items():
+            SubElement(element, name).text = text
+    else:
+        SubElement(inertial, "mass", value=f"{mass:.17g}")
+        SubElement(inertial, "inertia", entries)
+
+
+def nearest_possible_inertia(
+    inertia: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Return the nearest possible tensor (3, 3) about the centre of mass, and its distance.
+
+    Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal
+    parts, which is nearest in the Frobenius norm. The distance is the largest change of a
+    principal moment, relative to the largest moment; it is 0 for a possible tensor, which is
+    returned unchanged.
+    """
+    given, axes = np.linalg.eigh((inertia + inertia.T) / 2.0)
+    moments = np.maximum(given, 0.0)
+    deficit = moments[2] - moments[1] - moments[0]
+    largest = float(np.abs(given).max())
+    if given[0] >= 0.0 and deficit <= 0.0:
+        return inertia, 0.0
+    if deficit > 0.0:
+        moments += (deficit + _MARGIN * largest) / 3.0 * np.array([1.0, 1.0, -1.0])
+    distance = float(np.abs(moments - given).max()) / largest
+    return (axes * moments) @ axes.T, distance

@@ -1,0 +1,194 @@
+"""Removal of unusable meshes of a robot model, and sticks in place of missing visuals."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from pydrake.geometry import Capsule, Mesh
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
+
+from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
+from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
+
+# Suffixes of meshes that Drake accepts as collision shapes.
+_READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
+# Numbers of each dimension of a shape.
+_DIMENSIONS = {
+    "box": {"size": 3},
+    "sphere": {"radius": 1},
+    "cylinder": {"radius": 1, "length": 1},
+    "capsule": {"radius": 1, "length": 1},
+    "ellipsoid": {"a": 1, "b": 1, "c": 1},
+    "mesh": {},
+    "plane": {},
+}
+_MIN_CORNERS = 3  # of a mesh
+_STICK_RADIUS_M = 0.035
+_STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
+
+
+def remove_unusable_shapes(
+    root: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
+) -> dict[str, list[str]]:
+    """Remove shapes that Drake cannot read; return the names of the affected links by fault.
+
+    Relative addresses start at the folder of the file `model` and become absolute. STL files become
+    convex hulls in `folder`, because Drake does not read STL. Without a folder all shapes are
+    removed, for a plant without geometry. A lost visual is reported only for links without shapes,
+    a lost collision shape only for links without a visual or with other collision shapes.
+    """
+    lost: dict[str, list[str]] = {}
+    for link in root.iter("link"):
+        faults = {"collision": set[str](), "visual": set[str]()}
+        for kind, removed in faults.items():
+            for shape in link.findall(kind):
+                fault = _shape_fault(shape) or _mesh_fault(shape, model, files, folder)
+                if fault:
+                    link.remove(shape)
+                    removed.add(fault)
+        if link.find("collision") is not None:
+            reported = faults["collision"]
+        elif link.find("visual") is not None:
+            reported = set()
+        else:
+            reported = faults["collision"] | faults["visual"]
+        for fault in sorted(reported):
+            lost.setdefault(fault, []).append(link.get("name", ""))
+        for shape in [*link.findall("collision"), *link.findall("visual")] if not folder else []:
+            link.remove(shape)
+    return lost
+
+
+def _shape_fault(shape: ElementTree.Element) -> str | None:
+    """Return the fault of a shape's kind, size or place as text."""
+    inner = shape.find("geometry/*")
+    kind = "" if inner is None else inner.tag.removeprefix("drake:")
+    if inner is None or kind not in _DIMENSIONS:
+        return f"{kind or 'empty'} shapes cannot be read"
+    sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS[kind]
+    for name, count in sizes.items():
+        values = _values(inner.get(name) or inner.findtext(name))
+        if len(values) != count or not all(0.0 < value <= MAX_VALUE for value in values):
+            return f"the {name} of a {kind} is no usable size"
+    scale = _values(inner.get("scale") or inner.findtext("scale"))
+    places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
+    texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
+    numbers = [value for text in texts for value in _values(text)]
+    valid = all(scale) and all(abs(value) <= MAX_VALUE for value in numbers)
+    return None if valid else "of an invalid place or scale"
+
+
+def _values(text: str | None) -> list[float]:
+    return [number(word) for word in (text or "").split()]
+
+
+def _mesh_fault(
+    shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
+) -> str | None:
+    """Return the fault of a shape's mesh as text; without a fault, make its path absolute."""
+    mesh = shape.find("geometry/mesh")
+    if mesh is None:
+        return None
+    address = (mesh.get("filename") or mesh.findtext("uri") or "").strip()
+    file = files.file(address, model.resolve().parent)
+    if file is None or not file.is_file():
+        return "meshes were not found (--package-path, slave.package_paths)"
+    if not files.may_read(file):
+        return (
+            f"meshes in {file.resolve().parent} are outside the model's folder and its packages"
+            " (name their folder: --package-path, slave.package_paths)"
+        )
+    try:
+        files.check(file)
+    except DrakeTeleopError as error:
+        return str(error)
+    suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
+    if suffix not in (".stl", *_READABLE_SUFFIXES):
+        return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
+    if (suffix == ".stl" or shape.tag == "collision") and not _is_readable(file, written):
+        return f"{Path(address).suffix} meshes are empty or damaged"
+    if suffix == ".stl" and folder is not None:
+        target = folder / f"{len(list(folder.iterdir()))}_{file.stem}.obj"
+        target.write_text(_obj_of_stl(file, written))
+        file = target
+    if mesh.get("filename"):
+        mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
+    else:
+        mesh.find("uri").text = f"file://{file.resolve()}"  # type: ignore[union-attr]
+    return None
+
+
+@lru_cache(maxsize=1024)
+def _is_readable(path: Path, _: int) -> bool:
+    """Return whether a mesh has faces with finite corners.
+
+    The second argument is the file's time, so that an edited file is read again.
+    """
+    if path.suffix.lower() in (".gltf", ".vtk"):
+        try:
+            with silent_stderr():
+                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_CORNERS
+        except RuntimeError:
+            return False
+    try:
+        read_triangles(path)
+    except ValueError:
+        return False
+    return True
+
+
+@lru_cache(maxsize=1024)
+def _obj_of_stl(path: Path, _: int) -> str:
+    """Return the convex hull of an STL file, or its triangles if flat, as text of an OBJ file."""
+    triangles = read_triangles(path)
+    with suppress(ValueError):
+        triangles = convex_hull(triangles.vertices)
+    return obj_text(triangles)
+
+
+def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
+    """Add sticks to links without visuals, each from its joint to the next, or to S."""
+    joints = map(plant.get_joint, plant.GetJointIndices())
+    inboard = {joint.child_body().index(): joint for joint in joints}
+    end, body = sensor_frame, sensor_frame.body()
+    while body.index() in inboard:
+        joint = inboard[body.index()]
+        parent = joint.parent_body()
+        on_world = parent.index() == plant.world_body().index()
+        if not isinstance(joint, WeldJoint):
+            _add_stick(plant, joint.frame_on_child(), _in_body(end, body, inboard), body)
+            end = joint.frame_on_parent()
+        elif on_world:
+            _add_stick(plant, body.body_frame(), _in_body(end, body, inboard), body)
+        body = parent
+
+
+def _in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
+    """Return the pose X_BodyFrame of a frame on the body, or on a body welded to it."""
+    pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
+    while on.index() != body.index():
+        weld = inboard[on.index()]
+        X_FB = weld.X_FM() @ weld.frame_on_child().GetFixedPoseInBodyFrame().inverse()
+        pose = weld.frame_on_parent().GetFixedPoseInBodyFrame() @ X_FB @ pose
+        on = weld.parent_body()
+    return pose
+
+
+def _add_stick(plant: MultibodyPlant, first: Frame, last: RigidTransform, body: RigidBody) -> None:
+    if plant.GetVisualGeometriesForBody(body):
+        return
+    start = first.GetFixedPoseInBodyFrame().translation()
+    way = last.translation() - start
+    length = float(np.linalg.norm(way))
+    along = way / length if length > _STICK_RADIUS_M else np.array([0.0, 0.0, 1.0])
+    pose = RigidTransform(RotationMatrix.MakeFromOneVector(along, 2), start + way / 2)
+    stick = Capsule(_STICK_RADIUS_M, max(length, 1e-3))
+    plant.RegisterVisualGeometry(body, pose, stick, f"stick_of_{body.name()}", _STICK_COLOUR)

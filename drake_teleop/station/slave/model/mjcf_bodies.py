@@ -1,0 +1,266 @@
+"""Bodies, joints and shapes of an MJCF file, in the body's axes and SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import count
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
+from drake_teleop.station.slave.model.mjcf_elements import MIN_LENGTH, Attributes, Mjcf, rotation_to
+from drake_teleop.station.slave.model.mjcf_masses import (
+    NO_MASS,
+    MassProperties,
+    combined,
+    fitted_shape,
+    mesh_properties,
+    primitive,
+)
+from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
+
+# Elements that generate bodies or joints.
+_GENERATORS = ("replicate", "attach", "composite", "flexcomp")
+_DENSITY = 1000.0  # kg/m^3, default of MuJoCo
+_UNSUPPORTED_SHAPES = ("hfield", "sdf")
+_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # numbers in size
+_ROUND = ("capsule", "cylinder")
+_MAX_VISIBLE_GROUP = 2  # as in MuJoCo and Drake
+_Array = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class Joint:
+    """Joint of a body: `kind` hinge, slide, ball or free; `anchor` (3,) and `axis` (3,)."""
+
+    name: str
+    kind: str
+    anchor: _Array
+    axis: _Array
+    attributes: Attributes
+    limits: tuple[float, float] | None
+    ref: float
+
+    def pose(self, q: float) -> RigidTransform:
+        """Return the motion of the body from the drawn pose to position `q` [rad, m]."""
+        if self.kind == "slide":
+            return RigidTransform((q - self.ref) * self.axis)
+        turn = RotationMatrix(AngleAxis(q - self.ref, self.axis))
+        return RigidTransform(turn, self.anchor - turn @ self.anchor)
+
+    def moved(self, X: RigidTransform) -> Joint:
+        """Return the joint with anchor and axis in other axes."""
+        anchor, axis = X @ self.anchor, X.rotation() @ self.axis
+        limits, ref = self.limits, self.ref
+        return Joint(self.name, self.kind, anchor, axis, self.attributes, limits, ref)
+
+
+@dataclass(eq=False)
+class Geom:
+    """Shape of a body; `mesh` is set for shapes of type mesh."""
+
+    kind: str
+    X_BG: RigidTransform
+    size: list[float]
+    attributes: Attributes
+    mesh: Mesh | None
+
+    @property
+    def touches(self) -> bool:
+        """Whether the shape takes part in contacts."""
+        return touches(self.attributes)
+
+    @property
+    def visible(self) -> bool:
+        """Whether MuJoCo shows the shape by default."""
+        return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GROUP
+
+
+def touches(shape: Attributes) -> bool:
+    """Return whether a shape takes part in contacts."""
+    return any(shape.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
+
+
+@dataclass(eq=False)
+class Body:
+    """Body with its pose X_PB in the parent; `generators` are elements that cannot be read."""
+
+    name: str
+    X_PB: RigidTransform
+    joints: list[Joint] = field(default_factory=list)
+    geoms: list[Geom] = field(default_factory=list)
+    sites: dict[str, RigidTransform] = field(default_factory=dict)
+    children: list[Body] = field(default_factory=list)
+    inertial: MassProperties | None = None
+    generators: list[str] = field(default_factory=list)
+    is_auxiliary: bool = False  # a body that the file does not have
+
+    def all(self) -> list[Body]:
+        """Return the body and all bodies on it."""
+        return [self, *(body for child in self.children for body in child.all())]
+
+    def path_to(self, name: str) -> list[Body]:
+        """Return the bodies from this one to a body, or an empty list."""
+        if self.name == name:
+            return [self]
+        paths = (child.path_to(name) for child in self.children)
+        return next(([self, *path] for path in paths if path), [])
+
+
+class BodyReader:
+    """Reader of bodies; joints and bodies without names get one."""
+
+    def __init__(self, mjcf: Mjcf) -> None:
+        self._mjcf, self.meshes = mjcf, MeshLibrary(mjcf)
+        self._names = {e.get("name", "") for e in mjcf.root.iter() if e.tag in ("body", "joint")}
+        self._counters: dict[str, count[int]] = {}
+        self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
+
+    def take_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
+        """Remove the bodies from the world; return them with `childclass` and pose of the frame."""
+        found = []
+
+        def collect(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
+            childclass = parent.get("childclass") or childclass
+            for child in list(parent):
+                if child.tag == "body":
+                    found.append((child, childclass, X_WF))
+                    parent.remove(child)
+                elif child.tag == "frame":
+                    attributes = Attributes(child.attrib, "frame", self._mjcf.report)
+                    collect(child, childclass, X_WF @ self._mjcf.pose(attributes))
+
+        for element in self._mjcf.root.findall("worldbody"):
+            collect(element, "", RigidTransform())
+        return found
+
+    def read_world(self) -> Body:
+        """Return the world with everything on it."""
+        world = Body("world", RigidTransform())
+        for element in self._mjcf.root.findall("worldbody"):
+            self._read_content(world, element, element.get("childclass", ""), RigidTransform())
+        return world
+
+    def read(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
+        """Return a body, in a frame of its parent, with all bodies on it."""
+        name = element.get("name") or self._invent("body")
+        attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
+        body = Body(name, X_PF @ self._mjcf.pose(attributes))
+        childclass = element.get("childclass") or childclass
+        self._read_content(body, element, childclass, RigidTransform())
+        return body
+
+    def _invent(self, stem: str) -> str:
+        for number in self._counters.setdefault(stem, count(1)):
+            if (name := f"{stem}_{number}") not in self._names:
+                break
+        return name
+
+    def _read_content(
+        self, body: Body, element: Element, childclass: str, X_BF: RigidTransform
+    ) -> None:
+        for child in element:
+            attributes = self._mjcf.attributes(child, childclass, f"{child.tag} of {body.name}")
+            if child.tag == "frame":
+                inner = child.get("childclass") or childclass
+                self._read_content(body, child, inner, X_BF @ self._mjcf.pose(attributes))
+            elif child.tag == "body":
+                body.children.append(self.read(child, childclass, X_BF))
+            elif child.tag in ("joint", "freejoint"):
+                body.joints.append(self._joint(body, attributes, child.tag).moved(X_BF))
+            elif child.tag == "geom":
+                self._add_geom(body, attributes, X_BF)
+            elif child.tag == "site":
+                body.sites[child.get("name", "")] = X_BF @ self._mjcf.pose(attributes)
+            elif child.tag == "inertial":
+                body.inertial = self._inertial(body, attributes).transformed(X_BF)
+            elif child.tag in _GENERATORS:
+                body.generators.append(child.tag)
+
+    def _joint(self, body: Body, given: Attributes, tag: str) -> Joint:
+        name = given.get("name") or self._invent(f"{body.name}_joint")
+        given.label = f"joint {name}"
+        kind = "free" if tag == "freejoint" else given.get("type", "hinge")
+        axis = given.vector("axis", (0.0, 0.0, 1.0))
+        if np.linalg.norm(axis) < MIN_LENGTH:
+            self._mjcf.report.refuse(f"joint {name}: its axis is 0")
+            axis = np.array([0.0, 0.0, 1.0])
+        limits = given.limits("range", "limited", automatic=self._mjcf.autolimits)
+        ref = given.number("ref", 0.0)
+        if kind == "hinge":
+            limits = limits and (self._mjcf.angle(limits[0]), self._mjcf.angle(limits[1]))
+            ref = self._mjcf.angle(ref)
+        anchor = given.vector("pos", (0.0, 0.0, 0.0))
+        return Joint(name, kind, anchor, axis / np.linalg.norm(axis), given, limits, ref)
+
+    def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
+        kind, name = given.get("type", "sphere"), given.get("mesh", "")
+        X_FG, size = self._mjcf.pose(given), given.numbers("size", (0.0, 0.0, 0.0))
+        if "fromto" in given and kind in (*_ROUND, "box", "ellipsoid"):
+            ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
+            X_FG = RigidTransform(rotation_to(ends[0] - ends[1]), ends.mean(axis=0))
+            half = float(np.linalg.norm(ends[0] - ends[1])) / 2
+            size = [size[0], half, 0.0] if kind in _ROUND else [size[0], size[0], half]
+        found = self.meshes.find(name) if name else None
+        mesh, fault = (None, found) if isinstance(found, str) else (found, "")
+        if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
+            fault = f"shapes of type {kind} are not supported"
+        elif kind in _SIZES and not name and min(size[: _SIZES[kind]]) <= 0.0:
+            fault = "shapes need a size above 0"
+        if fault:
+            self.lost.setdefault(fault, []).append((body, given))
+            return
+        if mesh is not None and kind != "mesh":
+            by_box = self._mjcf.compiler.get("fitaabb") == "true"
+            try:
+                X_GM, size = fitted_shape(mesh, kind, by_box=by_box)
+            except ValueError as error:
+                self.lost.setdefault(f"a mesh has {error}", []).append((body, given))
+                return
+            X_FG, mesh = X_FG @ X_GM, None
+        if given.get("shellinertia") == "true":
+            self._mjcf.report.state("solid instead of hollow shapes of", body.name)
+        body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
+
+    def _inertial(self, body: Body, given: Attributes) -> MassProperties:
+        mass = float(given.vector("mass", (0.0,))[0])
+        if mass < 0.0:
+            self._mjcf.report.refuse(f"body {body.name}: mass {mass:g} kg is negative")
+        moments = given.vector("diaginertia", (0.0, 0.0, 0.0))
+        inertia = np.diag(moments)
+        if "fullinertia" in given:
+            xx, yy, zz, xy, xz, yz = given.vector("fullinertia", (0.0,) * 6)
+            inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return MassProperties(mass, np.zeros(3), inertia).transformed(self._mjcf.pose(given))
+
+    def mass(self, body: Body) -> MassProperties:
+        """Return the body's mass properties, by its `inertial` or its shapes."""
+        compiler, given = self._mjcf.compiler, body.inertial
+        source = compiler.get("inertiafromgeom", "auto")
+        if source == "true" or (source == "auto" and given is None):
+            given = combined([self._geom_mass(geom) for geom in body.geoms])
+        mass, centre, inertia = given or NO_MASS
+        bound = compiler.number("boundinertia", 0.0)
+        if bound > 0.0:
+            moments, axes = np.linalg.eigh(inertia)
+            inertia = (axes * np.maximum(moments, bound)) @ axes.T
+        if compiler.get("balanceinertia") == "true" and nearest_possible_inertia(inertia)[1]:
+            inertia = np.eye(3) * np.trace(inertia) / 3
+        return MassProperties(max(mass, compiler.number("boundmass", 0.0)), centre, inertia)
+
+    def _geom_mass(self, geom: Geom) -> MassProperties:
+        groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))
+        if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
+            return NO_MASS
+        try:
+            shape = mesh_properties(geom.mesh) if geom.mesh else primitive(geom.kind, geom.size)
+        except ValueError as error:
+            self._mjcf.report.repair(f"no mass of a mesh ({error}) of", geom.attributes.label)
+            return NO_MASS
+        mass = geom.attributes.number("mass", -1.0)
+        density = geom.attributes.number("density", _DENSITY)
+        return shape.scaled(mass if mass >= 0.0 else density * shape.mass).transformed(geom.X_BG)

@@ -1,0 +1,209 @@
+"""Elements of an MJCF file after includes, compiler settings and class defaults are applied."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis, Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.repair_report import RepairReport
+
+_MAX_DEPTH = 150  # largest depth of nested elements
+MIN_LENGTH = 1e-9
+"""Shortest vector that has a direction."""
+_MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
+_ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+# A shorter list replaces only the first numbers of the default.
+_PARTIAL = ("size", "gear", "gainprm", "biasprm", "friction")
+_ACTUATORS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
+_ACTUATORS |= {"muscle", "adhesion", "dcmotor", "plugin"}
+_MAIN = "main"  # name of the class at the top
+
+
+class Attributes(dict[str, str]):
+    """Attributes of one element, with `label` for messages; `report` takes their faults."""
+
+    def __init__(self, values: dict[str, str], label: str, report: RepairReport) -> None:
+        super().__init__(values)
+        self.label, self._report = label, report
+
+    def numbers(self, name: str, default: tuple[float, ...]) -> list[float]:
+        """Return the numbers of an attribute; `default` completes a list that is too short."""
+        try:
+            values = [float(word) for word in self.get(name, "").split()]
+        except ValueError:
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            self._report.refuse(f"{self.label}: {name} {self[name]!r} is not a list of numbers")
+            return list(default)
+        return [*values, *default[len(values) :]][: len(default)]
+
+    def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
+        """Return the numbers of an attribute that has as many as `default`, each up to 1e6."""
+        count, values = len(default), self.numbers(name, default)
+        if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > _MAX_VALUE:
+            what = f"{name} {self[name]!r} is not {count} numbers up to {_MAX_VALUE:g}"
+            self._report.refuse(f"{self.label}: {what}")
+            return np.array(default)
+        return np.array(values)
+
+    def number(self, name: str, default: float) -> float:
+        """Return the number of an attribute, or a default."""
+        return self.numbers(name, (default,))[0]
+
+    def limits(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
+        """Return the range `name`, or None if it does not apply (`flag`, autolimits)."""
+        lower, upper = self.numbers(name, (0.0, 0.0))
+        limited = self.get(flag, "auto")
+        if limited == "false" or (limited == "auto" and not (automatic and lower != upper)):
+            return None
+        if lower > upper:
+            self._report.refuse(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
+        return lower, upper
+
+
+class Mjcf:
+    """Content of an MJCF file, and the report of its repairs and faults."""
+
+    def __init__(self, root: Element, path: Path, files: ModelFiles, report: RepairReport) -> None:
+        self.root, self.path, self.files, self.report = root, path, files, report
+        self._folders: dict[Element, Path] = {}  # of included elements
+        if self.root.tag != "mujoco":
+            what = f"does not contain a mujoco tag, but {self.root.tag}"
+            raise DrakeTeleopError(what, where=str(path), remedy="give an MJCF file")
+        self._insert_includes(self.root, path, {path.resolve()}, 0)
+        self.compiler = Attributes({}, "compiler", report)
+        for element in self.root.findall("compiler"):
+            self.compiler.update(element.attrib)
+        if self.compiler.get("coordinate", "local") != "local":
+            self.report.refuse("coordinate='global', which MuJoCo no longer reads either")
+        self.autolimits = self.compiler.get("autolimits", "true") == "true"
+        self._defaults: dict[str, dict[str, dict[str, str]]] = {_MAIN: {}}
+        for element in self.root.findall("default"):
+            self._read_defaults(element, _MAIN, self._defaults[_MAIN])
+
+    def file(self, element: Element, name: str, folder: str) -> Path | None:
+        """Return a file beside the main file, or else beside the included one."""
+        places = [self.path.resolve().parent, self._folders.get(element)]
+        found = (self.files.file(name, place / folder) for place in places if place)
+        return next((file for file in found if file is not None and not file.is_dir()), None)
+
+    def children(self, section: str) -> Iterator[Element]:
+        """Yield the elements in all sections of this name, such as two `asset` sections."""
+        for element in self.root.findall(section):
+            yield from element
+
+    def angle(self, value: float) -> float:
+        """Return an angle of the file in rad."""
+        degrees = self.compiler.get("angle", "degree") == "degree"
+        return math.radians(value) if degrees else value
+
+    def attributes(self, element: Element, childclass: str, label: str) -> Attributes:
+        """Return the attributes of an element, with the defaults of its class."""
+        name = element.get("class") or childclass or _MAIN
+        if name not in self._defaults:
+            self.report.refuse(f"{label}: there is no class {name}")
+            name = _MAIN
+        kind = "actuator" if element.tag in _ACTUATORS else element.tag
+        defaults = self._defaults[name].get(kind, {})
+        return Attributes(_merge(defaults, element.attrib), label, self.report)
+
+    def pose(self, attributes: Attributes) -> RigidTransform:
+        """Return the pose of an element in its parent, from `pos` and its orientation."""
+        return RigidTransform(self._rotation(attributes), attributes.vector("pos", (0.0,) * 3))
+
+    def _rotation(self, given: Attributes) -> RotationMatrix:
+        if "quat" in given:
+            quat = given.vector("quat", (1.0, 0.0, 0.0, 0.0))
+            length = float(np.linalg.norm(quat))
+            return RotationMatrix(Quaternion(quat / length)) if length else RotationMatrix()
+        if "axisangle" in given:
+            *axis, angle = given.vector("axisangle", (0.0, 0.0, 1.0, 0.0))
+            return _turn(np.array(axis), self.angle(angle))
+        if "euler" in given:
+            rotation = RotationMatrix()
+            sequence = self.compiler.get("eulerseq", "xyz")
+            for letter, angle in zip(sequence, given.vector("euler", (0.0,) * 3), strict=False):
+                turn = _turn(np.eye(3)["xyz".find(letter.lower())], self.angle(angle))
+                rotation = rotation @ turn if letter.islower() else turn @ rotation
+            return rotation
+        if "xyaxes" in given:
+            axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
+            z = np.cross(axes[:3], axes[3:])
+            if np.linalg.norm(z) < MIN_LENGTH:
+                self.report.refuse(f"{given.label}: its xyaxes are parallel")
+                return RotationMatrix()
+            columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
+            return RotationMatrix(columns / np.linalg.norm(columns, axis=0))
+        return rotation_to(given.vector("zaxis", (0.0, 0.0, 1.0)))
+
+    def _insert_includes(
+        self, element: Element, path: Path, included: set[Path], depth: int
+    ) -> None:
+        """Replace each `include` by the content of its file; a file may be included once."""
+        if depth > _MAX_DEPTH:
+            what = f"its elements are nested more than {_MAX_DEPTH} deep"
+            raise DrakeTeleopError(what, where=str(self.path))
+        content = list[Element]()
+        for child in element:
+            if child.get("file"):
+                self._folders[child] = path.resolve().parent
+            if child.tag != "include":
+                self._insert_includes(child, path, included, depth + 1)
+                content.append(child)
+                continue
+            name = child.get("file", "")
+            file = self.file(child, name, "")
+            if file is None:
+                self.report.refuse(f"the included file {name!r} was not found")
+            elif file.resolve() in included:
+                self.report.refuse(f"{name} is included twice")
+            else:
+                included.add(file.resolve())
+                root = read_xml(file)
+                self._insert_includes(root, file, included, depth)
+                content += root
+        element[:] = content
+
+    def _read_defaults(
+        self, element: Element, name: str, values: dict[str, dict[str, str]]
+    ) -> None:
+        self._defaults[name] = values
+        nested = element.findall("default")
+        for child in (each for each in element if each.tag != "default"):
+            kind, own = child.tag, child.attrib
+            if kind in _ACTUATORS:
+                kind, own = "actuator", {**own, "kind": child.tag}
+            values[kind] = _merge(values.get(kind, {}), own)
+        for child in nested:
+            self._read_defaults(child, child.get("class", ""), dict(values))
+
+
+def _merge(defaults: dict[str, str], own: dict[str, str]) -> dict[str, str]:
+    oriented = any(name in own for name in _ORIENTATIONS)
+    merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATIONS)}
+    for name, text in own.items():
+        words = text.split()
+        rest = merged.get(name, "").split()[len(words) :] if name in _PARTIAL else []
+        merged[name] = " ".join([*words, *rest]) if rest else text
+    return merged
+
+
+def _turn(axis: NDArray[np.float64], angle: float) -> RotationMatrix:
+    length = float(np.linalg.norm(axis))
+    return RotationMatrix(AngleAxis(angle, axis / length)) if length else RotationMatrix()
+
+
+def rotation_to(z: NDArray[np.float64]) -> RotationMatrix:
+    """Return the smallest rotation that turns the z axis to this direction (3,)."""
+    axis = np.cross([0.0, 0.0, 1.0], z)
+    sine = float(np.linalg.norm(axis))
+    return _turn(axis if sine else np.array([1.0, 0.0, 0.0]), math.atan2(sine, float(z[2])))

@@ -1,0 +1,138 @@
+"""Meshes of an MJCF file: triangles for masses, and .obj files for Drake."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
+from drake_teleop.station.slave.model.triangles import (
+    Triangles,
+    checked_triangles,
+    convex_hull,
+    obj_text,
+    read_triangles,
+)
+
+_NOT_FOUND = "meshes were not found (--package-path, slave.package_paths)"
+_OUTSIDE = (
+    "{kind} files in {folder} are outside the model's folder and its packages"
+    " (name their folder: --package-path, slave.package_paths)"
+)
+_UNREADABLE = "meshes cannot be read (convert them to .obj or .stl)"
+
+
+class Mesh:
+    """Mesh of an `asset` section, with its own scale and reference pose applied."""
+
+    def __init__(self, mjcf: Mjcf, attributes: Attributes, file: Path | None) -> None:
+        self.name = attributes.get("name") or Path(attributes.get("file", "")).stem
+        self.file, self.inertia = file, attributes.get("inertia", "legacy")
+        self._attributes = attributes
+        self._scale = attributes.vector("scale", (1.0, 1.0, 1.0))
+        reference = {"pos": attributes.get("refpos", "0 0 0")}
+        reference["quat"] = attributes.get("refquat", "1 0 0 0")
+        self._X_FM = mjcf.pose(Attributes(reference, attributes.label, mjcf.report))
+        self._triangles: Triangles | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether Drake can read the file itself."""
+        unmoved = self._X_FM.IsExactlyIdentity() and bool((self._scale == 1.0).all())
+        return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
+
+    def triangles(self) -> Triangles:
+        """Return the transformed triangles.
+
+        Raises:
+            ValueError: if the file is damaged or of another kind.
+        """
+        if self._triangles is None:
+            if self.file is not None:
+                vertices, faces = read_triangles(self.file)
+            else:
+                vertices, faces = checked_triangles(_read_inline(self._attributes))
+            moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
+            if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
+                faces = faces[:, ::-1]
+            self._triangles = Triangles(moved, faces)
+        return self._triangles
+
+    def obj(self, folder: Path) -> Path:
+        """Return an .obj file for Drake, converted into `folder` if necessary."""
+        if self.file is not None and self.is_plain:
+            return self.file.resolve()
+        return self._write(self.triangles(), folder)
+
+    def hull(self, folder: Path) -> Path:
+        """Return an .obj file in `folder` with the convex hull, which is what touches."""
+        return self._write(convex_hull(self.triangles().vertices), folder)
+
+    def _write(self, triangles: Triangles, folder: Path) -> Path:
+        number = len(list(folder.iterdir()))
+        path = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)[:40]}.obj"
+        path.write_text(obj_text(triangles))
+        return path
+
+
+class MeshLibrary:
+    """Meshes of a file by name; unused ones are never read."""
+
+    def __init__(self, mjcf: Mjcf) -> None:
+        self._mjcf = mjcf
+        self._meshes: dict[str, Mesh | str] = {}
+        self.inaccessible: list[str] = []  # faults of files that may not be read
+        for element in mjcf.children("asset"):
+            label = f"{element.tag} {element.get('name') or element.get('file', '')}"
+            attributes = mjcf.attributes(element, "", label)
+            file, fault = self._find(element, attributes)
+            if element.tag == "mesh":
+                mesh = Mesh(mjcf, attributes, file)
+                self._meshes[mesh.name] = fault or mesh
+
+    def find(self, name: str) -> Mesh | str:
+        """Return a mesh, or its fault as text."""
+        mesh = self._meshes.get(name, _NOT_FOUND)
+        if isinstance(mesh, Mesh) and not mesh.is_plain:
+            try:
+                mesh.triangles()
+            except ValueError:
+                suffix = f"{mesh.file.suffix} " if mesh.file is not None else ""
+                self._meshes[name] = mesh = f"{suffix}{_UNREADABLE}"
+        return mesh
+
+    def _find(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
+        """Return the file of an asset, and its fault as text."""
+        name = attributes.get("file", "")
+        if not name:
+            return None, "" if "vertex" in attributes else _UNREADABLE
+        compiler = self._mjcf.compiler
+        if compiler.get("strippath") == "true":
+            name = re.split(r"[/\\]", name)[-1]
+        own = "meshdir" if element.tag == "mesh" else "texturedir"
+        folder = compiler.get(own, compiler.get("assetdir", ""))
+        file = self._mjcf.file(element, name, folder)
+        if file is None:
+            return None, _NOT_FOUND
+        if self._mjcf.files.may_read(file):
+            try:
+                self._mjcf.files.check(file)
+            except DrakeTeleopError as error:
+                self.inaccessible.append(str(error))
+                return None, str(error)
+        else:
+            fault = _OUTSIDE.format(kind=element.tag, folder=file.resolve().parent)
+            self.inaccessible.append(fault)
+            return None, fault
+        return file, ""
+
+
+def _read_inline(attributes: Attributes) -> Triangles:
+    vertices = np.array(attributes["vertex"].split(), dtype=float).reshape(-1, 3)
+    if "face" not in attributes:
+        return convex_hull(vertices)
+    return Triangles(vertices, np.array(attributes["face"].split(), np.intp).reshape(-1, 3))

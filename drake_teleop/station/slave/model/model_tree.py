@@ -1,0 +1,170 @@
+"""Links and joints of a URDF robot or SDF model, and the chain of joints to the sensor frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from xml.etree.ElementTree import Element
+
+from drake_teleop.station.slave.model.repair_report import RepairReport
+
+WORLD = "world"  # name in URDF and SDF
+JOINT_TAGS = ("joint", "drake:joint")
+_LOOP_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
+_NUM_ENDS = 2  # names of bodies or frames in such a constraint
+_DETACHED = ("floating", "planar")
+
+
+def joints_of(scope: Element) -> list[Element]:
+    """Return the joints of a robot or model, without those of nested models."""
+    return [child for child in scope if child.tag in JOINT_TAGS]
+
+
+def joint_end(joint: Element, name: str) -> str:
+    """Return the name of a joint's `parent` or `child` link, or an empty text."""
+    element = joint.find(name)
+    return "" if element is None else (element.get("link") or element.text or "").strip()
+
+
+@dataclass(eq=False)
+class ModelTree:
+    """Joints up to the sensor from the base outwards, and all links by the nearest of them.
+
+    Attributes:
+        chain: joints from the root to the sensor's link, also fixed ones.
+        moved: number of the last moving joint of the chain below each link; 0 for links at rest.
+    """
+
+    chain: list[Element]
+    moved: dict[str, int]
+
+
+def link_of_frame(scope: Element, frame: str) -> str:
+    """Return the link that carries a frame, link or joint of this name, or an empty text."""
+    links = [link.get("name", "") for link in scope.findall("link")]
+    carriers = {
+        each.get("name", ""): each.get("link") or each.get("attached_to") or ""
+        for each in scope.findall("frame")
+    }
+    carriers |= {each.get("name", ""): joint_end(each, "child") for each in joints_of(scope)}
+    passed = set[str]()
+    while frame not in links and frame in carriers and frame not in passed:
+        passed.add(frame)
+        frame = carriers[frame] or (links[0] if scope.tag == "model" and links else "")
+    return frame if frame in links else ""
+
+
+def reduce_to_chain(
+    scope: Element, sensor_link: str, hold: set[str], report: RepairReport
+) -> ModelTree | None:
+    """Keep the tree with the sensor, and fix its joints outside the chain at their default.
+
+    Other roots and joints that close a loop are removed. The joints `hold` count as fixed. Return
+    None, with the faults in `report`, if the chain is ambiguous.
+    """
+    chain = _chain_to(scope, sensor_link, report)
+    if chain is None:
+        return None
+    chain = _without_free_base(scope, chain, report)
+    root = joint_end(chain[0], "parent") if chain else sensor_link
+    moved = _remove_unreachable(scope, root, chain, hold, report)
+    in_chain = set(map(id, chain))
+    for joint in joints_of(scope):
+        if id(joint) not in in_chain and joint.get("name") not in hold:
+            fix_joint(joint, report)
+    _remove_loops(scope, moved, report)
+    return ModelTree(chain, moved)
+
+
+def fix_joint(joint: Element, report: RepairReport) -> None:
+    """Make a joint that moves a fixed one, at its default position."""
+    if joint.get("type") == "fixed":
+        return
+    report.state("held:", joint.get("name", ""))
+    joint.tag = "joint"
+    joint.set("type", "fixed")
+    for child in list(joint):
+        if child.tag not in ("parent", "child", "origin", "pose"):
+            joint.remove(child)
+
+
+def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] | None:
+    parents: dict[str, list[Element]] = {}
+    for joint in joints_of(scope):
+        parents.setdefault(joint_end(joint, "child"), []).append(joint)
+    chain, passed = list[Element](), set[str]()
+    while link in parents:
+        if link in passed:
+            report.refuse(f"its joints form a circle through {link}; cut the loop")
+            return None
+        passed.add(link)
+        if link == WORLD:
+            report.refuse(f"world is the child of {parents[link][0].get('name', '')}")
+            return None
+        if len(parents[link]) > 1:
+            names = " and ".join(joint.get("name", "") for joint in parents[link])
+            report.refuse(f"{link} is the child of two joints, {names}; remove one of them")
+            return None
+        chain.append(parents[link][0])
+        link = joint_end(chain[-1], "parent")
+    return chain[::-1]
+
+
+def _without_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
+    """Remove a first joint that lets the arm's base float or drive."""
+    moving = [k for k, joint in enumerate(chain) if joint.get("type") != "fixed"]
+    if not moving or chain[moving[0]].get("type") not in _DETACHED:
+        return chain
+    free = chain[moving[0]]
+    report.state("welded to the world, where it may float:", joint_end(free, "child"))
+    scope.remove(free)
+    for link in scope.findall("link"):
+        if link.get("name") == WORLD:
+            scope.remove(link)
+    return chain[moving[0] + 1 :]
+
+
+def _remove_unreachable(
+    scope: Element, root: str, chain: list[Element], hold: set[str], report: RepairReport
+) -> dict[str, int]:
+    """Remove links and joints outside the tree of `root`; return `ModelTree.moved`."""
+    links = {link.get("name", ""): link for link in scope.findall("link")}
+    number_of, count = dict[int, int](), 0
+    for joint in chain:
+        count += joint.get("type") != "fixed" and joint.get("name", "") not in hold
+        number_of[id(joint)] = count
+    outboard: dict[str, list[Element]] = {}
+    for joint in sorted(joints_of(scope), key=lambda joint: id(joint) not in number_of):
+        outboard.setdefault(joint_end(joint, "parent"), []).append(joint)
+    moved, ahead, kept = {root: 0}, [root], set[int]()
+    while ahead:
+        parent = ahead.pop()
+        for joint in outboard.get(parent, []):
+            child = joint_end(joint, "child")
+            exists = child in links or id(joint) in number_of
+            if exists and child not in moved and child != WORLD:
+                moved[child] = number_of.get(id(joint), moved[parent])
+                kept.add(id(joint))
+                ahead.append(child)
+    for name in links.keys() - moved.keys():
+        scope.remove(links[name])
+    for name in [name for name in links if name not in moved and name != WORLD]:
+        report.repair("not connected to the arm and left out:", name or "a link without name")
+    for joint in joints_of(scope):
+        if id(joint) not in kept:
+            scope.remove(joint)
+            if joint_end(joint, "parent") in moved:
+                what = "left out, as it closes a loop or has no child:"
+                report.repair(what, joint.get("name", ""))
+    return moved
+
+
+def _remove_loops(scope: Element, moved: dict[str, int], report: RepairReport) -> None:
+    """Remove constraints between links that do not move relative to each other."""
+    for element in [child for child in scope if child.tag in _LOOP_TAGS]:
+        names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
+        groups = {moved.get(link_of_frame(scope, name), -1) for name in names}
+        scope.remove(element)
+        if len(names) < _NUM_ENDS or len(groups) > 1:
+            report.refuse(
+                f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
+            )

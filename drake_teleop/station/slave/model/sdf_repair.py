@@ -1,0 +1,120 @@
+"""Repair of SDF texts: the model with the sensor, without elements that Drake does not read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement
+
+from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.model.model_tree import link_of_frame
+from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport
+from drake_teleop.station.slave.model.urdf_repair import Purpose, finish, repair_scope, repair_urdf
+
+_MODEL_CONFIG, _URDF, _SDF = "model.config", ".urdf", ".sdf"
+_URIS = ".//include/uri"
+# Children that Drake reads; it also reads elements with its own prefix.
+_PARTS = {
+    "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
+    "link": {"pose", "inertial", "collision", "visual"},
+    "collision": {"pose", "geometry", "surface"},
+    "visual": {"pose", "geometry", "material"},
+}
+
+
+def repair_sdf(
+    root: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
+) -> RepairedModel:
+    """Return the text of an SDF that Drake reads, with meshes and included files in `folder`.
+
+    Raises:
+        DrakeTeleopError: with all faults of the arm that cannot be repaired.
+    """
+    report = RepairReport(strict=purpose.is_scene)
+    if not purpose.is_scene:
+        _keep_one_model(root, file, files, purpose.sensor, report)
+        for element in list(root.iter()):
+            allowed = _PARTS.get(element.tag)
+            for child in list(element) if allowed else ():
+                if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
+                    element.remove(child)
+    repair_scope(root, purpose, report, is_sdf=True)
+    for model in root.findall("model"):
+        model.set("name", model.get("name") or file.stem)
+    report.raise_causes(file)
+    inner = [_repair_included(uri, file, files, purpose, folder) for uri in root.iterfind(_URIS)]
+    own = finish(root, file, files, report, folder if purpose.has_geometry else None)
+    for each in (each for each in inner if each is not None):
+        own = RepairedModel(
+            own.text,
+            own.assumptions + each.assumptions,
+            own.effort_limits | each.effort_limits,
+            own.dependent | each.dependent,
+        )
+    return own
+
+
+def _repair_included(
+    uri: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
+) -> RepairedModel | None:
+    """Replace an included file by its repaired text; keep what Drake has to find or reject."""
+    included = _included_file((uri.text or "").strip(), file, files)
+    if included is None:
+        return None
+    uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
+    repair = {_URDF: repair_urdf, _SDF: repair_sdf}.get(included.suffix.lower())
+    if repair is None or not included.is_file():
+        return None
+    part = purpose._replace(in_directives=True)
+    repaired = repair(read_xml(included), included, files, part, folder)
+    target = folder / f"{len(list(folder.iterdir()))}_{included.name}"
+    target.write_text(repaired.text, encoding="utf-8")
+    uri.text = f"file://{target}"
+    return repaired
+
+
+def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
+    """Return the file at an address, or in the model folder there if it names one file."""
+    found = files.file(address, file.resolve().parent) or files.file(address)
+    if found is not None and (found / _MODEL_CONFIG).is_file():
+        named = read_xml(found / _MODEL_CONFIG).findall("sdf")
+        inner = files.file((named[0].text or "").strip(), found) if len(named) == 1 else None
+        return inner or found
+    return found
+
+
+def _keep_one_model(
+    root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
+) -> None:
+    """Reduce worlds and several models to the model with the sensor."""
+    worlds = root.findall("world")
+    models = [
+        each for scope in (root, *worlds) for each in scope if each.tag in ("model", "include")
+    ]
+    if not worlds and len(models) <= 1:
+        return
+    with_sensor = [each for each in models if _has_frame(each, file, files, sensor)]
+    if len(with_sensor) != 1:
+        return  # Drake or the search for the frame reports it
+    (kept,) = with_sensor
+    for child in [child for child in root if child.tag in ("world", "model", "include")]:
+        root.remove(child)
+    if kept.tag == "include":
+        around = SubElement(root, "model", name="model_of_world")
+        around.append(kept)
+    else:
+        root.append(kept)
+    for other in models:
+        if other is not kept:
+            name = other.get("name") or other.findtext("name") or other.findtext("uri") or ""
+            report.repair("models beside the arm left out:", name)
+
+
+def _has_frame(model: Element, file: Path, files: ModelFiles, sensor: str) -> bool:
+    if model.tag == "model":
+        inner = [each for each in model.iter() if each.tag == "model"]
+        return any(link_of_frame(scope, sensor) for scope in inner)
+    included = _included_file((model.findtext("uri") or "").strip(), file, files)
+    if included is None or included.suffix.lower() not in (_URDF, _SDF):
+        return False
+    scopes = [each for each in read_xml(included).iter() if each.tag in ("robot", "model")]
+    return any(link_of_frame(scope, sensor) for scope in scopes)

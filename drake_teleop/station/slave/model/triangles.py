@@ -1,0 +1,113 @@
+"""Triangle meshes of STL, OBJ and MSH files, their convex hulls, and their text for Drake."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Triangle of a binary STL file.
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+_Array = NDArray[np.float64]
+
+
+class Triangles(NamedTuple):
+    """Triangle mesh: vertices (n, 3) [m] and rows (m, 3) of vertex indices."""
+
+    vertices: _Array
+    faces: NDArray[np.intp]
+
+
+def read_triangles(file: Path) -> Triangles:
+    """Return the triangles of an STL, OBJ or MSH file.
+
+    Raises:
+        ValueError: if the file is damaged or of another kind.
+    """
+    read = {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}
+    try:
+        return checked_triangles(read[file.suffix.lower()](file.read_bytes()))
+    except (KeyError, IndexError, OSError) as error:  # another kind, or too short
+        raise ValueError(str(error)) from None
+
+
+def checked_triangles(triangles: Triangles) -> Triangles:
+    """Return the triangles; raise ValueError unless all their vertices exist and are finite."""
+    vertices, faces = triangles
+    if not faces.size or faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError("no triangles")
+    if not np.isfinite(vertices).all():
+        raise ValueError("vertices that are not finite")
+    return triangles
+
+
+def obj_text(triangles: Triangles) -> str:
+    """Return the triangles as text of an OBJ file."""
+    vertices, faces = triangles.vertices, triangles.faces + 1
+    text = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel())
+    return text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel())
+
+
+def convex_hull(vertices: _Array) -> Triangles:
+    """Return the convex hull with triangles that face outwards.
+
+    Raises:
+        ValueError: if the points have no volume.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError as error:
+        raise ValueError("no volume") from error
+    faces = hull.simplices.astype(np.intp)
+    inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
+    faces[inwards] = faces[inwards, ::-1]
+    return _merged(vertices[faces])
+
+
+def _merged(corners: _Array) -> Triangles:
+    """Return triangles (m, 3, 3) with each vertex once."""
+    points = corners.reshape(-1, 3).astype(float)
+    order = np.lexsort(points.T)
+    is_new = np.ones(len(points), bool)
+    is_new[1:] = (np.diff(points[order], axis=0) != 0.0).any(axis=1)
+    number = np.empty(len(points), np.intp)
+    number[order] = np.cumsum(is_new) - 1
+    return Triangles(points[order][is_new], number.reshape(-1, 3))
+
+
+def _read_stl(data: bytes) -> Triangles:
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + count * _TRIANGLE.itemsize:
+        return _merged(np.frombuffer(data, _TRIANGLE, count, 84)["corners"])
+    lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
+    return _merged(np.array(lines, dtype=float).reshape(-1, 3))
+
+
+def _read_obj(data: bytes) -> Triangles:
+    vertices, faces = list[list[float]](), list[tuple[int, int, int]]()
+    for line in data.splitlines():
+        words = line.split()
+        if words[:1] == [b"v"]:
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[:1] == [b"f"]:
+            corners = [int(word.split(b"/")[0]) for word in words[1:]]
+            corners = [k - 1 if k > 0 else len(vertices) + k for k in corners]
+            faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
+    return Triangles(np.array(vertices).reshape(-1, 3), np.array(faces, np.intp).reshape(-1, 3))
+
+
+def _read_msh(data: bytes) -> Triangles:
+    """Read MuJoCo's binary format: four counts, then vertices, normals, texture and faces."""
+    n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
+    if min(n, normals, texture, count) < 0:
+        raise ValueError("a negative count")
+    vertices = np.frombuffer(data, "<f4", 3 * n, 16).reshape(-1, 3)
+    start = 16 + 4 * (3 * n + 3 * normals + 2 * texture)
+    faces = np.frombuffer(data, "<i4", 3 * count, start).reshape(-1, 3)
+    return Triangles(vertices.astype(float), faces.astype(np.intp))

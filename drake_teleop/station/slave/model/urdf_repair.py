@@ -1,0 +1,222 @@
+"""Repair of URDF and SDF texts, so that Drake reads the arm in them.
+
+Links and joints that the arm does not need never stop the reading. Every repair is stated.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from drake_teleop.station.slave.model.link_repair import repair_inertia
+from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
+from drake_teleop.station.slave.model.model_numbers import (
+    check_joint,
+    check_quantities,
+    number,
+    separate_by_blanks,
+)
+from drake_teleop.station.slave.model.model_references import ModelFiles
+from drake_teleop.station.slave.model.model_tree import (
+    WORLD,
+    ModelTree,
+    fix_joint,
+    joint_end,
+    joints_of,
+    link_of_frame,
+    reduce_to_chain,
+)
+from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, listed
+
+_URDF_PARTS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
+_URDF_PARTS |= {"drake:collision_filter_group"}
+_NUM_COLOURS = 4  # red, green, blue, opacity
+_DRAKE_ROTOR = ("drake:rotor_inertia", "drake:gear_ratio")
+
+
+class Purpose(NamedTuple):
+    """Use of a model: as arm, tool or surroundings.
+
+    Attributes:
+        sensor: frame, link or site of the sensor; empty for tools and surroundings.
+        hold: angles or positions [rad, m] of joints that do not move.
+        is_tool: whether all joints are held.
+        is_scene: whether every element that the tool could touch must be readable.
+        in_directives: whether other files may attach to any link, and set positions.
+        has_geometry: whether the plant takes shapes.
+    """
+
+    sensor: str = ""
+    hold: dict[str, float] = {}  # noqa: RUF012  (never changed)
+    is_tool: bool = False
+    is_scene: bool = False
+    in_directives: bool = False
+    has_geometry: bool = True
+
+
+def repair_urdf(
+    root: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
+) -> RepairedModel:
+    """Return the text of a URDF that Drake reads, with meshes converted in `folder`.
+
+    Raises:
+        DrakeTeleopError: with all faults of the arm that cannot be repaired.
+    """
+    report = RepairReport(strict=purpose.is_scene)
+    root.set("name", root.get("name") or file.stem)
+    if not purpose.is_scene:
+        for child in [child for child in root if child.tag not in _URDF_PARTS]:
+            if not child.tag.endswith(("_constraint", "_bushing_rpy")):
+                root.remove(child)
+        _keep_one_material_per_name(root)
+    repair_scope(root, purpose, report, is_sdf=False)
+    if not purpose.is_scene:
+        _remove_idle_parts(root, report)
+    return finish(root, file, files, report, folder if purpose.has_geometry else None)
+
+
+def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sdf: bool) -> None:
+    """Repair links and joints of a robot, or of a model and its nested models."""
+    separate_by_blanks(root)
+    scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
+    for scope in scopes:
+        _name_joints(scope, report)
+    tree = _tree(scopes, purpose, report)
+    chain = set() if tree is None else set(map(id, tree.chain))
+    for scope in scopes:
+        links = {link.get("name", "") for link in scope.findall("link")}
+        for joint in joints_of(scope):
+            if joint.get("name") in purpose.hold:
+                for mimic in joint.findall("mimic"):
+                    joint.remove(mimic)
+            in_chain = id(joint) in chain and joint.get("name") not in purpose.hold
+            check_joint(joint, links, report, in_chain=in_chain)
+        moving = {
+            joint_end(each, "child") for each in joints_of(scope) if each.get("type") != "fixed"
+        }
+        for link in scope.findall("link"):
+            name = link.get("name", "")
+            for part in [link] if purpose.is_scene else link.findall("inertial"):
+                check_quantities(part, f"link {name}", report)
+            at_rest = tree is not None and tree.moved.get(name) == 0
+            is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
+            if is_massless and name in moving:
+                report.state("no inertia of", name)
+
+
+def finish(
+    root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path | None
+) -> RepairedModel:
+    """Make the addresses of meshes absolute; return the text, or raise all faults at once.
+
+    Without a folder for converted meshes the text has no shapes.
+    """
+    report.raise_causes(file)
+    lost = remove_unusable_shapes(root, file, files, folder)
+    for fault, links in lost.items():
+        report.repair("shapes are missing of", f"{listed(links)}: {fault}")
+    report.raise_causes(file)
+    limits = {
+        joint.get("name", ""): number(limit.get("effort") or limit.findtext("effort") or "0")
+        for joint in root.iter("joint")
+        for limit in joint.iter("limit")
+    }
+    text = ElementTree.tostring(root, encoding="unicode")
+    limits = {name: limit for name, limit in limits.items() if 0.0 < limit < float("inf")}
+    return RepairedModel(text, report.assumptions, limits, dependent_joints(root))
+
+
+def dependent_joints(root: Element) -> dict[str, str]:
+    """Return, by joint or link, the reason why it does not move independently."""
+    found: dict[str, str] = {}
+    for joint in root.iter("joint"):
+        parent = joint_end(joint, "parent")
+        if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
+            found[joint.get("name", "")] = "moves with another joint (mimic)"
+        if joint.get("type") == "floating" and parent != WORLD:
+            found[joint_end(joint, "child")] = f"floats on {parent}"
+    return found
+
+
+def _tree(scopes: list[Element], purpose: Purpose, report: RepairReport) -> ModelTree | None:
+    """Return the chain to the sensor if one robot or model contains it all."""
+    if purpose.is_tool:
+        for joint in (joint for scope in scopes for joint in joints_of(scope)):
+            fix_joint(joint, report)
+        return None
+    if len(scopes) != 1 or purpose.in_directives or scopes[0].find("include") is not None:
+        return None
+    link = link_of_frame(scopes[0], purpose.sensor) if purpose.sensor else ""
+    return reduce_to_chain(scopes[0], link, set(purpose.hold), report) if link else None
+
+
+def _name_joints(scope: Element, report: RepairReport) -> None:
+    """Give each joint a separate name, and keep one link of each name."""
+    names = set[str]()
+    for number_of_joint, joint in enumerate(joints_of(scope), start=1):
+        name = joint.get("name", "")
+        if not name or name in names:
+            new = f"{name or 'joint'}_{number_of_joint}"
+            report.repair("a new name for the joint", f"{name or 'without name'} ({new})")
+            joint.set("name", new)
+        names.add(joint.get("name", ""))
+    links, children = set[str](), Counter(joint_end(joint, "child") for joint in joints_of(scope))
+    for link in scope.findall("link"):
+        name = link.get("name", "")
+        if name in links and children[name] > 1:
+            report.refuse(f"two links are named {name}; rename one of them")
+        elif name in links:
+            scope.remove(link)
+            report.repair("a second link of the same name left out:", name)
+        links.add(name)
+
+
+def _keep_one_material_per_name(root: Element) -> None:
+    """Define each named colour once, in the robot; visuals refer to it, or have a nameless one."""
+    own = [each for each in root.iter("material") if _has_colour(each) and each.get("name")]
+    defined = {each.get("name", ""): each for each in reversed([*root.findall("material"), *own])}
+    defined = {name: each for name, each in defined.items() if _has_colour(each)}
+    for material in root.findall("material"):
+        root.remove(material)
+    for visual in root.iterfind("link/visual"):
+        for material in visual.findall("material"):
+            name = material.get("name", "")
+            if name in defined:
+                visual.remove(material)
+                SubElement(visual, "material", name=name)
+            elif name or not _has_colour(material):
+                visual.remove(material)
+    root.extend(defined.values())
+
+
+def _has_colour(material: Element) -> bool:
+    for texture in material.findall("texture"):
+        material.remove(texture)
+    colour = material.find("color")
+    values = [] if colour is None else [number(word) for word in colour.get("rgba", "").split()]
+    return len(values) == _NUM_COLOURS and all(0.0 <= value <= 1.0 for value in values)
+
+
+def _remove_idle_parts(root: Element, report: RepairReport) -> None:
+    """Remove frames and filters of missing links, and motors without data for Drake."""
+    links = {link.get("name", "") for link in root.findall("link")}
+    moving = {joint.get("name", "") for joint in joints_of(root) if joint.get("type") != "fixed"}
+    for frame in root.findall("frame"):
+        if frame.get("link") not in links:
+            root.remove(frame)
+    for group in root.findall("drake:collision_filter_group"):
+        if any(member.get("link") not in links for member in group.findall("drake:member")):
+            root.remove(group)
+    for motor in root.findall("transmission"):
+        names = [joint.get("name", "") for joint in motor.findall("joint")]
+        has_data = any(inner.tag in _DRAKE_ROTOR for inner in motor.iter())
+        if len(names) != 1 or names[0] not in moving or not has_data:
+            root.remove(motor)
+            continue
+        moving.discard(names[0])
+        check_quantities(motor, f"motor of {names[0]}", report)
+        for actuator in motor.findall("actuator"):
+            actuator.set("name", names[0])

@@ -1,0 +1,229 @@
+"""`ros2://` and the command `ros2` against real nodes of ROS 2 in other processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from peer import HASH
+from test_compensator import PHI, load
+from test_peers import Seen
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots.connections import open_sink
+from drake_teleop.robots.lines import flag_names
+from drake_teleop.robots.ros2_messages import MessageConverter
+from drake_teleop.robots.streams import NONZERO_FLAGS, POSE, Compensated, Flag
+
+PEER = Path(__file__).with_name("ros2_peer.py")
+DOMAIN = str(os.getpid() % 100 + 1)
+ros = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy (extra `ros2`) is not installed")
+
+
+@contextmanager
+def process(*words: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, *words], stdout=subprocess.PIPE, text=True, **options
+    ) as started:
+        try:
+            yield started
+        finally:
+            started.kill()
+
+
+class Echo(list[dict[str, Any]]):
+    """Lines of a peer's node, as they arrive."""
+
+    def __init__(self, started: subprocess.Popen[str]) -> None:
+        self._thread = threading.Thread(target=self._read, args=(started,), daemon=True)
+        self._thread.start()
+
+    def _read(self, started: subprocess.Popen[str]) -> None:
+        assert started.stdout is not None
+        for line in started.stdout:
+            self.append(json.loads(line))
+
+    def wait(self, condition: Any, act: Any = lambda: None, seconds: float = 60.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline
+            act()
+            time.sleep(0.005)
+
+
+@ros
+@pytest.mark.slow
+def test_node_receives_wrench_and_every_flag_and_the_hash() -> None:
+    wrench = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    with process(str(PEER), "echo", DOMAIN, "/tool/contact") as peer:
+        sink = open_sink(f"ros2://tool/contact?frame=tool0&domain={DOMAIN}")
+        seen = Echo(peer)
+
+        def write(flags: int) -> None:
+            zero = flags & ~NONZERO_FLAGS
+            sink.write(Compensated(7, 0.5, wrench * (not zero), -wrench, flags))
+
+        seen.wait(lambda: any("wrench" in row for row in seen), lambda: write(0))
+        seen.wait(lambda: any(row.get("message") == "ok" for row in seen), lambda: write(0), 30)
+        for flag in (*Flag, Flag.WRONG_RATE | Flag.CLIPPED):
+            words = ", ".join(flag_names(flag))
+            write(int(flag))
+            seen.wait(lambda words=words: any(row.get("message") == words for row in seen))
+        sink.close()
+    assert seen[0] == {"hash": f"RIHS01_{HASH}", "type": "geometry_msgs/msg/WrenchStamped"}
+    first = next(row for row in seen if "wrench" in row)
+    assert first["wrench"] == wrench.tolist() and first["frame"] == "tool0"
+    assert abs(first["t"] - time.time()) < 600.0
+    levels = {row["message"]: row["level"] for row in seen if "message" in row}
+    for flag in Flag:
+        expected = 1 if flag & NONZERO_FLAGS else 3 if flag == Flag.STALE else 2
+        assert levels[flag_names(flag)[0]] == expected
+    assert levels["ok"] == 0
+    last = [row for row in seen if "message" in row][-1]
+    assert last["name"] == "drake_teleop: /tool/contact"
+    assert last["values"]["number"] == "7" and last["values"]["wrong rate"] == "2"
+
+
+@ros
+@pytest.mark.slow
+def test_faults_of_a_node_are_named_and_zero() -> None:
+    from drake_teleop.robots.ros2 import Ros2Source
+
+    with process(str(PEER), "faults", DOMAIN) as peer:
+        assert peer.stdout is not None and peer.stdout.readline() == "ready\n"
+        source = Ros2Source(f"ros2://ft/wrench?domain={DOMAIN}&sign=1", 0.002)
+        seen = Seen(source, 20, Flag.RESTART, 30.0)
+        source.close()
+    flags = Flag.REORDERED | Flag.NOT_FINITE | Flag.DAMAGED | Flag.OUT_OF_RANGE | Flag.STALE
+    named = Flag(0)
+    for row in seen:
+        named |= Flag(row.flags)
+        assert not row.flags or not row.contact.any()
+    assert (
+        named & (flags | Flag.CLOCK_JUMP | Flag.RESTART) == flags | Flag.CLOCK_JUMP | Flag.RESTART
+    )
+
+
+def test_static_and_moving_transforms_form_a_chain() -> None:
+    """Messages of `/tf_static` yield no pose; those of `/tf` do."""
+
+    def transforms(child: str, parent: str, x: float, sec: int) -> Any:
+        stamp = SimpleNamespace(sec=sec, nanosec=0)
+        return SimpleNamespace(
+            transforms=[
+                SimpleNamespace(
+                    header=SimpleNamespace(stamp=stamp, frame_id=parent),
+                    child_frame_id=child,
+                    transform=SimpleNamespace(
+                        translation=SimpleNamespace(x=x, y=0.0, z=0.0),
+                        rotation=SimpleNamespace(w=1.0, x=0.0, y=0.0, z=0.0),
+                    ),
+                )
+            ]
+        )
+
+    converter = MessageConverter(1.0, ("base", "sensor"))
+    assert converter.parts_of("tf", transforms("flange", "base", 0.5, 3), 1) == []
+    converter.add_transforms(transforms("sensor", "flange", 0.1, 0))
+    (part,) = converter.parts_of("tf", transforms("flange", "base", 0.7, 4), 2)
+    assert (part.stream, part.number, part.t) == (POSE, 2, 4.0)
+    np.testing.assert_allclose(part.values, [1, 0, 0, 0, 0.8, 0, 0])
+
+
+@ros
+def test_wrong_addresses_are_one_error_line() -> None:
+    from drake_teleop.robots.connections import open_source
+
+    for address, words in (
+        ("ros2://", "'' is not a topic"),
+        ("ros2://ft wrench", "is not a topic"),
+        ("ros2://ft/wrench?colour=1", "unknown parameter 'colour'"),
+        ("ros2://ft/wrench?domain=300", "is not 0 to 232"),
+        ("ros2://ft/wrench?tf=base", "tf is not PARENT,CHILD"),
+        ("ros2://ft/wrench?joints=/joint_states", "need the model of the arm"),
+    ):
+        with pytest.raises(DrakeTeleopError, match=words):
+            open_source(address, load(), rate_hz=500.0)
+    if find_spec("tf2_msgs") is None:
+        with pytest.raises(DrakeTeleopError, match="needs the ROS package tf2_msgs"):
+            open_source("ros2://ft/wrench?tf=base,tool", load(), rate_hz=500.0)
+
+
+def test_missing_rclpy_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(DrakeTeleopError, match=r"rclpy, which is not installed.*\[ros2\]"):
+        open_sink("ros2://contact")
+
+
+NODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
+
+
+@ros
+@pytest.mark.long
+@pytest.mark.slow
+def test_services_and_parameters_of_the_node(tmp_path: Path) -> None:
+    """Tare, scales, another load, a refused value, and a calibration that is too short."""
+    file, other = tmp_path / "load.json", tmp_path / "other.json"
+    load().save(file)
+    load().save(other)
+    rest = non_contact_wrench(*np.split(np.array([0.0, 0.0, 9.81, *np.zeros(6)]), 3), PHI)
+    np.save(tmp_path / "rows.npy", [[*(rest + 0.5), 1.0, *np.zeros(6)]])
+    source = f"ros2://ft/wrench?pose=/ft/pose&domain={DOMAIN}&sign=1"
+    words = ["ros2", source, f"ros2://contact?domain={DOMAIN}&wrench=scaled", "--load", str(file)]
+    words += ["--rate", "200", "--sigma", "0", "--out", str(tmp_path / "out")]
+    with (
+        process(str(PEER), "moving", DOMAIN, str(tmp_path / "rows.npy"), "200"),
+        process("-c", NODE, *words) as node,
+        process(str(PEER), "echo", DOMAIN, "/contact") as peer,
+        process(str(PEER), "calls", DOMAIN, stdin=subprocess.PIPE) as calls,
+    ):
+        seen = Echo(peer)
+
+        def call(line: str) -> list[Any]:
+            assert calls.stdin is not None and calls.stdout is not None
+            calls.stdin.write(line + "\n")
+            calls.stdin.flush()
+            answer = json.loads(calls.stdout.readline())
+            seen.clear()
+            seen.wait(lambda: sum("wrench" in row and any(row["wrench"]) for row in seen) > 2)
+            return answer
+
+        def wrench() -> Any:
+            return np.array([row["wrench"] for row in seen if "wrench" in row][-1])
+
+        seen.wait(lambda: any("wrench" in row and any(row["wrench"]) for row in seen), seconds=120)
+        before = wrench()
+        assert call("set gamma 2.0") == [True, ""]
+        time.sleep(0.5)
+        np.testing.assert_allclose(wrench(), 2.0 * before, atol=1e-6)
+        assert call("set sigma -1.0") == [False, "sigma: -1.0 is not a finite number of at least 0"]
+        assert call("set sigma 1.0")[0]
+        time.sleep(0.5)
+        np.testing.assert_allclose(wrench(), 2.0 * before + rest, atol=1e-6)
+        assert call("set load /nowhere.json")[0]
+        done, said = call("load")
+        assert not done and said.startswith("refused: /nowhere.json")
+        assert call(f"set load {other}")[0]
+        assert call("load") == [True, f"done: {load().mass:.4g} kg"]
+        assert call("set sigma 0.0")[0]
+        done, said = call("tare")
+        assert done == said.startswith("done: offsets moved by"), said
+        assert call("set seconds 2.0")[0]
+        done, said = call("calibrate")
+        assert not done and "the wrench is the same in all samples" in said
+        node.send_signal(signal.SIGINT)
+        assert node.wait(30) == 0

@@ -1,0 +1,180 @@
+"""`tune`: the stated set, the search, and the written scenario."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import drake_teleop as dt
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.comparison.delayed_contact import thickness_of
+from drake_teleop.lab.tuning.press_trial import (
+    MAX_REST_FORCE_N,
+    Settings,
+    StationTrial,
+    press_depth,
+    rms_above,
+)
+from drake_teleop.lab.tuning.search import holds, search_settings
+from drake_teleop.lab.tuning.stated_set import base_of, stated_set
+from drake_teleop.lab.tuning.tune import tune
+from drake_teleop.station.environment.sheet_spring import SheetSpring
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.scenario import LoadScenario, replace
+
+GOOD = {"rests": 1.0, "rest_force_N": 0.01, "share": 0.95, "free_force_N": 0.0, "contact_N": 5.0}
+
+
+def test_stated_set_has_the_softest_and_firmest_grip_at_both_walls():
+    stated = stated_set(["firm", "light", "medium"], [20.0, 0.5, 3.0], "press")
+    assert stated.hands == ("light", "medium", "firm")
+    assert stated.walls == (500.0, 20000.0)
+    assert stated.corners == [
+        ("light", 20000.0), ("firm", 20000.0), ("light", 500.0), ("firm", 500.0),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "where"),
+    [
+        ((["lite"], [1.0], "press"), "hands"),
+        (([], [1.0], "press"), "hands"),
+        ((["light"], [], "press"), "walls"),
+        ((["light"], [0.0], "press"), "walls"),
+        ((["light"], [np.nan], "press"), "walls"),
+        ((["light"], [1.0], "dance"), "task"),
+    ],
+)
+def test_invalid_sets_are_refused(arguments, where):
+    with pytest.raises(DrakeTeleopError, match=f"^{where}"):
+        stated_set(*arguments)
+
+
+def test_unknown_networks_are_refused():
+    with pytest.raises(DrakeTeleopError, match=r"^network: 'internt' is unknown"):
+        base_of(LoadScenario("touch"), "internt")
+
+
+def test_leaf_of_a_stiffness_has_this_stiffness():
+    leaf = SheetSpring(length=0.12, width=0.05, thickness=thickness_of(3000.0))
+    assert leaf.stiffness == pytest.approx(3000.0)
+
+
+def test_firm_grip_presses_less_deeply_with_a_weak_device():
+    strong = LoadScenario("touch")
+    weak = replace(strong, master=Master(model="geomagic_touch"))
+    assert press_depth(strong, "firm") == 0.02
+    assert press_depth(weak, "firm") == pytest.approx(0.6 * 3.3 / 700.0)
+
+
+def test_only_force_above_5_hz_counts_as_oscillation():
+    t = np.arange(800) * 1e-3
+    slow, fast = np.sin(2 * np.pi * 1.25 * t), 0.3 * np.sin(2 * np.pi * 40.0 * t)
+    assert rms_above(slow, 1e-3, 5.0) < 0.05
+    assert rms_above(slow + fast, 1e-3, 5.0) == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
+    assert rms_above(np.full(800, np.nan), 1e-3, 5.0) == np.inf
+
+
+@pytest.mark.parametrize(
+    "change", [{"rests": 0.0}, {"rest_force_N": 1.2 * MAX_REST_FORCE_N}, {"share": 0.8}]
+)
+def test_station_holds_only_if_it_rests_quietly_and_renders_the_force(change):
+    assert holds(GOOD)
+    assert not holds(GOOD | change)
+
+
+class FakeStation:
+    """Answers of a station that is stable with `ledger` below a product of gamma and wall."""
+
+    def __init__(self, limit: float, one_axis_limit: float) -> None:
+        self.limit, self.one_axis_limit, self.names = limit, one_axis_limit, []
+
+    def __call__(self, name, study, work):
+        self.names.append(name)
+        rows = [dict(point) for point in study.points()]
+        for row in rows:
+            if name == "search":
+                limit = self.one_axis_limit if row["method"] == "ledger" else 0.0
+                row |= {"gamma_limit": limit, "linear_limit": 0.0, "share": 0.95}
+            else:
+                row |= GOOD | {"threshold_N": 1.0 / row["gamma"]}
+                row["rests"] = float(row["gamma"] * row["wall"] <= self.limit)
+        return rows
+
+
+def trial(walls=(0.5, 20.0)) -> StationTrial:
+    given = LoadScenario("contact_transition")
+    base = base_of(given, "internet")
+    return StationTrial(given, base, stated_set(["light", "firm"], walls, "press"), np.ones(16))
+
+
+def test_search_takes_the_limit_of_one_axis_if_the_station_holds_it():
+    found = search_settings(trial(), FakeStation(limit=np.inf, one_axis_limit=2.2))
+    assert (found.settings.method, found.settings.sigma_inertia) == ("ledger", 0.0)
+    assert found.settings.gamma == pytest.approx(2.2 / 1.1)
+    assert {row["wall"] for row in found.limits} == {20000.0, 24000.0, 40000.0}
+    assert all(row["gamma"] == found.settings.gamma for row in found.limits)
+
+
+def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin():
+    limit = 0.7 * 20000.0
+    station = FakeStation(limit=limit, one_axis_limit=2.2)
+    found = search_settings(trial(), station)
+    assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
+    assert {row["gamma"] for row in found.inside} == {1.1 * found.settings.gamma}
+    assert {(row["hand"], row["wall"]) for row in found.inside} == set(trial().stated.corners)
+    assert not all(holds(row) for row in found.limits)
+
+
+def test_search_refuses_a_set_that_no_settings_hold():
+    with pytest.raises(DrakeTeleopError, match="no settings were stable"):
+        search_settings(trial(), FakeStation(limit=0.0, one_axis_limit=2.2))
+
+
+def test_settings_change_method_scales_and_filter_alone():
+    base = base_of(LoadScenario("contact_transition"), "internet")
+    stated = stated_set(["light", "firm"], [1.0], "press")
+    tuned = Settings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
+    assert tuned.force_scaling.scales().shares == (0.3, 0.3, 0.0, 0.0)
+    assert tuned.force_scaling.scales().gamma == 2.0
+    assert tuned.wrist_sensor.bandwidth_hz == 100.0
+    assert tuned.passivity.charged_tdpa.hand_stiffness[0] == 700.0
+    assert (
+        replace(
+            tuned,
+            force_scaling=base.force_scaling,
+            wrist_sensor=base.wrist_sensor,
+            passivity=base.passivity,
+        )
+        == base
+    )
+
+
+@pytest.mark.long
+def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path):
+    arguments = {"hands": ["medium"], "walls": [1.0], "network": "lan", "jobs": 1}
+    summary = tune("touch", tmp_path, progress=False, **arguments)
+    tuned = LoadScenario(tmp_path / "tuned.yaml")
+    settings = summary["settings"]
+    assert tuned.passivity.method == settings["method"]
+    assert tuned.force_scaling.gamma == settings["gamma"]
+    assert tuned.channel.network == "lan"
+    assert tuned.operator.task == LoadScenario("touch").operator.task
+    heading = (tmp_path / "tuned.yaml").read_text().splitlines()
+    assert heading[: len(summary["sentences"])] == [f"# {line}" for line in summary["sentences"]]
+    assert summary["figures"]["share"] >= 0.9
+    assert summary["figures"]["threshold_N"] > 0.0
+    assert summary["sentences"][1] in (tmp_path / "report.html").read_text()
+    assert json.loads((tmp_path / "summary.json").read_text())["settings"] == settings
+    parts = sorted(tmp_path.glob("*/runs.parquet/*"))
+    before = [part.stat().st_mtime_ns for part in parts]
+    (tmp_path / "summary.json").unlink()
+    again = tune("touch", tmp_path, progress=False, **arguments)
+    assert again == summary
+    assert [part.stat().st_mtime_ns for part in parts] == before
+
+
+def test_tune_is_a_public_name():
+    assert dt.tune is tune
