@@ -97,6 +97,9 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "a delay": (lambda: dt.identify(N6, N3, N3, N3, delay_s=HALF), "delay_s"),
     "noise": (lambda: identify_batch(N6, N3, N3, N3, noise=HALF), "noise"),
     "a plant": (lambda: dt.AddWristSensor(None, 7, None), "AddWristSensor"),
+    "a hand": (lambda: dt.tune("contact_transition", hands=("strong",)), "hands"),
+    "a wall": (lambda: dt.tune("contact_transition", walls=(-1.0, 20.0)), "walls"),
+    "a task": (lambda: dt.tune("contact_transition", task="dance"), "task"),
     # Logs.
     "read_log": (lambda: dt.read_log(7), "log"),  # type: ignore[arg-type]
     "a filter": (lambda: dt.read_log("log.csv", bandwidth_hz=HALF), "bandwidth_hz"),
