@@ -200,8 +200,8 @@ def main(arguments: list[str] | None = None) -> None:
         for key, value in found[name].items():
             if key != "rows":
                 print(f"{name}.{key:28} {value}", flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        if options.json:
+            options.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
