@@ -66,14 +66,16 @@ def mass() -> dict[str, Any]:
     t = np.arange(0.0, _PUSH_S, _STEP_S)
     shapes = {"constant": np.ones_like(t), "half_sine": np.sin(np.pi * t / _PUSH_S)}
     axis, found = OneAxis(sigma=1.0), {}
-    own, tool = axis.device_mass, axis.force_scale * axis.displayed_tool_mass
+    hand, device = axis.hand_mass, axis.device_mass
+    tool = axis.force_scale * axis.displayed_tool_mass
     for (shape, force), delay in itertools.product(shapes.items(), (0.025, 0.05)):
         late = round(delay / _STEP_S)
         admittance = force.sum() / force[:-late].sum()
         a = np.zeros_like(t)
         for k in range(len(t)):
-            a[k] = (force[k] - (tool * a[k - late] if k >= late else 0.0)) / own
-        impedance = force.sum() / a.sum() / (own + tool)
+            a[k] = (force[k] - (tool * a[k - late] if k >= late else 0.0)) / (hand + device)
+        # The hand does not perceive its own mass.
+        impedance = (force.sum() / a.sum() - hand) / (device + tool)
         found[f"admittance_{shape}_{1e3 * delay:.0f}_ms_%"] = 100.0 * (admittance - 1.0)
         found[f"station_{shape}_{1e3 * delay:.0f}_ms_%"] = 100.0 * (impedance - 1.0)
     return found
@@ -198,8 +200,8 @@ def main(arguments: list[str] | None = None) -> None:
         for key, value in found[name].items():
             if key != "rows":
                 print(f"{name}.{key:28} {value}", flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        if options.json:
+            options.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ from drake_teleop.station.oscillation import (
     pose_reversals,
     rotation_near,
 )
-from drake_teleop.station.passivity.ledger import fastest
+from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import SLIDES, ArmModel
@@ -221,12 +221,13 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
 
 
 def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
-    if scenario.passivity.method != "ledger" or len(result.t) < 2:
+    speed_limit = METHODS[scenario.passivity.method].speed_limit
+    if speed_limit is None or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
-    config, row = scenario.passivity.ledger, t[1] - t[0]
+    config, row = scenario.passivity.of_method(), t[1] - t[0]
     mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale(scenario)
-    limit = fastest(config, mass)
+    limit = speed_limit(config, mass)
     then = t - _packet_ages(t, scenario)
     window = longest_delay(scenario.channel.lines()[0]) + _SETTLING_TIME_S
     for g, (command, actual, least, unit, scale) in enumerate(_pose_parts(sent, received)):
@@ -240,10 +241,12 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         enough, speed_unit = np.array(config.reserve), ("m/s", "rad/s")[g]
         enough[g] *= (speed[held].max() / limit[g]) ** 2
         yield (
-            f"the ledger's reserve limits the slave to {limit[g]:.2g} {speed_unit}, and the hand"
-            f" moves at up to {speed[held].max():.2g}: for {100 * held.mean():.0f} % of the time"
+            f"the {scenario.passivity.method}'s reserve limits the slave to {limit[g]:.2g}"
+            f" {speed_unit}, and the hand moves at up to {speed[held].max():.2g}:"
+            f" for {100 * held.mean():.0f} % of the time"
             f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
-            " pose (move more slowly, or increase the energy: passivity.ledger.reserve"
+            " pose (move more slowly, or increase the energy:"
+            f" passivity.{scenario.passivity.method}.reserve"
             f" {_list_text(enough)} and initial {_list_text(enough + config.hand_reserve)}),",
             find_spans(t, held),
         )

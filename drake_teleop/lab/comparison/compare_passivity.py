@@ -86,7 +86,7 @@ def compare_command(
     out: Path,
     *,
     networks: Sequence[str] = NETWORKS,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] | None = None,
     scenario: str | Path = "contact_transition",
     seed: int = 0,
     jobs: int = -1,
@@ -96,7 +96,7 @@ def compare_command(
     """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
 
     Args:
-        networks, methods: names of networks and passivity methods.
+        networks, methods: names of networks and passivity methods; None: all methods.
         scenario: shipped name or YAML file; its rates, integrator and environment are not used.
         seed: seed of sensor noise and networks.
         jobs: number of processes; -1: one for each core.
@@ -105,8 +105,14 @@ def compare_command(
     Returns:
         The content of summary.json; the module lists it.
     """
-    _check_names("network", networks, tuple(PRESETS))
-    _check_names("method", methods, METHODS)
+    for name in networks:
+        if name not in PRESETS:
+            remedy = suggestion(name, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
+            what = f"there is no network '{name}'"
+            raise DrakeTeleopError(what, where="networks", remedy=remedy)
+    methods = tuple(METHODS) if methods is None else methods
+    for name in methods:
+        METHODS.check(name, "methods")
     make_folder(out)  # before the work, so that a bad path fails early
     with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
@@ -332,16 +338,6 @@ def _run_parallel(
         results.append(result)
         progress(len(results) / len(cases))
     return results
-
-
-def _check_names(what: str, requested: Sequence[str], known: Sequence[str]) -> None:
-    for name in requested:
-        if name not in known:
-            raise DrakeTeleopError(
-                f"there is no {what} '{name}'",
-                where=f"{what}s",
-                remedy=suggestion(name, known, f"choose among {', '.join(known)}"),
-            )
 
 
 def _finite_or_none(figures: dict[str, Any]) -> dict[str, Any]:

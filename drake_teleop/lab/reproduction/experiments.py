@@ -49,7 +49,7 @@ class IdealMotion:
     """
 
     reaction: Array
-    motion: tuple[Array, ...]
+    motion: tuple[Array, Array, Array]
     phi: Array
 
 
@@ -135,8 +135,8 @@ def ideal_motion(progress: Progress) -> IdealMotion:
     result = read_log(simulator, simulation.settle)
     taken = np.rint((result["sample_time"][:, 0] + simulation.settle) * rate).astype(int)
     started = taken >= 0
-    motion = tuple(part[started] for part in sensor_samples(result)[1:])
-    return IdealMotion(wrenches[taken[started]], motion, phi)
+    _, s, omega, alpha = (part[started] for part in sensor_samples(result))
+    return IdealMotion(wrenches[taken[started]], (s, omega, alpha), phi)
 
 
 def ideal_values(run: IdealMotion) -> Values:

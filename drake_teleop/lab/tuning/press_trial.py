@@ -207,9 +207,8 @@ class GammaSearch:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
         stable = np.ones(len(_LINEAR_GAMMAS), dtype=bool)
         for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
-            held = dataclasses.replace(
-                with_grip(axis, grip), wall_stiffness=wall, gamma=_LINEAR_GAMMAS
-            )
+            grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _LINEAR_GAMMAS}
+            held = dataclasses.replace(with_grip(axis, grip), **grid)
             stable &= unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
         return float(_LINEAR_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 

@@ -202,8 +202,8 @@ def _load_force(trial: StationTrial) -> float:
 
 
 def _study_of(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
-    numbers = (settings[name] for name in ("gamma", "sigma_inertia", "low_pass_hz"))
-    return _study([settings["method"]], *numbers, hands, walls, TRIAL_MEASURES)
+    gamma, sigma, low_pass = (settings[key] for key in ("gamma", "sigma_inertia", "low_pass_hz"))
+    return _study([settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES)
 
 
 def _study(

@@ -98,7 +98,7 @@ def base_of(scenario: Scenario, network: str | None) -> Scenario:
         DrakeTeleopError: for an unknown network.
     """
     if network is not None and network not in PRESETS:
-        remedy = suggestion(network, PRESETS, f"choose among {', '.join(PRESETS)}")
+        remedy = suggestion(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)
     scaling = scenario.force_scaling
     simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)

@@ -111,8 +111,6 @@ _DRAG_ACTIVE = _places.vector(2)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
 _NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _places.number(), _places.vector(2), _places.vector(6)
 
-AT_THE_MOTOR = True  #: the energy balance is at the port of the slave's motors
-
 
 @settings
 @dataclass
