@@ -27,6 +27,7 @@ RUNS = {
     "kernel": "benchmarks/kernel.py --json FILE",
     "intervals": "benchmarks/intervals.py --json FILE",
     "inverse_kinematics": "benchmarks/inverse_kinematics.py --json FILE",
+    "ledger_cells": "benchmarks/ledger_cells.py --cells 8 --seed 54 --json FILE",
     "ledger_in_station": "benchmarks/ledger_in_station.py --json FILE",
     "ledger_with_friction": (
         "benchmarks/ledger_in_station.py --friction 30 --damping 300 --json FILE"
@@ -155,6 +156,16 @@ def _well_by_medium_grip(row: Any) -> bool:
     at_rest = row["stable"] and row["left_m"] <= 5e-3 and min(row["energy_J"]) >= -1e-6
     good = abs(row["felt_error"]) <= 0.1 and row["chatter_N"] <= 0.05
     return row["grip"] == "medium" and at_rest and good
+
+
+def _cells_that_keep(criterion: str) -> Callable[[Any], float]:
+    """Return the share [%] of the random cells that meet a criterion of `ledger_cells.py`."""
+
+    def share(figures: Any) -> float:
+        drawn = [row for row in figures["rows"] if isinstance(row["cell"], int)]
+        return 100 * sum(criterion not in row["missed"] for row in drawn) / len(drawn)
+
+    return share
 
 
 def _of_domain(method: str, what: str) -> Callable[[Any], float]:
@@ -495,6 +506,31 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(NETWORK, "and meets all criteria, force steady within 0.05 N, with a medium grip"),
         *("4 networks, 2 leaves, σ 0 and 1", "delay.md", "ledger_with_friction"),
         *(lambda f: sum(map(_well_by_medium_grip, f["rows"])), "of 16", 16.0),
+    ),
+    Claim(
+        *(NETWORK, "`ledger` creates no energy on slanted walls with friction"),
+        *("8 random cells of the station, seed 54", "delay.md", "ledger_cells"),
+        *(_cells_that_keep("energy"), "%", 100.0),
+    ),
+    Claim(
+        *(NETWORK, "Random cells at rest"),
+        *("the same cells", "delay.md", "ledger_cells"),
+        *(_cells_that_keep("rest"), "%", 97.5),
+    ),
+    Claim(
+        *(NETWORK, "Random cells that render the contact force within 10 %"),
+        *("the same cells", "delay.md", "ledger_cells"),
+        *(_cells_that_keep("vector"), "%", 95.0),
+    ),
+    Claim(
+        *(NETWORK, "Random cells with at most 0.05 N rms above 5 Hz"),
+        *("the same cells", "delay.md", "ledger_cells"),
+        *(_cells_that_keep("quiet"), "%", 97.5),
+    ),
+    Claim(
+        *(NETWORK, "Random cells with a let go below 0.3 m/s and 50 mm"),
+        *("the same cells", "delay.md", "ledger_cells"),
+        *(_cells_that_keep("let go"), "%", 100.0),
     ),
     NotShown(NETWORK, "Use by a person", "no person has tried it; the hand is simulated"),
     # Analysis
