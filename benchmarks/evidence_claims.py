@@ -692,12 +692,14 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
     ),
     InTests(
         *(LIVE, "FMUs of FMI 2.0 and 3.0 have the bits of `compensate`, one step later"),
-        *("FMPy validates and simulates both", "controller.md", "tests/robots/test_fmu.py"),
+        *("FMPy validates and simulates both", "controller.md"),
+        "tests/robots/test_fmu.py::"
+        "test_fmpy_validates_and_simulates_the_bits_of_compensate_one_step_later",
     ),
     InTests(
         *(LIVE, "The page of the site has the numbers of `eliminate --causal`"),
         *("the sample log, headless Chromium", "browser.md"),
-        "tests/robots/test_browser_kernel.py",
+        "tests/robots/test_browser_kernel.py::test_the_sample_log_has_the_numbers_of_eliminate",
     ),
     Claim(
         *(LIVE, "Residual force in NTNU's vibrations, live, without its mean"),

@@ -368,9 +368,10 @@ KNOWN = {
 def print_row(row: dict[str, Any]) -> None:
     """Print a cell in one line."""
     name = (
-        f"{row['cell']!s:>3} {row['arm']:5} {row['device'][:7]} {row['network'][:8]:8} {row['grip']:6}"
-        f" {row['shape']:6} {math.degrees(row['tilt']):2.0f} mu {row['friction']:.2f}"
-        f" {1e-3 * row['stiffness']:4.1f}k {row['action']:5} s {row['sigma']:g} g {row['gamma']:.1f}"
+        f"{row['cell']!s:>3} {row['arm']:5} {row['device'][:7]} {row['network'][:8]:8}"
+        f" {row['grip']:6} {row['shape']:6} {math.degrees(row['tilt']):2.0f}"
+        f" mu {row['friction']:.2f} {1e-3 * row['stiffness']:4.1f}k {row['action']:5}"
+        f" s {row['sigma']:g} g {row['gamma']:.1f}"
     )
     print(
         f"{name}|{row['pressed_N']:6.2f} N|{row['energy_J']:8.4f}|{1e3 * row['motion_m']:7.2f}"

@@ -41,7 +41,6 @@ from drake_teleop.station.passivity.memory import (
     own_memory,
 )
 from drake_teleop.station.passivity.methods import (
-    AT_THE_MOTOR,
     METHODS,
     PassivityConfig,
     initial_memory,
@@ -293,8 +292,8 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
             memories = np.stack([start, start])
             began = time.thread_time()
             _run(
-                steps_of, method in AT_THE_MOTOR, p, memories, newest, motion, poses, wrench,
-                PERIOD, sent, figures,
+                steps_of, METHODS[method].balance_at_motors, p, memories, newest, motion, poses,
+                wrench, PERIOD, sent, figures,
             )  # fmt: skip
             seconds[name] += time.thread_time() - began
             figures[:, STRONGER] *= -1.0

@@ -23,10 +23,14 @@ if TYPE_CHECKING:
     from drake_teleop.load.regressor import non_contact_wrench, regressor
     from drake_teleop.logs.processing import eliminate_log, identify_log
     from drake_teleop.logs.read.reading import read_log
+    from drake_teleop.station.channel_side import MakeChannel
+    from drake_teleop.station.master_side import MakeMasterSide
+    from drake_teleop.station.operator.operator import MinimumJerk, Sine
     from drake_teleop.station.result import SimulationResult
     from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioNames
     from drake_teleop.station.sensor.plant_wrist_sensor import AddWristSensor
     from drake_teleop.station.simulation import simulate
+    from drake_teleop.station.slave_side import MakeSlaveSide
     from drake_teleop.station.station import MakeIdentificationStation, MakeTeleopStation
 
 __all__ = [
@@ -34,11 +38,16 @@ __all__ = [
     "DrakeTeleopError",
     "Identification",
     "LoadScenario",
+    "MakeChannel",
     "MakeIdentificationStation",
+    "MakeMasterSide",
+    "MakeSlaveSide",
     "MakeTeleopStation",
+    "MinimumJerk",
     "Scenario",
     "ScenarioNames",
     "SimulationResult",
+    "Sine",
     "__version__",
     "contact_wrench",
     "drive",
@@ -66,10 +75,14 @@ _HOMES = {
     "load.regressor": ("non_contact_wrench", "regressor"),
     "logs.processing": ("eliminate_log", "identify_log"),
     "logs.read.reading": ("read_log",),
+    "station.channel_side": ("MakeChannel",),
+    "station.master_side": ("MakeMasterSide",),
+    "station.operator.operator": ("MinimumJerk", "Sine"),
     "station.result": ("SimulationResult",),
     "station.scenario": ("LoadScenario", "Scenario", "ScenarioNames"),
     "station.sensor.plant_wrist_sensor": ("AddWristSensor",),
     "station.simulation": ("simulate",),
+    "station.slave_side": ("MakeSlaveSide",),
     "station.station": ("MakeIdentificationStation", "MakeTeleopStation"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

@@ -5,18 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.lab.analysis.period_map import Sampling, delay_steps, period_map
+from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Sampling, cut_map, delay_steps
+
+
+def closed_map(axis: OneAxis, sampling: Sampling) -> np.ndarray:
+    """Return the matrix of the closed loop over a hand period; registers delay the force."""
+    M, registers = cut_map(axis, sampling), 2 * delay_steps(axis, sampling)
+    n = len(M) - 3
+    closed = np.zeros((n + registers, n + registers))
+    closed[:n, :n] = M[:n, :n]
+    source = n + registers - 1 if registers else SAMPLE
+    closed[:n, source] += M[:n, RECEIVED]
+    for k in range(registers):
+        closed[n + k, n + k - 1 if k else SAMPLE] = 1.0
+    return closed
 
 
 def multipliers(axis: OneAxis, sampling: Sampling) -> np.ndarray:
-    """Return the eigenvalues of the closed loop over the common period of all rates."""
-    M, _ = period_map(axis, sampling, delay_steps(axis, sampling), cut=False)
-    n = M.shape[-1] - 3
-    return np.linalg.eigvals(M[:n, :n])
+    """Return the eigenvalues of the closed loop over a hand period."""
+    return np.linalg.eigvals(closed_map(axis, sampling))
 
 
 def growth_rate(axis: OneAxis, sampling: Sampling) -> float:
     """Return the growth rate [1/s] of the slowest-decaying motion; negative: stable."""
-    _, periods = period_map(axis, sampling, delay_steps(axis, sampling), cut=False)
-    largest = np.abs(multipliers(axis, sampling)).max()
-    return float(np.log(largest) * sampling.hand_hz / periods)
+    return float(np.log(np.abs(multipliers(axis, sampling)).max()) * sampling.hand_hz)

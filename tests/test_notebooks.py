@@ -33,3 +33,9 @@ def test_it_is_a_page_of_the_site(path):
     assert f"notebooks/{path.stem}\n" in (ROOT / "docs" / "tutorials.md").read_text(
         encoding="utf-8"
     )
+
+
+def test_the_blocks_in_a_diagram_take_at_most_60_lines():
+    notebook = nbformat.read(ROOT / "notebooks" / "07_your_diagram.ipynb", as_version=4)
+    code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 60

@@ -1,19 +1,31 @@
-"""The recipes of docs/extend.md, followed in a copy of the package."""
+"""The recipes of docs/extend.md."""
 
 from __future__ import annotations
 
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shown import type_in
 
+from drake_teleop.cli.main import main
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.registry import REGISTRIES, Registry, register_from
 from drake_teleop.lab.identification import true_load
-from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.live.inputs import Inputs, header, read_inputs, row
+from drake_teleop.live.scenarios import chosen_scenario
+from drake_teleop.load.batch.methods import identify_batch
+from drake_teleop.load.identification import Identification
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.robots.connections import SINKS, SOURCES, open_sink, open_source
+from drake_teleop.robots.export import export
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import ENVIRONMENTS, LoadScenario, Scenario, ScenarioFromData
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
@@ -22,55 +34,182 @@ pytestmark = pytest.mark.checks
 
 ROOT = Path(__file__).parents[1]
 RECIPES = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+PHI = np.array([3.0, 0.1, -0.2, 0.3, 0.05, 0.0, 0.001, 0.06, 0.002, 0.02])
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(# drake_teleop/.*?|--- .*?)^```$", RECIPES, re.M | re.S)
+def block(first_line: str) -> str:
+    (text,) = re.findall(rf"^```\w+\n# {re.escape(first_line)}\n(.*?)^```$", RECIPES, re.M | re.S)
+    return text
 
 
-def follow(package: Path) -> None:
-    """Writes the files of the recipes, and their lines below the lines that they name."""
-    for text in blocks("python"):
-        first, _, rest = text.partition("\n")
-        new = package / first.removeprefix("# ")
-        assert not new.exists()
-        new.write_text(rest)
-    for text in blocks("diff"):
-        first, *lines = text.splitlines()
-        file = package / first.removeprefix("--- ")
-        source = file.read_text()
-        for before, line in zip(lines[::2], lines[1::2], strict=True):
-            assert before[0] == " " and line[0] == "+"
-            assert source.count(f"\n{before[1:]}\n") == 1
-            source = source.replace(f"\n{before[1:]}\n", f"\n{before[1:]}\n{line[1:]}\n")
-        file.write_text(source)
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Folder with the files of the page; parts that a test registers are removed again."""
+    for name in ("parts.py", "share.yaml"):
+        (tmp_path / name).write_text(block(name))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DRAKE_TELEOP_REGISTER", "")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    for table in REGISTRIES.values():
+        for name in set(table) - set(table.shipped):
+            table.remove(name)
+    sys.modules.pop("parts", None)
 
 
-@pytest.fixture(scope="module")
-def copy(tmp_path_factory) -> Path:
-    """A checkout with a method, an estimator and an environment more; compiled code goes along."""
-    folder = tmp_path_factory.mktemp("checkout")
-    for part in ("drake_teleop", "models"):
-        shutil.copytree(ROOT / part, folder / part)
-    follow(folder)
-    return folder
+def record(path: Path) -> None:
+    """Write a log of free motion in the format of the page."""
+    t = np.arange(0.0, 8.0, 2e-3)
+    phases = np.outer(t, [3.1, 2.3, 4.7, 1.7, 2.9, 3.7, 5.3, 4.1, 1.3]) + np.arange(9.0)
+    s, omega, alpha = np.split(np.sin(phases) * np.repeat([9.0, 2.0, 15.0], 3), 3, axis=1)
+    wrench = np.arange(6.0) + non_contact_wrench(s, omega, alpha, PHI)
+    np.column_stack([t, wrench, s, omega, alpha]).tofile(path)
 
 
-def run(copy: Path, script: str) -> None:
-    # Compiled without optimising, which takes half of the time: a method is part of the channel.
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=copy,
-        env=os.environ | {"NUMBA_OPT": "0"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+@pytest.mark.slow
+def test_the_command_line_runs_registered_parts_and_refuses_removed_ones(folder, capsys):
+    record(folder / "log.f64")
+    type_in("docs/extend.md", "drake-teleop --register parts.py parts")
+    out = capsys.readouterr().out
+    for line in ("share*", "data_sheet*", "Table*", ".f64*", "kilograms*"):
+        assert line in out
+    log = SimulationResult.read_parquet(folder / "out" / "run" / "log.parquet")
+    np.testing.assert_allclose(log["true_contact_wrench_W"][0, 2], 2e5 * 1e-4, rtol=0.05)
+    assert np.abs(log["force_to_master"]).max() > 0.0
+    found = Identification.load(folder / "out" / "identify" / "identification.json")
+    assert found.method == "data sheet's least squares"
+    np.testing.assert_allclose(found.phi, PHI, atol=1e-3)
+    recorded = folder / "out" / "run" / "scenario.yaml"
+    assert "method: share" in recorded.read_text() and "!Table" in recorded.read_text()
+    ENVIRONMENTS.remove("Table")
+    with pytest.raises(
+        DrakeTeleopError, match=r"environment\[0\]: '!Table' is not known; use one of"
+    ):
+        LoadScenario(recorded)
+    METHODS.remove("share")
+    with pytest.raises(SystemExit):
+        main(["run", str(recorded)])
+    assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_there_is_a_recipe_for_each_kind_of_part():
-    assert len(blocks("python")) == len(blocks("diff")) == 3
+def test_a_scenario_with_a_removed_method_names_it(folder):
+    register_from(folder / "parts.py")
+    scenario = LoadScenario(folder / "share.yaml")
+    METHODS.remove("share")
+    with pytest.raises(DrakeTeleopError, match=r"passivity\.method: there is no passivity method"):
+        MakeTeleopStation(scenario)
+
+
+@pytest.mark.slow
+def test_the_registered_share_scales_the_wrench(folder):
+    """All of the wrench is what there is without a method, none of it is none."""
+    register_from(folder / "parts.py")
+
+    def force(**passivity):
+        data = {
+            "simulation": {"duration": 0.02, "settle": 0.0},
+            "passivity": passivity,
+            "channel": {"network": "lan"},
+        }
+        scenario = ScenarioFromData(data, "test.yaml")
+        return simulate(MakeTeleopStation(scenario), scenario.simulation)["force_to_master"]
+
+    nothing = force(method="none")
+    assert np.abs(nothing).max() > 1.0  # the tool's weight
+    np.testing.assert_array_equal(force(method="share", registered={"share": 1.0}), nothing)
+    assert (force(method="share", registered={"share": 0.0}) == 0.0).all()
+
+
+def test_parameters_of_a_registered_method_are_checked(folder):
+    register_from(folder / "parts.py")
+    for values, says in (
+        ({"share": 2.0}, r"mine:passivity\.registered\.share: 2 is outside 0 to 1"),
+        ({"shar": 0.5}, r"there is no such field; did you mean 'share'"),
+    ):
+        config = Scenario(passivity=PassivityConfig(method="share", registered=values))
+        with pytest.raises(DrakeTeleopError, match=says):
+            config.check("mine")
+    with pytest.raises(DrakeTeleopError, match="'tdpa' has its own fields"):
+        PassivityConfig(method="tdpa", registered={"share": 0.5}).check("mine")
+
+
+def test_a_live_session_records_the_registered_name(folder):
+    before = Inputs().changed({"method": 99}).method
+    register_from(folder / "parts.py")
+    inputs = Inputs().changed({"method": 99})
+    assert inputs.method == before + 1
+    assert chosen_scenario(Scenario(), None, inputs).passivity.method == "share"
+    path = folder / "inputs.csv"
+    path.write_text(header() + row(0, inputs) + row(10, inputs))
+    assert ",share," in path.read_text() and read_inputs(path)[0][1] == inputs
+    METHODS.remove("share")
+    with pytest.raises(DrakeTeleopError, match="has an unknown method, 'share'"):
+        read_inputs(path)
+
+
+def test_export_source_and_sink_by_their_registered_names(folder):
+    register_from(folder / "parts.py")
+    rng = np.random.default_rng(1)
+    s, omega, alpha = rng.normal(size=(3, 200, 3)) * [[[9.0]], [[2.0]], [[5.0]]]
+    wrench = np.arange(6.0) + non_contact_wrench(s, omega, alpha, PHI)
+    found = identify_batch(wrench, s, omega, alpha, method="data_sheet").identification
+    assert export(found, "kilograms")[0] == "3.000\n"
+    sink, source = object(), object()
+    SINKS.register("serial", lambda address: sink)
+    SOURCES.register("serial", lambda address, dt: (source, dt))
+    assert open_sink("serial://tty0") is sink
+    assert open_source("serial://tty0", None, rate_hz=500.0) == (source, 0.002)
+    SINKS.remove("serial")
+    with pytest.raises(DrakeTeleopError, match=r"serial://tty0: is not a sink; give .*udp://"):
+        open_sink("serial://tty0")
+
+
+def test_a_registry_refuses_shipped_and_impossible_names():
+    table = Registry("colour of a test", {"red": 1})
+    try:
+        assert table.register("blue", 2) == 2 and table["blue"] == 2
+        table.register("blue", 3)
+        assert table["blue"] == 3
+        table.remove("blue")
+        for wrong in (
+            lambda: table["blue"],
+            lambda: table.remove("blue"),
+            lambda: table.remove("red"),
+            lambda: table.register("red", 2),
+            lambda: table.register("a,b", 2),
+        ):
+            with pytest.raises(DrakeTeleopError, match="colour of a test"):
+                wrong()
+        with pytest.raises(
+            DrakeTeleopError, match=r"here: there is no .* 'rid'; did you mean 'red'"
+        ):
+            table.check("rid", "here")
+    finally:
+        del REGISTRIES["colour of a test"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("parts.txt", "", "is not a Python file"),
+        ("missing.py", None, "is not a Python file"),
+        ("json.py", "", "has the name of the module"),
+        ("broken.py", "1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_file_that_registers_nothing_is_one_line(folder, name, text, says):
+    if text is not None:
+        (folder / name).write_text(text)
+    with pytest.raises(DrakeTeleopError, match=says):
+        register_from(folder / name)
+
+
+def test_another_process_registers_the_same_parts_when_a_name_is_unknown(folder):
+    register_from(folder / "parts.py")
+    METHODS.remove("share")
+    assert "share" not in METHODS  # registered once, then removed
+    del sys.modules["parts"]
+    assert "share" in METHODS and str(folder) in os.environ["DRAKE_TELEOP_REGISTER"]
 
 
 def test_an_arm_a_device_and_a_wall_are_ten_lines(tmp_path):
@@ -88,128 +227,3 @@ def test_an_arm_a_device_and_a_wall_are_ten_lines(tmp_path):
     assert scenario.master.device(0.0, 0.0).mass_matrix(np.zeros(6))[0, 0] == pytest.approx(0.12)
     assert result["true_contact_wrench_W"].shape == (21, 6)
     assert np.abs(result["measured_wrench_S"][:, :3]).max() > 0.5
-
-
-@pytest.mark.slow
-def test_a_station_with_the_new_method(copy):
-    """All of the wrench is what there is without a method, none of it is none."""
-    run(
-        copy,
-        """
-import numpy as np
-from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.scenario import ScenarioFromData
-from drake_teleop.station.simulation import simulate
-from drake_teleop.station.station import MakeTeleopStation
-
-assert "share" in METHODS
-
-def force(**passivity):
-    data = {
-        "simulation": {"duration": 0.02, "settle": 0.0},
-        "passivity": passivity,
-        "channel": {"network": "lan"},
-    }
-    scenario = ScenarioFromData(data, "test.yaml")
-    return simulate(MakeTeleopStation(scenario), scenario.simulation)["force_to_master"]
-
-nothing, all_of_it = force(method="none"), force(method="share", share={"share": 1.0})
-assert np.abs(nothing).max() > 1.0  # the tool's weight
-np.testing.assert_array_equal(all_of_it, nothing)
-assert (force(method="share", share={"share": 0.0}) == 0.0).all()
-""",
-    )
-
-
-DRIVE = """
-from pathlib import Path
-from drake_teleop.live.inputs import Inputs
-from drake_teleop.live.scenarios import live_scenario
-from drake_teleop.live.session import Session, read_drive
-from drake_teleop.common.progress import silent
-from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.scenario import ScenarioFromData
-
-folder = Path({folder!r})
-assert METHODS.index("tdpa") == {tdpa}
-if {tdpa} == 2:
-    data = {{"passivity": {{"method": "wave"}}, "channel": {{"network": "lan"}}}}
-    scenario = live_scenario(ScenarioFromData(data, "test.yaml"))
-    session = Session(scenario, log=folder / "log.parquet", record=folder)
-    inputs = session.inputs
-    for ms in range(0, 60, 10):
-        inputs = inputs.changed({{"z": -20 * ms}})
-        session.apply(inputs.changed({{"method": {tdpa}}} if ms >= 30 else {{}}))
-        session.advance(10)
-    session.close()
-else:
-    read_drive(folder).repeat(silent(""), folder / "again.parquet")
-    names = [sorted((folder / name).iterdir()) for name in ("log.parquet", "again.parquet")]
-    one, other = ([path.read_bytes() for path in paths] for paths in names)
-    assert one == other and len(b"".join(one)) > 10_000
-"""
-
-
-@pytest.mark.slow
-def test_a_recorded_drive_is_the_same_after_a_method_is_entered_first(copy, tmp_path):
-    first = tmp_path / "checkout"
-    shutil.copytree(copy, first)
-    methods = first / "drake_teleop" / "station" / "passivity" / "methods.py"
-    line = "    share: ShareConfig = field(default_factory=ShareConfig)\n"
-    source = methods.read_text().replace(line, "", 1)
-    wave = "    wave: WaveConfig ="
-    methods.write_text(source.replace(wave, line + wave, 1))
-    drive = str(tmp_path / "drive")
-    run(copy, DRIVE.format(folder=drive, tdpa=2))
-    assert ",tdpa," in (tmp_path / "drive" / "inputs.csv").read_text()
-    run(first, DRIVE.format(folder=drive, tdpa=3))
-
-
-@pytest.mark.slow
-def test_an_identification_with_the_new_estimator(copy):
-    run(
-        copy,
-        """
-import numpy as np
-from drake_teleop.load.batch.data_sheet import NOISE
-from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.identification import Identification
-from drake_teleop.load.regressor import non_contact_wrench
-
-rng = np.random.default_rng(1)
-s, omega, alpha = rng.normal(size=(3, 200, 3)) * [[[9.0]], [[2.0]], [[5.0]]]
-phi = np.array([3.0, 0.1, -0.2, 0.3, 0.05, 0.0, 0.001, 0.06, 0.002, 0.02])
-offsets = np.arange(6.0)
-result = identify_batch(offsets + non_contact_wrench(s, omega, alpha, phi), s, omega, alpha,
-                        method="data_sheet")
-np.testing.assert_allclose(result.identification.phi, phi, atol=1e-10)
-np.testing.assert_allclose(result.identification.offsets, offsets, atol=1e-9)
-np.testing.assert_array_equal(result.noise, NOISE)
-result.identification.save("identification.json")
-loaded = Identification.load("identification.json")
-assert loaded.method == "least squares with the data sheet's noise"
-""",
-    )
-
-
-@pytest.mark.slow
-def test_a_station_with_the_new_environment(copy):
-    """The tip begins 0.1 mm deep in the table, which pushes it up with k x."""
-    run(
-        copy,
-        """
-import numpy as np
-from drake_teleop.station.scenario import ScenarioFromData
-from drake_teleop.station.simulation import simulate
-from drake_teleop.station.station import MakeTeleopStation
-
-data = {
-    "simulation": {"duration": 0.01, "settle": 0.0},
-    "environment": [{"_tag": "!Table", "position": [0.55, 0.0, 0.45 - 0.2 + 1e-4 - 0.01]}],
-}
-scenario = ScenarioFromData(data, "test.yaml")
-result = simulate(MakeTeleopStation(scenario), scenario.simulation)
-np.testing.assert_allclose(result["true_contact_wrench_W"][0, :3], [0, 0, 2e5 * 1e-4], atol=1e-6)
-assert "sheet_state" not in result.signals
-""",
-    )

@@ -213,3 +213,12 @@ def test_repr_lists_signals_with_units():
 @pytest.mark.pictures
 def test_a_notebook_can_show_the_plot():
     assert make_result().plot("sigma")._repr_png_().startswith(b"\x89PNG")
+
+
+def test_a_slice_is_a_result_with_these_rows():
+    result = make_result()
+    part = result[10:20:2]
+    assert isinstance(part, SimulationResult) and part.specs == result.specs
+    np.testing.assert_array_equal(part.t, result.t[10:20:2])
+    for name in result:
+        np.testing.assert_array_equal(part[name], result[name][10:20:2])

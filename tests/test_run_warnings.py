@@ -100,6 +100,8 @@ PLANTED = [
      " intent does not, from 2.0"),
     ("pose_received", (2, 0.005 * np.sin(40 * T) * during(2, 3)), "makes the slave's command"
      " oscillate"),
+    ("force_to_master", (0, 0.1 * np.sin(2 * np.pi * 44 * T) * during(2, 3)), "the rendered force"
+     " oscillates at 44 Hz with up to 0.07 N rms while the hand rests"),
 ]  # fmt: skip
 
 
@@ -119,8 +121,10 @@ def test_only_the_planted_condition_is_reported(name, change, said):
         # An answer that rings twice, and a tremble that nobody sees.
         ("pose_master", (5, 0.003 * np.exp(-8 * (T - 1)) * np.sin(25 * (T - 1)) * (T > 1))),
         ("slave_state", (3, 0.0008 * np.sin(40 * T) * during(1, 2))),
+        ("force_to_master", (0, 0.06 * np.sin(2 * np.pi * 44 * T))),
+        ("force_to_master", (0, np.sin(2 * np.pi * 44 * T) * during(0.5, 1.4))),
     ],
-    ids=["display", "silence", "channel", "joint", "ringing", "tremble"],
+    ids=["display", "silence", "channel", "joint", "ringing", "tremble", "weak", "moving"],
 )
 def test_short_or_small_deviations_are_not_reported(name, change):
     assert run_warnings(recorded(**{name: change}), OVER_NETWORK, ARM) == []

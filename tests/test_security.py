@@ -48,8 +48,10 @@ EXPLAINED = {
     # Processes that this one starts: what they say to each other goes through pipes.
     ("lab/studies/processes.py", "joblib"), ("lab/comparison/compare_passivity.py", "joblib"),
     # A module of the package by its name.
-    ("station/passivity/methods.py", "import_module"),
+    ("cli/printing.py", "import_module"),
     ("__init__.py", "import_module"),
+    # The Python file that the user names with --register.
+    ("common/registry.py", "import_module"),
     # A child of this package's own code, with a host's name as its argument.
     ("robots/rtde.py", "subprocess"),
     ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop

@@ -12,6 +12,7 @@ from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, Leaf
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.comparison.delayed_contact import energy_between
 from drake_teleop.lab.identification import true_load
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.channel.channel import Channel
@@ -232,3 +233,84 @@ def test_direct_channel_passes_values_through():
     context = channel.GetMyContextFromRoot(diagram.CreateDefaultContext())
     for name, value in (("pose_to_slave", pose), ("wrench_to_master", wrench)):
         np.testing.assert_array_equal(channel.GetOutputPort(name).Eval(context), value)
+
+
+class Follower(LeafSystem):
+    """Controller that passes the pose command to the inverse kinematics of the slave."""
+
+    def __init__(self, output: str = "pose_command", size: int = 7) -> None:
+        super().__init__()
+        entry = self.DeclareVectorInputPort("pose_command", 7)
+        self.DeclareVectorOutputPort(
+            output, size, lambda context, out: out.SetFromVector(entry.Eval(context)[:size])
+        )
+
+
+SHORT_RUN = {"simulation__settle": 0.0, "simulation__duration": 0.05, "force_scaling__sigma": 1.0}
+
+
+def test_a_controller_that_passes_the_pose_on_changes_nothing():
+    scenario = replace(LoadScenario("free_motion_force"), **SHORT_RUN)
+    own = MakeTeleopStation(scenario, slave=MakeSlaveSide(scenario, controller=Follower()))
+    results = [simulate(s, scenario.simulation) for s in (own, MakeTeleopStation(scenario))]
+    for name in results[1]:
+        np.testing.assert_array_equal(results[0][name], results[1][name])
+
+
+def test_a_torque_that_is_no_number_keeps_the_arm_where_it_is():
+    class Broken(LeafSystem):
+        def __init__(self) -> None:
+            super().__init__()
+            self.DeclareVectorInputPort("pose_command", 7)
+            self.DeclareVectorOutputPort(
+                "joint_torque", 6, lambda _, out: out.SetFromVector([np.nan] * 6)
+            )
+
+    scenario = replace(LoadScenario("free_motion_force"), **SHORT_RUN)
+    slave = MakeSlaveSide(scenario, controller=Broken())
+    result = simulate(MakeTeleopStation(scenario, slave=slave), scenario.simulation)
+    assert (result["joint_torque"] == result["joint_torque"][0]).all()
+    assert np.ptp(result["slave_state"], axis=0).max() < 1e-3
+    assert "joint_command" not in result.signals
+
+
+@pytest.mark.parametrize(
+    ("controller", "says"),
+    [
+        ("impedance", "controller: expected System, found 'impedance'; make a Drake system"),
+        (Silent({"wrench_B": 6}, {}), "controller: there is no input port 'pose_command'"),
+        (Silent({"pose_command": 7}, {}), "controller: there is no output port 'joint_torque'"),
+        (Follower("joint_torque", 5), "its output port 'joint_torque' has 5 numbers"),
+    ],
+)
+def test_a_controller_without_its_ports_is_one_line(controller, says):
+    with pytest.raises(DrakeTeleopError, match=says):
+        MakeSlaveSide(replace(Scenario(), force_scaling__sigma=1.0), controller=controller)
+
+
+def test_a_custom_channel_takes_the_place_of_the_scenarios():
+    """The channel of another scenario, which delays the command."""
+    scenario = replace(LoadScenario("free_motion_force"), **SHORT_RUN)
+    delayed = replace(scenario, channel__delay=0.02)
+    stations = (
+        MakeTeleopStation(scenario, channel=MakeChannel(delayed)),
+        MakeTeleopStation(delayed),
+    )
+    own, expected = (simulate(station, scenario.simulation) for station in stations)
+    np.testing.assert_array_equal(own["pose_received"], expected["pose_received"])
+    with pytest.raises(DrakeTeleopError, match="channel: there is no input port 'pose_command'"):
+        MakeTeleopStation(scenario, channel=Silent({}, {}))
+
+
+@pytest.mark.long
+def test_example_controllers_press_a_wall_without_creating_energy():
+    """Over 50 ms in each direction, at the actual motion; each controller has at most 40 lines."""
+    page = Path(__file__).parents[1] / "docs" / "controllers.md"
+    blocks, names = re.findall(r"```python\n(.*?)```", page.read_text(), re.S), {}
+    assert max(len(text.splitlines()) for text in blocks if text.startswith("class ")) <= 40
+    exec(compile("\n".join(blocks), "controllers.md", "exec"), names)
+    assert len(names["results"]) == 4
+    for result, scenario in names["results"].values():
+        assert result["true_contact_wrench_W"][:, 2].max() > 10.0
+        assert result["true_contact_wrench_W"][-1, 2] > 5.0  # it presses to the end
+        assert energy_between(result, scenario).min() >= -2e-6  # with the initial energy E0

@@ -35,6 +35,7 @@ TESTED = {
     "browser.md": "tests/robots/test_browser_kernel.py",
     "blocks.md": "tests/blocks/test_plain_blocks.py",
     "cluster.md": "tests/studies/test_study.py",
+    "controllers.md": "tests/test_sides.py",
     "delay.md": "tests/test_delay_doc.py",
     "delay-figures.md": "tests/test_delay_doc.py",
     "detection.md": "tests/test_detection_doc.py",
@@ -122,7 +123,7 @@ def test_a_script_of_the_gallery_is_short_and_says_what_it_shows():
 def test_every_block_says_what_it_is():
     """Code in one of these languages is run; "text" is a drawing, a file, or what is printed."""
     assert len(BLOCKS) > 40
-    assert {language for _, language, _ in BLOCKS} == {"sh", "python", "yaml", "text", "diff"}
+    assert {language for _, language, _ in BLOCKS} == {"sh", "python", "yaml", "text"}
 
 
 def test_commands_that_cannot_be_typed_here_have_the_arguments_that_are_shown():

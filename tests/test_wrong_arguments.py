@@ -17,11 +17,10 @@ from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.station.channel_side import MakeChannel
-from drake_teleop.station.master_side import MakeMasterSide
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.scenario import replace
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave_side import MakeSlaveSide
 
 N3, N6, N10 = np.ones((4, 3)), np.ones((4, 6)), np.ones(10)
 NAME: Any = "free_motion_force"
@@ -68,14 +67,16 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "replace": (lambda: replace(NAME, simulation__seed=1), "scenario"),
     "LoadScenario": (lambda: dt.LoadScenario(dt.Scenario()), "scenario"),  # type: ignore[arg-type]
     "simulate": (lambda: simulate(NAME, NAME), "diagram"),
-    "MakeMasterSide": (lambda: MakeMasterSide(NAME), "scenario"),
-    "MakeChannel": (lambda: MakeChannel(NAME), "scenario"),
-    "MakeSlaveSide": (lambda: MakeSlaveSide(NAME), "scenario"),
+    "MakeMasterSide": (lambda: dt.MakeMasterSide(NAME), "scenario"),
+    "MakeChannel": (lambda: dt.MakeChannel(NAME), "scenario"),
+    "MakeSlaveSide": (lambda: dt.MakeSlaveSide(NAME), "scenario"),
     "identified_load": (lambda: identified_load(NAME), "scenario"),
     "RobotFromScenario": (lambda: RobotFromScenario(NAME), "scenario"),
     "linearize": (lambda: linearize(NAME), "scenario"),
     "linearize_station": (lambda: linearize_station(NAME), "scenario"),
     "LoadStudy": (lambda: LoadStudy(dt.Scenario()), "study"),  # type: ignore[arg-type]
+    "a sine": (lambda: dt.Sine(frequency="high"), "Sine.frequency"),  # type: ignore[arg-type]
+    "a step": (lambda: dt.MinimumJerk(duration=HALF), "MinimumJerk.duration"),
     "a block that is none": (lambda: replace(dt.Scenario(), description__x=1), "description.x"),
     # Loads and arrays.
     "a load of length 10": (lambda: station(load_estimate=N10), "load_estimate"),
@@ -96,6 +97,9 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "a delay": (lambda: dt.identify(N6, N3, N3, N3, delay_s=HALF), "delay_s"),
     "noise": (lambda: identify_batch(N6, N3, N3, N3, noise=HALF), "noise"),
     "a plant": (lambda: dt.AddWristSensor(None, 7, None), "AddWristSensor"),
+    "a hand": (lambda: dt.tune("contact_transition", hands=("strong",)), "hands"),
+    "a wall": (lambda: dt.tune("contact_transition", walls=(-1.0, 20.0)), "walls"),
+    "a task": (lambda: dt.tune("contact_transition", task="dance"), "task"),
     # Logs.
     "read_log": (lambda: dt.read_log(7), "log"),  # type: ignore[arg-type]
     "a filter": (lambda: dt.read_log("log.csv", bandwidth_hz=HALF), "bandwidth_hz"),
@@ -142,3 +146,41 @@ def test_numbers_of_numpy_are_numbers() -> None:
         slave__position=[np.float64(0.5), 0, 0.45],
     ).check()
     station(load_estimate=list(true_load(dt.Scenario())))
+
+
+def test_values_are_checked_when_they_are_assigned() -> None:
+    scenario = dt.Scenario()
+    for block, name, value, says in (
+        (scenario.passivity, "method", "legder", "'legder'; did you mean 'ledger'"),
+        (scenario.force_scaling, "sigma", -3, "sigma: -3 is outside 0 to 100"),
+        (scenario.slave, "position", [1.0], "has 1 numbers; give 3 numbers"),
+        (scenario, "channel", "internet", "make one: Channel(...), with fields delay"),
+    ):
+        before = getattr(block, name)
+        with pytest.raises(dt.DrakeTeleopError) as error:
+            setattr(block, name, value)
+        assert says in str(error.value) and getattr(block, name) == before
+
+
+def test_a_forgotten_simulation_is_named() -> None:
+    scenario = replace(dt.Scenario(), force_scaling__sigma=1.0)
+    with pytest.raises(dt.DrakeTeleopError, match=r"simulation: .*pass scenario\.simulation"):
+        simulate(dt.MakeTeleopStation(scenario))
+
+
+def test_a_printed_scenario_has_a_line_for_each_changed_field() -> None:
+    scenario = dt.Scenario(operator=OperatorConfig(intent=[dt.Sine(frequency=2.0)]))
+    scenario.slave.position[2] = 0.4
+    assert str(scenario).splitlines() == [
+        "Scenario",
+        "  operator: OperatorConfig",
+        "    intent[0]: Sine",
+        "      frequency: 2",
+        "  slave: Slave",
+        "    position: [0.55, 0, 0.4]",
+    ]
+
+
+def test_a_printed_log_is_short() -> None:
+    log = Log(0.1 * np.arange(4), 10.0 * N6, N3, N3, N3, notes=("a note",))
+    assert str(log) == "Log log: 4 samples, 0 to 0.3 s, force up to 17.3 N\n  a note"

@@ -97,4 +97,13 @@ changed = slice(2395, None)  # to the internet and a method
 assert np.abs(np.diff(felt[changed])).max() < 0.02
 assert np.linalg.norm(np.diff(log["pose_received"][2398:2403, 4:], axis=0), axis=1).max() < 1e-4
 """,
+    "07_your_diagram": """
+assert load.identifiable.all() and abs(load.mass - 1.5) < 0.01
+np.testing.assert_allclose(load.com, [0.01, 0.0, 0.09], atol=3e-3)
+measured, contact, received = size
+assert contact[500:1000].mean() < 0.5 < 12.0 < measured[500:1000].mean()
+assert abs(contact[1200:].mean() - 10.0) < 0.1
+late = [int(np.argmax(force[900:] > 5.0)) for force in (contact, received)]
+assert late[1] - late[0] == 50  # ms
+""",
 }

@@ -20,7 +20,15 @@ from drake_teleop.common.version import __version__
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="drake-teleop")
-def cli() -> None:
+@click.option(
+    "--register",
+    "scripts",
+    type=option.PATH,
+    multiple=True,
+    metavar="FILE",
+    help="Import this Python file first, which registers own parts; may be repeated.",
+)
+def cli(scripts: tuple[Path, ...]) -> None:
     """Bilateral teleoperation with non-contact force scaling: simulate it, and use it on logs.
 
     Every command with --out writes its figures by name into DIR/summary.json. A command with
@@ -29,6 +37,10 @@ def cli() -> None:
     The Tab key completes commands, options, names and files in bash (zsh, fish: likewise) after
     eval "$(_DRAKE_TELEOP_COMPLETE=bash_source drake-teleop)"
     """
+    for script in scripts:
+        from drake_teleop.common.registry import register_from
+
+        register_from(script)
 
 
 @cli.command()
@@ -166,6 +178,17 @@ def print_scenario(name: str | None) -> None:
 
 
 @cli.command()
+def parts() -> None:
+    """List the parts that can be selected by name.
+
+    Own parts are added by --register FILE: drake-teleop --register mine.py parts
+    """
+    from drake_teleop.cli.printing import print_parts
+
+    print_parts()
+
+
+@cli.command()
 @click.argument("folder", type=option.PATH)
 @click.option(
     "--scenario", metavar="SCENARIO", help="Scenario of the log.  [default: the file beside it]"
@@ -188,7 +211,7 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
 @option.gripper
 @click.option(
     "--method",
-    type=click.Choice(["ordinary", "whitened", "robust", "consistent"]),
+    type=option.Registered("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
     show_default=True,
     help="Least squares; also weighted by noise; also without impacts; also physically consistent.",
@@ -451,20 +474,17 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
     return 0 if summary["all_known"] else 1
 
 
-_EXPORT_FORMATS = (
-    *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
-)
 _CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
+_EXPORT_FORMATS = option.Registered(
+    "export format",
+    *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
+    *_CONTROLLER_FORMATS,
+)
 
 
 @cli.command()
 @click.argument("identification", type=option.PATH)
-@click.option(
-    "--to",
-    required=True,
-    type=click.Choice(_EXPORT_FORMATS + _CONTROLLER_FORMATS),
-    help="Robot or file format.",
-)
+@click.option("--to", required=True, type=_EXPORT_FORMATS, help="Robot or file format.")
 @option.sensor_pose("Sensor in the flange [m, deg].  [default: values in the sensor's frame]")
 @click.option(
     "--sign",
@@ -579,7 +599,7 @@ def compare_passivity(
     comparison.compare_command(
         out,
         networks=networks or comparison.NETWORKS,
-        methods=methods or comparison.METHODS,
+        methods=methods,
         **options,
     )
 

@@ -16,6 +16,7 @@ from click.shell_completion import CompletionItem
 from drake_teleop.common.config import in_short
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir, studies_dir
+from drake_teleop.common.registry import REGISTRIES
 
 
 class Utf8Path(click.Path):
@@ -123,6 +124,28 @@ class Names(click.ParamType):
         if isinstance(value, tuple):
             return value
         return tuple(name.strip() for name in value.split(","))
+
+
+class Registered(click.Choice):
+    """Parameter type: one of the shipped names, or a registered part of this kind.
+
+    The table of the parts is not imported; a script that registers a part has done so.
+    """
+
+    def __init__(self, kind: str, *shipped: str) -> None:
+        super().__init__(shipped)
+        self._shipped, self._kind = shipped, kind
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Names that are allowed at present."""
+        table = REGISTRIES.get(self._kind)
+        new = () if table is None else (name for name in table if name not in table.shipped)
+        return (*self._shipped, *new)
+
+    @choices.setter
+    def choices(self, value: tuple[str, ...]) -> None:
+        """Ignore the names that click stores."""
 
 
 class PositiveNumbers(click.ParamType):

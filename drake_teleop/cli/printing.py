@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -143,3 +144,22 @@ def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) 
     console.print(table)
     for line in [*lines, f"written to {out}"]:
         console.print(line, highlight=False, markup=False)
+
+
+def print_parts() -> None:
+    """Print the names of all parts by kind; registered ones are marked with `*`."""
+    import click
+
+    from drake_teleop.common.registry import REGISTRIES
+
+    for module in (
+        "load.batch.methods",
+        "logs.read.table_files",
+        "robots.connections",
+        "robots.export",
+        "station.scenario",
+    ):
+        import_module(f"drake_teleop.{module}")
+    for kind, table in sorted(REGISTRIES.items()):
+        names = [name if name in table.shipped else f"{name}*" for name in table]
+        click.echo(f"{kind}: {', '.join(names)}")

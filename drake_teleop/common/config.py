@@ -8,16 +8,20 @@ import numbers
 import reprlib
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from inspect import cleandoc
 from textwrap import TextWrapper
 from typing import Any, NamedTuple, TypeVar
 
 from drake_teleop.common.errors import DrakeTeleopError, field_place, suggestion
+from drake_teleop.common.registry import Registry
 
 KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 """Name of each value type in messages."""
+_checks_assignments = ContextVar("checks_assignments", default=True)
 
 
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
@@ -35,18 +39,23 @@ def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def choice(default: str, choices: Sequence[str], doc: str) -> Any:
-    """Return a dataclass field for one of the words `choices`."""
-    return dataclasses.field(default=default, metadata={"choices": tuple(choices), "doc": doc})
+def choice(
+    default: str, choices: Sequence[str], doc: str, registry: Registry[Any] | None = None
+) -> Any:
+    """Return a dataclass field for one of the words `choices`, or a name in the registry."""
+    metadata = {"choices": tuple(choices), "doc": doc, "registry": registry}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
-def plain(default: Any, doc: str) -> Any:
-    """Return a dataclass field for a flag, word, integer, list or mapping of names."""
+def plain(default: Any, doc: str, registry: Registry[Any] | None = None) -> Any:
+    """Return a dataclass field for a flag, word, integer, list or mapping of names.
+
+    With a registry of dataclasses the field contains these.
+    """
+    metadata = {"doc": doc, "registry": registry}
     if isinstance(default, (list, dict)):
-        return dataclasses.field(
-            default_factory=lambda: type(default)(default), metadata={"doc": doc}
-        )
-    return dataclasses.field(default=default, metadata={"doc": doc})
+        return dataclasses.field(default_factory=lambda: type(default)(default), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def in_short(value: Any) -> str:
@@ -95,6 +104,13 @@ def check_name(schema: type, name: Any, where: str) -> None:
         raise DrakeTeleopError("there is no such field", where=where, remedy=remedy)
 
 
+def check_field(schema: type, name: str, value: Any, where: str) -> None:
+    """Raise DrakeTeleopError, with the place `where`, unless a field may have this value."""
+    check_name(schema, name, where)
+    entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    _check_value(entry, _kind_of_field(entry, _type_hints(schema)[name]), value, where)
+
+
 def check_ranges(config: Any, where: str) -> None:
     """Check all values of a dataclass, recursively.
 
@@ -104,18 +120,24 @@ def check_ranges(config: Any, where: str) -> None:
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_place(where, field.name)
-        _check_kind(kinds[field.name], value, place, from_file=False)
-        if "choices" in field.metadata:
-            if value not in field.metadata["choices"]:
-                allowed = ", ".join(field.metadata["choices"])
-                raise DrakeTeleopError(
-                    f"'{value}' is not known", where=place, remedy=f"choose one of {allowed}"
-                )
-        elif "unit" in field.metadata and value is not None:
-            _check_range(field.metadata, value, place)
+        _check_value(field, kinds[field.name], value, place)
         for index, item in enumerate(value if isinstance(value, list) else [value]):
             if dataclasses.is_dataclass(item):
                 check_ranges(item, f"{place}[{index}]" if isinstance(value, list) else place)
+
+
+def _check_value(field: Any, kind: Kind, value: Any, place: str) -> None:
+    metadata = field.metadata
+    _check_kind(kind, value, place, from_file=False)
+    if "choices" in metadata:
+        words, registry = metadata["choices"], metadata.get("registry")
+        if registry is not None:
+            registry.check(value, place, *words)
+        elif value not in words:
+            remedy = suggestion(value, words, f"choose one of {', '.join(words)}")
+            raise DrakeTeleopError(f"'{value}' is not known", where=place, remedy=remedy)
+    elif "unit" in metadata and value is not None:
+        _check_range(metadata, value, place)
 
 
 def _check_range(metadata: Any, value: Any, place: str) -> None:
@@ -136,9 +158,21 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
             )
 
 
-@functools.cache
 def _field_types(schema: type) -> dict[str, Kind]:
-    return {name: kind_of(hint) for name, hint in typing.get_type_hints(schema).items()}
+    hints, entries = _type_hints(schema), dataclasses.fields(schema)
+    return {entry.name: _kind_of_field(entry, hints[entry.name]) for entry in entries}
+
+
+@functools.cache
+def _type_hints(schema: type) -> dict[str, Any]:
+    return typing.get_type_hints(schema)
+
+
+def _kind_of_field(entry: dataclasses.Field[Any], hint: Any) -> Kind:
+    registry, kind = entry.metadata.get("registry"), kind_of(hint)
+    if registry is None or "choices" in entry.metadata:
+        return kind
+    return kind._replace(items=tuple(registry.values()))
 
 
 def _field_names(schema: type) -> list[str]:
@@ -196,16 +230,17 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
         several = len(kind.items) > 1
         check_structure(_selected_block(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
-        raise _kind_error(" or ".join(block.__name__ for block in kind.items), value, place)
+        fields = ", ".join(_field_names(first))
+        remedy = f"make one: {first.__name__}(...), with fields {fields}"
+        raise _kind_error(" or ".join(block.__name__ for block in kind.items), value, place, remedy)
 
 
 def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
-        raise DrakeTeleopError(
-            f"'!{tag}' is not known", where=place, remedy=f"use one of !{', !'.join(names)}"
-        )
+        remedy = suggestion(tag, names, f"use one of !{', !'.join(names)}")
+        raise DrakeTeleopError(f"'!{tag}' is not known", where=place, remedy=remedy)
     return blocks[names.index(tag) if tag else 0]
 
 
@@ -286,21 +321,55 @@ class FieldInfo:
 
 
 def settings(block: _Class) -> _Class:
-    """Make a dataclass reject unknown attributes, and list its fields in its docstring.
+    """Make a dataclass check what it is assigned, and list its fields in its docstring.
 
     Its module must not postpone annotations: `yaml_load_typed` reads the types of the fields.
     """
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
+    block.__str__ = _changed_fields  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.text) for entry in fields_of(block)]
     block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
     return block
 
 
+def _changed_fields(self: Any) -> str:
+    return "\n  ".join([type(self).__name__, *_changed_lines(self)])
+
+
+def _changed_lines(config: Any) -> Iterator[str]:
+    """Yield a line for each field that differs from its default."""
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        if value == _default(entry):
+            continue
+        blocks = value if isinstance(value, list) else [value]
+        if not blocks or not dataclasses.is_dataclass(blocks[0]):
+            yield f"{entry.name}: {_shown(value)}"
+            continue
+        for index, block in enumerate(blocks):
+            place = f"{entry.name}[{index}]" if isinstance(value, list) else entry.name
+            yield f"{place}: {type(block).__name__}"
+            yield from (f"  {line}" for line in _changed_lines(block))
+
+
 def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
-    if name not in self.__dataclass_fields__:
-        check_name(type(self), name, f"{type(self).__name__}.{name}")
+    place = f"{type(self).__name__}.{name}"
+    if _checks_assignments.get():
+        check_field(type(self), name, value, place)
+    else:
+        check_name(type(self), name, place)
     object.__setattr__(self, name, value)
+
+
+@contextmanager
+def unchecked_assignments() -> Iterator[None]:
+    """Leave values unchecked, for a reader that checks the whole with the places in its file."""
+    token = _checks_assignments.set(False)
+    try:
+        yield
+    finally:
+        _checks_assignments.reset(token)
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
@@ -312,8 +381,7 @@ def fields_of(config: Any) -> list[FieldInfo]:
 
 
 def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
-    hint: Any = entry.type
-    lists, items, optional, by_name = kind_of(hint)
+    lists, items, optional, by_name = _kind_of_field(entry, entry.type)
     blocks = tuple(item for item in items if item not in KINDS)
     metadata = entry.metadata
     return FieldInfo(
@@ -326,7 +394,9 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         unit=metadata.get("unit", ""),
         low=metadata.get("low"),
         high=metadata.get("high"),
-        choices=metadata.get("choices", ()),
+        choices=(*metadata["choices"], *(metadata.get("registry") or ()))
+        if "choices" in metadata
+        else (),
         blocks=blocks,
         meaning=metadata.get("doc") or _first_line(blocks[0]),
         by_name=by_name,

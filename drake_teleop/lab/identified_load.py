@@ -21,6 +21,7 @@ from drake_teleop.common.version import __version__
 from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.identification import Identification
+from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.station.scenario import Scenario, check_scenario
 
 CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
@@ -70,6 +71,8 @@ def identified_load(
     before = identification_scenario(scenario, scenario.simulation.seed + 1)
     detects = scenario.contact_detection is not None
     path = (folder or cache_folder()) / f"load-{_cache_key(before, detects)}.npz"
+    # A registered estimator may have changed since.
+    fresh = fresh or before.load_estimator.method not in METHODS.shipped
     if not fresh and (cached := read_load(path)) is not None:
         return cached
     found = identify_load(before, progress)

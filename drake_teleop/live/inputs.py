@@ -31,8 +31,6 @@ Array = NDArray[np.float64]
 OWN = "as in the scenario"
 NETWORKS = (OWN, *NETWORK_PRESETS, "custom")
 SENSORS = (OWN, *SENSOR_PRESETS)
-#: Names of each choice; a choice is the index of its name.
-NAMES = {"network": NETWORKS, "method": METHODS, "grip": tuple(GRIPS), "sensor": SENSORS}
 
 #: Name of the file with the inputs of a recorded drive.
 INPUTS = "inputs.csv"
@@ -43,11 +41,17 @@ _SHARE_UNIT, _SCALE_UNIT = 1e-2, 1e-5
 MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
+def names() -> dict[str, tuple[str, ...]]:
+    """Return the names of each choice; a choice is the index of its name."""
+    shipped = {"network": NETWORKS, "grip": tuple(GRIPS), "sensor": SENSORS}
+    return shipped | {"method": tuple(METHODS)}
+
+
 def initial_choices(scenario: Scenario) -> dict[str, int]:
     """Return the choices (input -> integer) that leave a scenario unchanged."""
     return {
         "network": 0,
-        "method": METHODS.index(scenario.passivity.method),
+        "method": list(METHODS).index(scenario.passivity.method),
         "grip": list(GRIPS).index(scenario.operator.grip),
         "object": int(scenario.slave.payload.mass > 0.0),
         "detection": int(scenario.contact_detection is not None),
@@ -65,10 +69,11 @@ class Inputs:
         held: 1 while the hand holds the stylus.
         clutch: 1 while motion is transmitted.
         sigma: scale of the gripper's (or whole) non-contact wrench [%].
+        sigma_weight: scale of the load's weight alone [%]; -1: as its inertia.
         sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
-        network, method, grip, sensor: index into `NAMES`.
+        network, method, grip, sensor: index into `names()`.
         delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
         object: 1 with a gripped object.
         detection: 1 with contact detection.
@@ -83,6 +88,7 @@ class Inputs:
     held: int = 1
     clutch: int = 1
     sigma: int = 0
+    sigma_weight: int = -1
     sigma_object: int = 0
     gamma: int = 100
     force_scale: int = 5714
@@ -102,15 +108,23 @@ class Inputs:
         sigma, sigma_object, gamma = (
             round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()[:3]
         )
-        scale = round(scenario.force_scaling.force_scale / _SCALE_UNIT)
-        started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)
+        config = scenario.force_scaling
+        apart = config.sigma_weight is not None or config.sigma_inertia is not None
+        weight = round(config.scales().weight_gripper / _SHARE_UNIT) if apart else -1
+        started = cls(
+            sigma=sigma,
+            sigma_weight=weight,
+            sigma_object=sigma_object,
+            gamma=gamma,
+            force_scale=round(config.force_scale / _SCALE_UNIT),
+        )
         return started.changed(initial_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
-        """Return the inputs with new values, clipped to `RANGES`; invalid values are ignored."""
+        """Return the inputs with new values, clipped to their range; invalid ones are ignored."""
         changes = {}
         for name in values.keys() & RANGES.keys():
-            value, (low, high) = values[name], RANGES[name]
+            value, (low, high) = values[name], range_of(name)
             if isinstance(value, (int, float)) and abs(value) < 1e15:
                 changes[name] = round(min(max(value, low), high))
         return dataclasses.replace(self, **changes) if changes else self
@@ -150,9 +164,10 @@ class Inputs:
         return self.changed({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
 
     @property
-    def scales(self) -> dict[str, float]:
+    def scales(self) -> dict[str, Any]:
         """Force scales as arguments of `ForceScaling.SetScales`."""
         return {
+            "sigma_weight": None if self.sigma_weight < 0 else _SHARE_UNIT * self.sigma_weight,
             "sigma_gripper": _SHARE_UNIT * self.sigma,
             "sigma_object": _SHARE_UNIT * self.sigma_object,
             "gamma": _SHARE_UNIT * self.gamma,
@@ -165,7 +180,7 @@ _CHOICE_RANGES = {
     "delay": (0, 20_000),
     "jitter": (0, 100),
     "loss": (0, 500),
-    "method": (0, len(METHODS) - 1),
+    "method": (0, 0),  # see `range_of`
     "grip": (0, len(GRIPS) - 1),
     **dict.fromkeys(("object", "detection"), (0, 1)),
     "sensor": (0, len(SENSORS) - 1),
@@ -177,11 +192,20 @@ RANGES = {
     **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
     **dict.fromkeys(("rx", "ry", "rz"), (-10_000, 10_000)),
     **dict.fromkeys(("held", "clutch"), (0, 1)),
-    **dict.fromkeys(("sigma", "sigma_object", "gamma"), (0, 300)),
+    "sigma": (0, 300),
+    "sigma_weight": (-1, 300),
+    **dict.fromkeys(("sigma_object", "gamma"), (0, 300)),
     "force_scale": (0, 100_000),
     **_CHOICE_RANGES,
 }
 _COLUMNS = ("ms", *RANGES)
+
+
+def range_of(name: str) -> tuple[int, int]:
+    """Return the range of an input; that of `method` includes registered methods."""
+    return (0, len(METHODS) - 1) if name == "method" else RANGES[name]
+
+
 _VERSION = {"drake_teleop": __version__}
 
 
@@ -194,7 +218,7 @@ def header(made_by: Mapping[str, str] = _VERSION) -> str:
 def row(ms: int, inputs: Inputs) -> str:
     """Return the line of inputs.csv for inputs that apply from a time [ms]."""
     values = {name: getattr(inputs, name) for name in RANGES}
-    values |= {name: names[values[name]] for name, names in NAMES.items()}
+    values |= {name: words[values[name]] for name, words in names().items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
@@ -234,15 +258,15 @@ def _cannot_repeat(what: str, path: Path) -> DrakeTeleopError:
 
 
 def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
-    earlier = -1
+    earlier, choices = -1, names()
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
         if len(line) != len(_COLUMNS):
             raise DrakeTeleopError(f"has {len(line)} values, not {len(_COLUMNS)}", where=where)
         for column, name in enumerate(_COLUMNS):
-            if name in NAMES and line[column] in NAMES[name]:
-                line[column] = str(NAMES[name].index(line[column]))
-            elif name in NAMES:
+            if line[column] in choices.get(name, ()):
+                line[column] = str(choices[name].index(line[column]))
+            elif name in choices:
                 raise _cannot_repeat(f"has an unknown {name}, {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
@@ -255,7 +279,8 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
                 remedy="use increasing times in whole milliseconds from 0",
             )
         earlier, inputs = ms, dict(zip(RANGES, values, strict=True))
-        for name, (low, high) in RANGES.items():
+        for name in RANGES:
+            low, high = range_of(name)
             if not low <= inputs[name] <= high:
                 raise DrakeTeleopError(
                     f"{name} = {inputs[name]} is outside {low} to {high}", where=where

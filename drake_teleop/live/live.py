@@ -22,7 +22,15 @@ from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import TICK_MS
-from drake_teleop.live.inputs import CHOICES, MAX_DURATION_MS, NAMES, RANGES, SLICE_MS, Inputs
+from drake_teleop.live.inputs import (
+    CHOICES,
+    MAX_DURATION_MS,
+    RANGES,
+    SLICE_MS,
+    Inputs,
+    names,
+    range_of,
+)
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.scenarios import SCENES
@@ -142,8 +150,8 @@ class Live:
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
-            "ranges": RANGES,
-            "names": NAMES,
+            "ranges": {name: range_of(name) for name in RANGES},
+            "names": names(),
             "object": self._scenario.force_scaling.gripper_phi is not None,
             "touch": TOUCH_FORCE_N,
             "known": self._load is not None,

@@ -83,11 +83,12 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
 
     Contact detection is on only with a noise floor and the scenario's own sensor.
     """
+    method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {
-        "passivity__method": METHODS[inputs.method],
+        "passivity__method": method,
         "operator__grip": list(GRIPS)[inputs.grip],
     }
-    if METHODS[inputs.method] == "wave" != scenario.passivity.method:
+    if method == "wave" != scenario.passivity.method:
         along, turning = scenario.passivity.wave.impedance
         wave = dataclasses.replace(
             scenario.passivity.wave, impedance=[along, max(turning, _MIN_ROTATIONAL_IMPEDANCE)]

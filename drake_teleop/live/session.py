@@ -222,12 +222,7 @@ class Session:
             self._station.open(bool(inputs.clutch) and self.ms >= self._filled_at_ms)
         if inputs.scales != before.scales:
             scaling, context = self._station.block("force_scaling")
-            # The page has one sigma: of the inertia, if the scenario sets the weight apart.
-            kept = self.scenario.force_scaling
-            apart = kept.sigma_weight is not None or kept.sigma_inertia is not None
-            weight = kept.scales().weight_gripper if apart else None
-            scales = inputs.scales
-            scaling.SetScales(context, **scales, sigma_weight=weight, duration=_SCALE_RAMP_S)
+            scaling.SetScales(context, **inputs.scales, duration=_SCALE_RAMP_S)
         if self._record is not None:
             self._record.write(self.ms, inputs)
 

@@ -55,12 +55,13 @@ class VirtualDevice:
 
 
 def tapping(
-    depth: float, *, hertz: float = 0.5, lift: float = 0.01, hold: float = 0.6
+    depth: float, *, hertz: float = 0.5
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
-    """Return a hand motion along z from `lift` to -`depth` [m] and back, `hertz` times a second.
+    """Return a hand motion along z from 10 mm to -`depth` [m] and back, `hertz` times a second.
 
-    `hold`: share of the period at the lower end.
+    The hand stays at the lower end for 60 % of the period.
     """
+    lift, hold = 0.01, 0.6
 
     def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
         phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)

@@ -260,7 +260,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
         distance = np.abs(residual - offsets)
         # 1.4826 * median |x| is the standard deviation of a normal x.
         spread = 1.4826 * np.median(distance, axis=0) + 1e-12
-        before, agrees = agrees, (distance <= 4 * spread).all(axis=1)
+        before, agrees = agrees, np.asarray((distance <= 4 * spread).all(axis=1))
         if np.array_equal(before, agrees) or not agrees.any():
             break
         offsets = residual[agrees].mean(axis=0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, number, one_blas_thread
-from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
+from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import (
     contact_wrench,
@@ -163,7 +163,7 @@ def identify_log(
 
     Args:
         path: canonical table or log description.
-        method: "ordinary", "whitened", "total", "robust" or "consistent".
+        method: "ordinary", "whitened", "total", "robust", "consistent" or a registered name.
         cutoff_hz: cut-off of the low-pass; None for no filter.
         delay: delay of the motion behind the wrench [s], or "auto".
         checks: result of `check_file` for this log, if known.
@@ -171,7 +171,7 @@ def identify_log(
     Raises:
         DrakeTeleopError: for an unusable log, an unknown method or a worthless result.
     """
-    check_method(method)
+    METHODS.check(method, "method")
     with one_blas_thread():
         check = partial(check_file, Path(path)) if checks is None else lambda: checks
         return _identified(path, method, cutoff_hz, delay, check)

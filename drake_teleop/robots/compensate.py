@@ -121,7 +121,7 @@ def compensate_command(
     watch: bool = False,
     free: Path | None = None,
     control: int | None = None,
-    serve: Callable[[Callable[[Identification], Compensator]], Any] | None = None,
+    attach: Callable[[Callable[[Identification], Compensator]], Any] | None = None,
     **stream: Any,
 ) -> None:
     """Run the command `compensate`; messages go to stderr.
@@ -131,7 +131,7 @@ def compensate_command(
         largest: range of the sensor: force [N], torque [N m].
         free: log of free motion, see `Detector`.
         control: UDP port of `Control`.
-        serve: function from a maker of compensators to an object that is used as a compensator.
+        attach: function from a maker of compensators to an object that is used as a compensator.
         stream: options of `open_source`.
     """
     found = Identification.load(load)
@@ -153,7 +153,7 @@ def compensate_command(
             detector=None if free is None else Detector(load, free, readings.dt, cutoff_hz),
         )
 
-    compensator = make(found) if serve is None else serve(make)
+    compensator = make(found) if attach is None else attach(make)
 
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)

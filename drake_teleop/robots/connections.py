@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.registry import Registry
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.robots.assembly import (
@@ -24,17 +26,8 @@ from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
-_SOURCES = (
-    "udp://:PORT, posed://:PORT, rtde://HOST, netft://HOST, ros2://TOPIC, zenoh://HOST/TOPIC,"
-    " - for stdin, or replay:LOG"
-)
-_SINKS = (
-    "udp://HOST:PORT, ros2://TOPIC, zenoh://HOST/TOPIC, foxglove://[HOST][:PORT], -,"
-    " or a .csv, .parquet or .mcap file"
-)
 _REPLAY = "replay:"
 _UNUSED_RATE_HZ = 1000.0
-_PART_KINDS = ("posed", "rtde", "netft", "ros2", "zenoh")
 
 
 def open_source(
@@ -61,7 +54,7 @@ def open_source(
         arm: kinematics for joint positions.
     """
     kind = _kind(address)
-    if kind in _PART_KINDS:
+    if kind in PART_SOURCES:
         track = load if isinstance(delay, str) else None
         if isinstance(delay, str):
             delay = 0.0 if load is None else load.delay_s
@@ -84,12 +77,12 @@ def open_source(
         path = address.removeprefix(_REPLAY)
         options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
         return LogSource(path, load, **options)  # type: ignore[arg-type]
-    if kind not in ("-", "udp"):
-        raise DrakeTeleopError("is not a source", where=address, remedy=_SOURCES)
+    if kind not in SOURCES:
+        remedy = f"give {_forms(SOURCES, PART_SOURCES)}, or replay:LOG"
+        raise DrakeTeleopError("is not a source", where=address, remedy=remedy)
     if load is not None and load.weight_removed:
         raise without_orientation(address)
-    dt = _period(rate_hz, address)
-    return LineSource(sys.stdin.fileno(), dt) if kind == "-" else UdpSource(address, dt)
+    return SOURCES[kind](address, _period(rate_hz, address))
 
 
 def open_recording(
@@ -109,7 +102,7 @@ def open_recording(
     kind = _kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
-    if kind in _PART_KINDS:
+    if kind in PART_SOURCES:
         parts = _open_parts(address, rate_hz, motion, arm)
         return parts, PartRecorder(parts, largest, _pose(sensor_pose))
     readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose, "arm": arm}
@@ -118,31 +111,21 @@ def open_recording(
 
 def is_file(address: str) -> bool:
     """Return whether the address of a sink is a file or a folder of files."""
-    return not _kind(address) and Path(address).suffix in (".csv", ".parquet", ".mcap")
+    return not _kind(address) and Path(address).suffix in SINKS
 
 
 def open_sink(address: str) -> Sink:
     """Return the sink at an address; raise DrakeTeleopError if it is invalid."""
-    kind, path = _kind(address), Path(address)
-    if kind == "-":
-        return LineSink(sys.stdout)
-    if kind == "udp":
-        return UdpSink(address)
-    if kind == "zenoh":
-        from drake_teleop.robots.ros2_zenoh import ZenohSink
+    kind = _kind(address) or Path(address).suffix
+    if kind not in SINKS:
+        remedy = f"give {_forms(SINKS)}"
+        raise DrakeTeleopError("is not a sink", where=address, remedy=remedy)
+    return SINKS[kind](address)
 
-        return ZenohSink(address)
-    if kind == "ros2":
-        from drake_teleop.robots.ros2 import Ros2Sink
 
-        return Ros2Sink(address)
-    if kind == "foxglove" or (is_file(address) and path.suffix == ".mcap"):
-        from drake_teleop.robots.foxglove import FoxgloveSink, McapSink
-
-        return FoxgloveSink(address) if kind else McapSink(path)
-    if not is_file(address):
-        raise DrakeTeleopError("is not a sink", where=address, remedy=_SINKS)
-    return TableSink(path)
+def _forms(*tables: Registry[Any]) -> str:
+    names = (name for table in tables for name in table)
+    return ", ".join(f"{name}://" if name[0].isalnum() else name for name in names)
 
 
 def _kind(address: str) -> str:
@@ -163,27 +146,10 @@ def _open_part_source(
     address: str, rate_hz: float | None, joints: tuple[str, ...] = ()
 ) -> PartSource:
     kind = _kind(address)
-    if kind == "posed":
-        return PosedSource(address, _period(rate_hz, address))
-    if kind == "rtde":
-        from drake_teleop.robots.rtde import RtdeSource
-
-        return RtdeSource(address)
-    if kind == "netft":
-        from drake_teleop.robots.netft import NetFtSource
-
-        return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
-    if kind == "zenoh":
-        from drake_teleop.robots.ros2_zenoh import ZenohSource
-
-        return ZenohSource(address, _period(rate_hz, address), joints)
-    if kind == "ros2":
-        from drake_teleop.robots.ros2 import Ros2Source
-
-        return Ros2Source(address, _period(rate_hz, address), joints)
-    raise DrakeTeleopError(
-        "delivers no motion", where=address, remedy="rtde://HOST or ros2://TOPIC"
-    )
+    if kind not in PART_SOURCES:
+        remedy = f"give {_forms(PART_SOURCES)}"
+        raise DrakeTeleopError("delivers no motion", where=address, remedy=remedy)
+    return PART_SOURCES[kind](address, rate_hz, joints)
 
 
 def _open_parts(
@@ -214,3 +180,82 @@ def _open_parts(
 
 def _pose(sensor_pose: tuple[float, ...] | None) -> Array:
     return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
+
+
+def _open_rtde(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.rtde import RtdeSource
+
+    return RtdeSource(address)
+
+
+def _open_netft(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.netft import NetFtSource
+
+    return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
+
+
+def _open_zenoh(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.ros2_zenoh import ZenohSource
+
+    return ZenohSource(address, _period(rate_hz, address), joints)
+
+
+def _open_ros2(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.ros2 import Ros2Source
+
+    return Ros2Source(address, _period(rate_hz, address), joints)
+
+
+def _open_zenoh_sink(address: str) -> Sink:
+    from drake_teleop.robots.ros2_zenoh import ZenohSink
+
+    return ZenohSink(address)
+
+
+def _open_ros2_sink(address: str) -> Sink:
+    from drake_teleop.robots.ros2 import Ros2Sink
+
+    return Ros2Sink(address)
+
+
+def _open_foxglove(address: str) -> Sink:
+    from drake_teleop.robots.foxglove import FoxgloveSink
+
+    return FoxgloveSink(address)
+
+
+def _open_mcap(address: str) -> Sink:
+    from drake_teleop.robots.foxglove import McapSink
+
+    return McapSink(Path(address))
+
+
+SOURCES: Registry[Callable[[str, float], Source[Reading]]] = Registry(
+    "source", {"udp": UdpSource, "-": lambda address, dt: LineSource(sys.stdin.fileno(), dt)}
+)
+"""Sources of readings by the scheme of their address, called with address and period [s]."""
+PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource]] = Registry(
+    "source of parts",
+    {
+        "posed": lambda address, hz, joints: PosedSource(address, _period(hz, address)),
+        "rtde": _open_rtde,
+        "netft": _open_netft,
+        "zenoh": _open_zenoh,
+        "ros2": _open_ros2,
+    },
+)
+"""Sources of wrench and motion apart, called with address, rate [Hz] or None, and joint names."""
+SINKS: Registry[Callable[[str], Sink]] = Registry(
+    "sink",
+    {
+        "-": lambda address: LineSink(sys.stdout),
+        "udp": UdpSink,
+        "zenoh": _open_zenoh_sink,
+        "ros2": _open_ros2_sink,
+        "foxglove": _open_foxglove,
+        ".csv": lambda address: TableSink(Path(address)),
+        ".parquet": lambda address: TableSink(Path(address)),
+        ".mcap": _open_mcap,
+    },
+)
+"""Sinks by the scheme or suffix of their address, called with the address."""

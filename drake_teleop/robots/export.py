@@ -12,6 +12,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
+from drake_teleop.common.registry import Registry
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.load.identification import PARAMETERS, Identification
@@ -79,11 +80,7 @@ def export(
             as in a URDF; None: F is S.
         sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
     """
-    if to not in FORMATS:
-        raise DrakeTeleopError(
-            f"{to!r} is not a target", where="export", remedy=f"one of {', '.join(FORMATS)}"
-        )
-    format = FORMATS[to]
+    format = FORMATS[FORMATS.check(to, "export")]
     if format.of_sensor:
         refuse_removed_weight(found, to)
     if sensor_pose is not None and format.of_sensor:
@@ -263,33 +260,36 @@ def _json(document: dict[str, Any]) -> str:
 
 _FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
 
-FORMATS = {
-    "ur": Format(_ur, comment="#"),
-    "franka": Format(
-        _franka, note="transformation is the identity: replace it by that of your end effector"
-    ),
-    "xarm": Format(_xarm, inertia=False, comment="#"),
-    "kth": Format(
-        _kth,
-        of_sensor=True,
-        inertia=False,
-        offsets=True,
-        comment="#",
-        note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
-        " compensated force is twice the weight, change the sign of the mass",
-    ),
-    "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
-    "ros2-admittance": Format(
-        _admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME_NOTE
-    ),
-    "bota": Format(
-        _bota,
-        of_sensor=True,
-        offsets=True,
-        note="the inertia is about the centre of mass; Bota does not document the reference point",
-    ),
-    "urdf": Format(_urdf, body=True),
-    "sdf": Format(_sdf, body=True),
-    "mjcf": Format(_mjcf, body=True),
-}
+FORMATS = Registry(
+    "export format",
+    {
+        "ur": Format(_ur, comment="#"),
+        "franka": Format(
+            _franka, note="transformation is the identity: replace it by that of your end effector"
+        ),
+        "xarm": Format(_xarm, inertia=False, comment="#"),
+        "kth": Format(
+            _kth,
+            of_sensor=True,
+            inertia=False,
+            offsets=True,
+            comment="#",
+            note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+            " compensated force is twice the weight, change the sign of the mass",
+        ),
+        "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
+        "ros2-admittance": Format(
+            _admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME_NOTE
+        ),
+        "bota": Format(
+            _bota,
+            of_sensor=True,
+            offsets=True,
+            note="the inertia is about the centre of mass; Bota does not document the point",
+        ),
+        "urdf": Format(_urdf, body=True),
+        "sdf": Format(_sdf, body=True),
+        "mjcf": Format(_mjcf, body=True),
+    },
+)
 """Export formats by name."""

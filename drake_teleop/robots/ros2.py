@@ -177,9 +177,9 @@ class Ros2Sink:
     """
 
     def __init__(self, address: str) -> None:
+        parsed = parse_address(address, ("frame", "wrench", "domain"))
         from rclpy.qos import qos_profile_sensor_data
 
-        parsed = parse_address(address, ("frame", "wrench", "domain"))
         topic, domain = topic_of(parsed, parsed.path), domain_of(parsed)
         self._which = parsed.choice("wrench", ("contact", "scaled"))
         kinds = [WRENCH_STAMPED]

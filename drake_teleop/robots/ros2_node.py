@@ -174,12 +174,12 @@ def ros2_command(
     scales = {name: -1.0 if options.get(name) is None else options[name] for name in _SCALES}
     served: list[ServedCompensator] = []
 
-    def serve(make: Callable[[Identification], Compensator]) -> Any:
+    def attach(make: Callable[[Identification], Compensator]) -> Any:
         served.append(ServedCompensator(node.node, make, load, calibrate, out, scales))
         return served[0]
 
     try:
-        compensate_command(source, load, sink, serve=serve, **options)
+        compensate_command(source, load, sink, attach=attach, **options)
     finally:
         for each in served:
             each.close()

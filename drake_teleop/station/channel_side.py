@@ -12,7 +12,7 @@ from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel.channel import TeleopChannel
-from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.joint_control import servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
@@ -36,8 +36,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m] (network)
         - pose_slave: (7,) actual X_WS of the slave (network)
         - saturated: (1,) 1 while the wrench is invalid (network)
-        - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; only `ledger`
-          reads it; may stay unconnected (network)
+        - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; read by methods
+          that need it apart; may stay unconnected (network)
         output_ports:
         - pose_to_slave: (7,) X_WS, setpoint of the slave
         - wrench_to_master: (6,) F_E_B, wrench to render [N, N m]
@@ -97,13 +97,13 @@ def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> Passivit
 
 
 def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
-    """Return the scenario's passivity method; for `ledger`, add mass and servo of the arm.
+    """Return the scenario's passivity method, with mass and servo of the arm if it needs them.
 
     Raises:
         DrakeTeleopError: if the arm has fewer than six joints (unbounded mass in a direction).
     """
     passivity = scenario.passivity
-    if passivity.method != "ledger" or passivity.slave_mass is not None:
+    if not METHODS[passivity.method].needs_arm_mass or passivity.slave_mass is not None:
         return passivity
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:

@@ -13,6 +13,8 @@ Flags = NDArray[np.bool_]
 _MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
 REVERSAL_WINDOW_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
+MAX_FAST_FORCE_N = 0.05
+"""Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
 # Smallest number of reversals of an oscillation, and longest time between two of them [s].
 _MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 
@@ -96,10 +98,10 @@ def split_at_gaps(times: Array, longest: float) -> list[Array]:
     return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
 
 
-def fast_part(t: Array, signal: Array, corner: float = 5.0) -> Array:
-    """Return the part of `signal` (N, k) above the frequency `corner` [Hz].
+def fast_part(t: Array, signal: Array) -> Array:
+    """Return the part of `signal` (N, k) above 5 Hz: the signal minus its mean over 0.2 s.
 
-    It is the signal minus its mean over one period of `corner`, for evenly spaced times `t` (N,).
+    `t` (N,) are evenly spaced times [s].
     """
-    rows = max(round(1.0 / (corner * (t[1] - t[0]))), 1) if len(t) > 1 else 1
+    rows = max(round(0.2 / (t[1] - t[0])), 1) if len(t) > 1 else 1
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -140,7 +140,16 @@ class SimulationResult:
             spec.name: dict(zip(spec.components, spec.units, strict=True)) for spec in self.specs
         }
 
-    def __getitem__(self, name: str) -> NDArray[np.float64]:
+    @overload
+    def __getitem__(self, name: str) -> NDArray[np.float64]: ...
+
+    @overload
+    def __getitem__(self, name: slice) -> SimulationResult: ...
+
+    def __getitem__(self, name: str | slice) -> NDArray[np.float64] | SimulationResult:
+        if isinstance(name, slice):
+            rows = {each: self._values[each][name] for each in self.signals}
+            return SimulationResult(self._t[name], rows, self.specs)
         if name == "t":
             return self._t
         if (found := self._column(name)) is not None:

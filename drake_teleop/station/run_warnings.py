@@ -12,6 +12,7 @@ behind         a pose or joint lags its command by more than delay and bandwidth
 reserve        the hand is faster than the energy reserve of `ledger` allows for the slave
 oscillation    hand, command or joint oscillates (limit cycle) while its command does not
 chatter        the tool loses and regains contact, see `drake_teleop.station.contact_chatter`
+fast force     over a network, the rendered force oscillates above 5 Hz while the hand rests
 ============== ===================================================================================
 
 The first six are always reported, the others if they last longer than 0.2 s (`reserve`: in total;
@@ -25,6 +26,7 @@ from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from drake_teleop.common.blocks import MEANINGS, Fault
 from drake_teleop.common.style import contact_spans
@@ -35,13 +37,15 @@ from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
+    MAX_FAST_FORCE_N,
     REVERSAL_WINDOW_S,
+    fast_part,
     oscillates,
     pose_oscillates,
     pose_reversals,
     rotation_near,
 )
-from drake_teleop.station.passivity.ledger import fastest
+from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import SLIDES, ArmModel
@@ -67,6 +71,10 @@ _DEGREES_PER_RAD = 180 / np.pi
 _MIN_JOINT_AMPLITUDE_RAD = np.deg2rad(0.1)
 # Number of time constants of the position loop until the error is 0.3 %.
 _SETTLING_TIME_CONSTANTS = 6.0
+# Time in which an intent at rest moves by less than a distance.
+_REST_S, _MAX_REST_MOTION_M = 0.5, 1e-4
+# Smallest number of periods of an oscillating force.
+_MIN_CYCLES = 4
 # Largest number of time spans that a warning lists; further ones are counted.
 _MAX_LISTED_TIMES = 3
 
@@ -86,6 +94,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_joints(result, scenario, arm),
         _check_hand(result),
         _check_contact(result),
+        _check_rendered_force(result),
     )
     overlaps = start_overlaps(scenario.slave, scenario.surroundings)
     return [
@@ -212,12 +221,13 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
 
 
 def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
-    if scenario.passivity.method != "ledger" or len(result.t) < 2:
+    speed_limit = METHODS[scenario.passivity.method].speed_limit
+    if speed_limit is None or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
-    config, row = scenario.passivity.ledger, t[1] - t[0]
+    config, row = scenario.passivity.of_method(), t[1] - t[0]
     mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale(scenario)
-    limit = fastest(config, mass)
+    limit = speed_limit(config, mass)
     then = t - _packet_ages(t, scenario)
     window = longest_delay(scenario.channel.lines()[0]) + _SETTLING_TIME_S
     for g, (command, actual, least, unit, scale) in enumerate(_pose_parts(sent, received)):
@@ -231,10 +241,12 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         enough, speed_unit = np.array(config.reserve), ("m/s", "rad/s")[g]
         enough[g] *= (speed[held].max() / limit[g]) ** 2
         yield (
-            f"the ledger's reserve limits the slave to {limit[g]:.2g} {speed_unit}, and the hand"
-            f" moves at up to {speed[held].max():.2g}: for {100 * held.mean():.0f} % of the time"
+            f"the {scenario.passivity.method}'s reserve limits the slave to {limit[g]:.2g}"
+            f" {speed_unit}, and the hand moves at up to {speed[held].max():.2g}:"
+            f" for {100 * held.mean():.0f} % of the time"
             f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
-            " pose (move more slowly, or increase the energy: passivity.ledger.reserve"
+            " pose (move more slowly, or increase the energy:"
+            f" passivity.{scenario.passivity.method}.reserve"
             f" {_list_text(enough)} and initial {_list_text(enough + config.hand_reserve)}),",
             find_spans(t, held),
         )
@@ -313,6 +325,33 @@ def _check_contact(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
             " force_scaling.force_scale or kinematic_scaling.translation_scale),",
             [(chatter.start, chatter.stop) for chatter in found],
         )
+
+
+def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+    if not {"ports", "intent", "force_to_master"} <= set(result.signals):
+        return
+    t, intent = result.t, result["intent"][:, 4:]
+    force = fast_part(t, result["force_to_master"][:, :3])
+    rows = round(_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
+    largest, least = _running_maximum(intent, rows), -_running_maximum(-intent, rows)
+    rests = np.linalg.norm(largest - least, axis=1) < _MAX_REST_MOTION_M
+    rests[:rows] = False
+    rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
+    spans = find_spans(t, rests & (rms > MAX_FAST_FORCE_N), _MIN_DURATION_S)
+    if not spans:
+        return
+    start, stop = max(spans, key=lambda span: span[1] - span[0])
+    part = force[(t >= start) & (t <= stop)]
+    strongest = part[:, part.std(axis=0).argmax()]
+    crossings = np.count_nonzero(np.diff(np.signbit(strongest)))
+    if crossings < 2 * _MIN_CYCLES:  # a step is no oscillation
+        return
+    yield (
+        f"the rendered force oscillates at {crossings / (2 * (stop - start)):.2g} Hz with up to"
+        f" {_maximum_within(t, rms, spans):.2g} N rms while the hand rests (reduce"
+        " force_scaling.gamma or force_scale, or increase passivity.ledger.initial with ledger),",
+        spans,
+    )
 
 
 def _joint_error(result: SimulationResult) -> Array:

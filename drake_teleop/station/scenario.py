@@ -8,11 +8,12 @@ import dataclasses
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar, cast
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.common.config import (
+    check_field,
     check_name,
     check_ranges,
     check_structure,
@@ -20,9 +21,11 @@ from drake_teleop.common.config import (
     plain,
     quantity,
     settings,
+    unchecked_assignments,
 )
 from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
 from drake_teleop.common.files import scenarios_dir
+from drake_teleop.common.registry import Registry
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.station.channel.channel import LONGEST_TIMEOUT, Channel
 from drake_teleop.station.channel.network import NetworkConfig
@@ -46,15 +49,10 @@ from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
 _T = TypeVar("_T")
-#: Types of objects in `environment`.
-Thing: TypeAlias = (
-    Wall
-    | Box
-    | Block
-    | SheetSpring
-    | Slot
-    | Scene
-)  # fmt: skip
+ENVIRONMENTS: Registry[type[Environment]] = Registry(
+    "environment", {each.__name__: each for each in (Wall, Box, Block, SheetSpring, Slot, Scene)}
+)
+"""Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
 _CONTACT_STEP_S = 1.25e-4
 
@@ -124,8 +122,8 @@ class Scenario:
     contact_detection: ContactDetectionConfig | None = None
     sheet_spring: SheetSpring | None = None
     slot: Slot | None = None
-    environment: list[Thing] = plain(
-        [], "further objects to touch, such as [!Wall {stiffness: 2e4}, !Block {}]"
+    environment: list[Environment] = plain(
+        [], "further objects to touch, such as [!Wall {stiffness: 2e4}, !Block {}]", ENVIRONMENTS
     )
 
     @property
@@ -158,6 +156,7 @@ class Scenario:
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
         check_ranges(self, where)
+        self.passivity.check(f"{where}:passivity")
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
         self.master.check(f"{where}:master")
@@ -244,8 +243,15 @@ def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | N
         DrakeTeleopError: for an unknown field, or a value of the wrong type.
     """
     check_structure(schema, data, where)
-    text = yaml_dump(data)
-    return yaml_load_typed(schema=schema, data=text, defaults=defaults or schema())
+    data = dict(data)
+    things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
+    with unchecked_assignments():
+        text = yaml_dump(data)
+        config = yaml_load_typed(schema=schema, data=text, defaults=defaults or schema())
+        for thing in things:
+            kind = ENVIRONMENTS[thing.pop("_tag", "!Wall").removeprefix("!")]
+            config.environment.append(yaml_load_typed(schema=kind, data=yaml_dump(thing)))
+    return cast(_T, config)
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
@@ -271,10 +277,8 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5
 
-    Values are checked when the scenario is used.
-
     Raises:
-        DrakeTeleopError: if there is no such block or field.
+        DrakeTeleopError: if there is no such block or field, or for an invalid value.
     """
     expect(Scenario, scenario, "scenario")
     for name, value in changes.items():
@@ -284,8 +288,9 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):
                 raise DrakeTeleopError(f"there is no block {block} to change", where=place)
-            check_name(type(config), inner, place)
+            check_field(type(config), inner, value, place)
             value = dataclasses.replace(config, **{inner: value})
+        check_field(Scenario, block, value, f"scenario:{block}")
         scenario = dataclasses.replace(scenario, **{block: value})  # type: ignore[arg-type]
     return scenario
 

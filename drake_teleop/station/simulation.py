@@ -29,7 +29,7 @@ _PART_ROWS = 8192
 
 def simulate(
     diagram: Diagram,
-    simulation: Simulation,
+    simulation: Simulation | None = None,
     *,
     progress: bool | Progress = True,
     log: str | Path | None = None,
@@ -38,7 +38,7 @@ def simulate(
 
     Args:
         diagram: station from `MakeTeleopStation`.
-        simulation: duration, settling time, integrator and seed.
+        simulation: duration, settling time, integrator and seed; required.
         progress: True shows a progress bar after one second; or a function of the completed
             fraction.
         log: folder for a log in parts, written during the run so that memory does not grow. After
@@ -53,6 +53,8 @@ def simulate(
             folder contains other files, or at a fault (`Simulation.on_fault`).
     """
     expect(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
+    if simulation is None:
+        raise DrakeTeleopError("is missing", where="simulation", remedy="pass scenario.simulation")
     expect(Simulation, simulation, "simulation", "pass scenario.simulation")
     check_ranges(simulation, "simulation")
     expect((str, Path, type(None)), log, "log", "give a folder")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
-from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import check_identified, checked
@@ -29,13 +29,13 @@ from drake_teleop.station.slave.joint_commands import (
     SlaveMonitor,
     ik_method_name,
 )
-from drake_teleop.station.slave.joint_control import MakeJointControl, mass_matrix
+from drake_teleop.station.slave.joint_control import HeldTorque, MakeJointControl, mass_matrix
 from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
 from drake_teleop.station.slave.surroundings import MovingPose
-from drake_teleop.station.wiring import export
+from drake_teleop.station.wiring import export, wire
 
 Array = NDArray[np.float64]
 
@@ -51,6 +51,7 @@ def MakeSlaveSide(
     load_estimate: Array | None = None,
     load_covariance: Array | None = None,
     noise_floor: NoiseFloor | None = None,
+    controller: System | None = None,
 ) -> Diagram:
     """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, force scaling.
 
@@ -73,7 +74,13 @@ def MakeSlaveSide(
           surroundings): signals
         - sample, scaled_contact_and_fault: several of these signals in one port, for the log
 
-    Arguments as for `MakeTeleopStation`.
+    Args:
+        load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
+        controller: custom control law of the arm (docs/station.md, "A controller of your own").
+            Its output `joint_torque` (n) [N m] replaces inverse kinematics and joint control, or
+            its output `pose_command` (7) is the setpoint of both. Its input `pose_command` (7) is
+            that of this side; `slave_state` (2 n), `pose_slave` (7), `contact_wrench_S` (6) and the
+            parts of a sample are connected if it has such inputs.
 
     Raises:
         DrakeTeleopError: for an invalid value, an unreachable start, scales that require a load
@@ -84,23 +91,24 @@ def MakeSlaveSide(
     if load_covariance is not None:
         checked("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    body = _add_slave_blocks(builder, scenario, load_estimate, load_covariance)
-    arm = body.slave.arm
-
-    start, led = body.slave.start, scenario.master.leads_joints
-    make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
-    make_ik = JointFollower if led else make_ik
-    ik = builder.AddNamedSystem("inverse_kinematics", make_ik(arm, start, body.command_period))
-    if not led:
-        builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
-    builder.Connect(
-        ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
+    led, torques = scenario.master.leads_joints, _gives_torques(controller, scenario)
+    body = _add_slave_blocks(
+        builder, scenario, load_estimate, load_covariance, custom_torque=torques
     )
-    builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
+    arm = body.slave.arm
+    if controller is not None:
+        builder.AddNamedSystem("controller", controller)
     setpoint = "leader_joints" if led else "pose_command"
-    builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
-    export(builder, ik, "joint_command")
-    export(builder, body.monitor, "ik_status")
+    if torques:
+        wire(builder, controller, "joint_torque", body.joint_control, "requested_torque")
+    else:
+        ik = _add_inverse_kinematics(builder, scenario, body, led)
+        if controller is None:
+            builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
+        else:
+            wire(builder, controller, "pose_command", ik, "pose_command")
+    if controller is not None:
+        builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
 
     R_WB = RollPitchYaw(scenario.kinematic_scaling.alignment).ToRotationMatrix().matrix()
     force_scaling = builder.AddNamedSystem(
@@ -120,11 +128,19 @@ def MakeSlaveSide(
     if _has_load_estimate(scenario, load_estimate):
         export(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
-    if not scenario.is_direct:
-        kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
-        state = body.slave.plant.get_state_output_port(body.slave.instance)
-        builder.Connect(state, kinematics.GetInputPort("slave_state"))
-        export(builder, kinematics, "pose_slave")
+    kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
+    state = body.slave.plant.get_state_output_port(body.slave.instance)
+    builder.Connect(state, kinematics.GetInputPort("slave_state"))
+    export(builder, kinematics, "pose_slave")
+    if controller is not None:
+        inputs = body.sample | {
+            "slave_state": state,
+            "pose_slave": kinematics.GetOutputPort("pose_slave"),
+            "contact_wrench_S": force_scaling.GetOutputPort("contact_wrench_S"),
+        }
+        for name, port in inputs.items():
+            if controller.HasInputPort(name):
+                builder.Connect(port, controller.GetInputPort(name))
 
     if scenario.contact_detection is not None:
         if noise_floor is None:
@@ -144,6 +160,43 @@ def MakeSlaveSide(
         builder.Connect(estimate, detection.GetInputPort("load_estimate"))
         export(builder, detection, "contact")
     return builder.Build()
+
+
+def _gives_torques(controller: System | None, scenario: Scenario) -> bool:
+    """Return whether a custom controller replaces the joint control; check its ports."""
+    if controller is None:
+        return False
+    expect(System, controller, "controller", "make a Drake system: docs/station.md")
+    torques = controller.HasOutputPort("joint_torque")
+    for has, port in (
+        (controller.HasInputPort("pose_command"), "input port 'pose_command'"),
+        (torques or controller.HasOutputPort("pose_command"), "output port 'joint_torque'"),
+    ):
+        if not has:
+            remedy = "docs/station.md lists its ports"
+            raise DrakeTeleopError(f"there is no {port}", where="controller", remedy=remedy)
+    scenario.master.check_pose_mode("a custom controller")
+    return bool(torques)
+
+
+def _add_inverse_kinematics(
+    builder: DiagramBuilder, scenario: Scenario, body: _SlaveBlocks, led: bool
+) -> LeafSystem:
+    arm = body.slave.arm
+    make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
+    make_ik = JointFollower if led else make_ik
+    ik = builder.AddNamedSystem(
+        "inverse_kinematics", make_ik(arm, body.slave.start, body.command_period)
+    )
+    if not led:
+        builder.Connect(body.sample["joint_position"], ik.GetInputPort("joint_position"))
+    builder.Connect(
+        ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
+    )
+    builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
+    export(builder, ik, "joint_command")
+    export(builder, body.monitor, "ik_status")
+    return ik
 
 
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
@@ -181,6 +234,8 @@ def _add_slave_blocks(
     load_estimate: Array | None = None,
     load_covariance: Array | None = None,
     q_start: Array | None = None,
+    *,
+    custom_torque: bool = False,
 ) -> _SlaveBlocks:
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
@@ -188,14 +243,16 @@ def _add_slave_blocks(
     state = plant.get_state_output_port(slave.instance)
     builder.ExportOutput(state, "slave_state")
 
-    samples = 1 if q_start is not None else _servo_samples_per_event(scenario, slave)
-    ramps = samples > 1
-    control = builder.AddNamedSystem(
-        "joint_control",
-        SampledServo(slave, scenario.joint_control, 1 / rates.joint_control_hz, samples, start)
-        if ramps
-        else MakeJointControl(arm, scenario.joint_control, 1 / rates.joint_control_hz, start),
-    )
+    own_servo = q_start is None and not custom_torque
+    samples = _servo_samples_per_event(scenario, slave) if own_servo else 1
+    ramps, period = samples > 1, 1 / rates.joint_control_hz
+    if custom_torque:
+        servo: LeafSystem = HeldTorque(arm, period, start)
+    elif ramps:
+        servo = SampledServo(slave, scenario.joint_control, period, samples, start)
+    else:
+        servo = MakeJointControl(arm, scenario.joint_control, period, start)
+    control = builder.AddNamedSystem("joint_control", servo)
     held = samples / rates.joint_control_hz
     _check_friction(slave, min(held, scenario.simulation.max_step))
     torque = control.GetOutputPort("joint_torque")

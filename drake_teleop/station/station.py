@@ -29,6 +29,7 @@ def MakeTeleopStation(
     load_covariance: NDArray[np.float64] | None = None,
     noise_floor: NoiseFloor | None = None,
     master: System | None = None,
+    channel: System | None = None,
     slave: System | None = None,
 ) -> Diagram:
     """Build the bilateral station: master side, channel, slave side.
@@ -46,14 +47,16 @@ def MakeTeleopStation(
         noise_floor: noise of the wrench without the load's part in free motion, at the estimator's
             rate, for contact detection: `LoadIdentification.noise_floor`.
         master: custom system with the ports of `MakeMasterSide(scenario)`.
-        slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`; it ignores
-            load_estimate, load_covariance and noise_floor.
+        channel: custom system with the ports of `MakeChannel(scenario)`; the scenario's channel and
+            passivity are unused.
+        slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`, such as one with
+            another controller; load_estimate, load_covariance and noise_floor are unused.
 
     Raises:
         DrakeTeleopError: for an invalid value, or a custom side without a required port.
     """
     check_scenario(scenario)
-    for name, side in (("master", master), ("slave", slave)):
+    for name, side in (("master", master), ("channel", channel), ("slave", slave)):
         if side is not None:
             expect(System, side, name, "docs/station.md lists the ports that each side has")
     builder = DiagramBuilder()
@@ -68,13 +71,13 @@ def MakeTeleopStation(
     master = builder.AddNamedSystem("master_side", master or MakeMasterSide(scenario))
 
     sides = [master, slave]
-    if scenario.is_direct and scenario.contact_detection is None:
+    if channel is None and scenario.is_direct and scenario.contact_detection is None:
         # A Diagram of two wires would cost 3 % of the time.
         setpoint = "leader_joints" if scenario.master.leads_joints else "pose_command"
         wire(builder, master, setpoint, slave, setpoint)
         wire(builder, slave, "wrench_B", master, "wrench_command")
     else:
-        channel = builder.AddNamedSystem("channel", MakeChannel(scenario))
+        channel = builder.AddNamedSystem("channel", channel or MakeChannel(scenario))
         sides.append(channel)
         wire(builder, master, "pose_command", channel, "pose_command")
         wire(builder, channel, "pose_to_slave", slave, "pose_command")

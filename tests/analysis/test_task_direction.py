@@ -34,7 +34,7 @@ def test_axis_has_the_parameters_of_the_scenario():
     )
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
     estimate[6] += 0.1
-    axis = OneAxisFromScenario(scenario, (1, 0, 0), load_estimate=estimate)
+    axis = task_direction(scenario, (1, 0, 0), load_estimate=estimate).axis
     assert (axis.hand_mass, axis.hand_stiffness, axis.sigma, axis.position_scale) == (
         *(0.5, 700.0, 0.5, 2.0),
     )

@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia
 from pydrake.symbolic import Evaluate, MakeVectorVariable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
@@ -24,9 +28,14 @@ from drake_teleop.station.estimation import contact_detection, load_estimator
 from drake_teleop.station.master.force_display import display_into, initial_display
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
-from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master
+from drake_teleop.station.scaling.force_scaling import (
+    ForceScaling,
+    ForceScalingConfig,
+    wrench_to_master,
+)
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.sensor.plant_wrist_sensor import AddWristSensor
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
@@ -374,3 +383,104 @@ def test_blocks_are_freed(name):
     del block
     gc.collect()
     assert gone() is None
+
+
+def beside_a_plant(name: str, time_step: float):
+    """Return block, sensor and simulator of a Diagram with a swinging arm of two joints."""
+    builder = DiagramBuilder()
+    plant = builder.AddNamedSystem("plant", MultibodyPlant(time_step))
+    end = plant.world_frame()
+    for k in range(2):
+        link = plant.AddRigidBody(f"link_{k}", SpatialInertia.SolidSphereWithMass(2.0, 0.1))
+        plant.AddJoint(RevoluteJoint(f"joint_{k}", end, link.body_frame(), [k, 1 - k, 0.0]))
+        offset = FixedOffsetFrame(f"end_{k}", link.body_frame(), RigidTransform([0.2, 0.0, 0.1]))
+        end = plant.AddFrame(offset)
+    gripper = plant.AddRigidBody("gripper", SpatialInertia.SolidSphereWithMass(2.0, 0.1))
+    weld = plant.WeldFrames(end, gripper.body_frame())
+    plant.Finalize()
+    sensor = AddWristSensor(builder, plant, weld, period=T)
+    block = builder.AddNamedSystem(name, EXAMPLES[name]())
+    phi = np.array([2.0, 0, 0, 0, 8e-3, 0, 0, 8e-3, 0, 8e-3])  # 2/5 m r^2
+    values = {"load_estimate": np.concatenate([np.zeros(6), phi]), "load": phi, "clutch": [1.0]}
+    values |= {"R_WS": np.eye(3).ravel()} | dict.fromkeys(
+        ("pose_master", "pose_command", "pose_slave"), START
+    )
+    for k in range(block.num_input_ports()):
+        port = block.get_input_port(k)
+        if sensor.HasOutputPort(port.get_name()) and port.get_name() != "joint_position":
+            source = sensor.GetOutputPort(port.get_name())
+        else:
+            value = values.get(port.get_name(), np.zeros(port.size()))
+            source = builder.AddSystem(ConstantVectorSource(value)).get_output_port()
+        builder.Connect(source, port)
+    return block, sensor, Simulator(builder.Build())
+
+
+@pytest.mark.parametrize("time_step", [0.0, T], ids=["continuous plant", "discrete plant"])
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_block_works_beside_a_plant(name, time_step):
+    block, sensor, simulator = beside_a_plant(name, time_step)
+    simulator.AdvanceTo(0.05)
+    context = block.GetMyContextFromRoot(simulator.get_context())
+    found = {
+        port.get_name(): port.Eval(context)
+        for port in map(block.get_output_port, range(block.num_output_ports()))
+    }
+    assert found and all(np.isfinite(value).all() for value in found.values())
+    measured = output(sensor, sensor.GetMyContextFromRoot(simulator.get_context()), "sample")[:6]
+    assert np.linalg.norm(measured[:3]) > 5.0
+    if name == "NonContactWrench":
+        np.testing.assert_allclose(found["non_contact_wrench_S"], measured, atol=1e-9)
+    elif name == "WrenchScaling":
+        np.testing.assert_allclose(found["contact_wrench_S"], 0.0, atol=1e-9)
+    elif name == "LoadEstimator":
+        assert np.abs(found["load_estimate"]).max() > 0.1  # it has learnt
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_script_sets_and_reads_state_parameters_and_inputs(name):
+    block = EXAMPLES[name]()
+    context = block.CreateDefaultContext()
+    vectors = [
+        context.get_mutable_discrete_state(k) for k in range(context.num_discrete_state_groups())
+    ]
+    vectors += [
+        context.get_mutable_numeric_parameter(k)
+        for k in range(context.num_numeric_parameter_groups())
+    ]
+    for vector in vectors:
+        value = vector.CopyToVector() + 0.5
+        vector.SetFromVector(value)
+        np.testing.assert_array_equal(vector.value(), value)
+    for k in range(block.num_input_ports()):
+        port = block.get_input_port(k)
+        port.FixValue(context, 0.1 * np.arange(port.size()))
+        np.testing.assert_array_equal(port.Eval(context), 0.1 * np.arange(port.size()))
+    assert vectors or name == "WrenchScaling"  # whose only settings are those of its constructor
+
+
+@pytest.mark.slow
+def test_plain_and_joined_ports_give_the_same_scaled_wrench_over_many_samples():
+    """10^4 random samples: `WrenchScaling` against the `ForceScaling` of the station."""
+    rng = np.random.default_rng(6)
+    arm = NominalSlave(Slave()).arm
+    plain, joined = blocks.WrenchScaling(CONFIG), ForceScaling(CONFIG, arm, np.eye(3))
+    estimate, R_WS, p_WS = np.concatenate([OFFSETS, PHI]), np.empty((3, 3)), np.empty(3)
+    one, two = plain.CreateDefaultContext(), joined.CreateDefaultContext()
+    plain.GetInputPort("load_estimate").FixValue(one, estimate)
+    joined.GetInputPort("load_estimate").FixValue(two, estimate)
+    names = ("contact_wrench_S", "scaled_wrench_S", "wrench_to_master")
+    worst = 0.0
+    for _ in range(10_000):
+        values = [20 * rng.normal(size=6), *(4 * rng.normal(size=(3, 3)))]
+        q = rng.uniform(-2.0, 2.0, 6)
+        forward_kinematics(arm.table, q, R_WS, p_WS)
+        for name, value in zip(("measured_wrench_S", *MOTION), values, strict=True):
+            plain.GetInputPort(name).FixValue(one, value)
+        plain.GetInputPort("R_WS").FixValue(one, R_WS.ravel())
+        joined.GetInputPort("sample").FixValue(two, np.concatenate([*values, [0.0], q, [0.0]]))
+        found = np.concatenate([output(plain, one, name) for name in names])
+        ports = *names[:2], "wrench_B"
+        expected = np.concatenate([output(joined, two, name) for name in ports])
+        worst = max(worst, np.abs(found - expected).max())
+    assert worst < 1e-12 * 300.0  # relative to the largest wrench [N, N m]

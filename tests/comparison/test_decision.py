@@ -12,7 +12,7 @@ from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_
 def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:
     """Return a good result of one method on two leaves, with changes to the second."""
     good = {"method": "tdpa", "network": "lan", "stable": True, "felt_force": 3.9}
-    good |= {"pressed_force": 4.0, "left_behind": 1e-3, "leaked": 0.0}
+    good |= {"pressed_force": 4.0, "left_behind": 1e-3, "leaked": 0.0, "fast_force": 0.049}
     good |= {"hunting": 1e-5, "turning": 1e-4}
     return {
         "methods": ["tdpa"],
@@ -30,7 +30,8 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
         ({"leaked": 0.9e-3, "left_behind": 4.9e-3}, "holds", "98%"),
         ({"leaked": 0.01234}, "leaks 12 mJ", "98%"),
         ({"hands_leaked": 2.345}, "leaks 2.3 J", "98%"),
-        ({"hands_leaked": 1.0, "left_behind": 5.1e-3}, "left behind", "98%"),
+        ({"hands_leaked": 1.0, "fast_force": 0.051}, "chatters", "98%"),
+        ({"fast_force": 1.0, "left_behind": 5.1e-3}, "left behind", "98%"),
         ({"stable": False, "left_behind": 1.0, "leaked": 1.0}, "unstable", ""),
         # A run that ended early.
         (

@@ -351,7 +351,7 @@ def test_unmodelled_contact_is_not_linearised():
             r"environment\[0\].normal: has no direction",
         ),
         ({"_tag": "!Wall", "stiffness": 0.0}, r"environment\[0\].stiffness: 0 N/m is outside"),
-        ({"_tag": "!Wal"}, r"environment\[0\]: '!Wal' is not known; use one of !Wall"),
+        ({"_tag": "!Wal"}, r"environment\[0\]: '!Wal' is not known; did you mean 'Wall'"),
         ({"_tag": "!Block", "table": [0.05, 0.05]}, "smaller than the block"),
     ],
 )

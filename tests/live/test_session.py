@@ -154,7 +154,7 @@ def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, lo
         return session.removed_force()
 
     assert simulate(500, z=-4000) == 0.0
-    assert simulate(1000, network=2, method=METHODS.index("force_limit")) == 0.0
+    assert simulate(1000, network=2, method=list(METHODS).index("force_limit")) == 0.0
     removed = simulate(1000, method=0)
     assert rendered[-1] == pytest.approx(rendered[-2] + 0.9, abs=1e-9)
     assert rendered[-1] + removed == pytest.approx(rendered[0], rel=0.02) and removed > 1.0
@@ -301,7 +301,7 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
         (HEADER + row(5, Inputs()), "5 ms is not a valid time"),
         (HEADER + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is not a valid time"),
         (HEADER + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":4.*x = 1000000 is outside"),
-        (HEADER + "0,1\n", "has 2 values, not 22"),
+        (HEADER + "0,1\n", "has 2 values, not 23"),
         (HEADER + row(0, Inputs()).replace("0,", "a,", 1), "a value that is not a whole number"),
         (
             HEADER + row(0, Inputs()).replace("none", "share"),
@@ -343,4 +343,21 @@ def test_incomplete_last_line_is_ignored(tmp_path):
     path = tmp_path / INPUTS
     path.write_text(HEADER + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
     assert read_inputs(path, MADE_BY) == [(0, Inputs()), (5, Inputs(x=3))]
-    assert len(RANGES) == 21
+    assert len(RANGES) == 22
+
+
+def test_weight_has_its_own_share_and_follows_the_inertia_at_minus_one(scenario, load):
+    apart = replace(scenario, force_scaling__sigma_weight=0.5, force_scaling__sigma_inertia=0.25)
+    assert Inputs.of(scenario).sigma_weight == -1 and Inputs().scales["sigma_weight"] is None
+    inputs = Inputs.of(apart)
+    assert (inputs.sigma, inputs.sigma_weight, inputs.scales["sigma_weight"]) == (25, 50, 0.5)
+    session = Session(scenario, load)
+    felt = {}
+    for weight in (0, 100):
+        session.apply(session.inputs.changed({"sigma": 0, "sigma_weight": weight}))
+        session.advance(150)
+        felt[weight] = session.new_rows()["force_to_master"][-1, 2]
+    session.close()
+    # 3.13 kg at rest, on the scale of the master
+    scale = scenario.force_scaling.force_scale
+    assert abs((felt[100] - felt[0]) / scale) == pytest.approx(3.13 * 9.81, rel=0.02)

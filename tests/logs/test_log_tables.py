@@ -62,7 +62,7 @@ def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> No
         ("x.csv", "", ["a"], ["cannot be read"]),
         ("x.parquet", "no parquet", ["a"], ["cannot be read", "valid .parquet"]),
         ("x.npz", "no npz", ["a"], ["cannot be read"]),
-        ("x.xls", "", ["a"], ["'.xls' is not known", ".parquet"]),
+        ("x.xls", "", ["a"], ["no log format '.xls'", ".xlsx"]),
     ],
 )
 def test_errors_name_file_and_remedy(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.comparison.one_dof import (
-    AT_THE_MOTOR,
     PERIOD,
     OneDof,
     Task,
@@ -111,7 +110,7 @@ def test_motion_during_silence_is_not_replayed(tmp_path, method):
     fast = np.abs(np.diff(result.master)).max() + 15 / 8 * missed / RESUME_TIME * PERIOD
     back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME_TIME))[:-1]
     assert np.abs(np.diff(result.slave))[back].max() < fast
-    if method not in AT_THE_MOTOR:  # there the command is a pull, written as a pose
+    if not METHODS[method].balance_at_motors:  # there the command is a pull, written as a pose
         assert np.abs(np.diff(result.command))[back].max() < fast
     assert np.abs(np.diff(result.command)).max() < 5e-3
 

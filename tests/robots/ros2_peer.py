@@ -51,7 +51,7 @@ def pose_message(t, values):
 def wait_for(publisher):
     while publisher.get_subscription_count() == 0:
         time.sleep(0.01)
-    time.sleep(0.1)
+    time.sleep(1.0)  # until the other side knows, too
 
 
 def faults(domain):

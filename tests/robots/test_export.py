@@ -197,7 +197,7 @@ def test_inconsistent_load_and_wrong_target_raise_one_line():
         export(dataclasses.replace(FOUND, phi=-FOUND.phi), "ur")
     with pytest.raises(DrakeTeleopError, match="kth takes its values in the sensor's frame"):
         export(FOUND, "kth", **TURNED)
-    with pytest.raises(DrakeTeleopError, match=r"'kuka' is not a target.*ur, franka"):
+    with pytest.raises(DrakeTeleopError, match=r"there is no export format 'kuka'.*ur, franka"):
         export(FOUND, "kuka")
 
 
@@ -218,7 +218,7 @@ def test_command_prints_text_and_warnings(tmp_path, capsys):
         )
         assert printed.err.splitlines() == [f"warning: {text}" for text in warnings]
     (choice,) = (p.type for p in cli.commands["export"].params if p.name == "to")
-    assert tuple(choice.choices) == tuple(FORMATS)
+    assert tuple(choice.choices) == (*FORMATS, "c99", "fmu", "ros2_filter")
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))

@@ -227,15 +227,14 @@ def can_oscillate(
     return crossing | hand.contains(-felt, omega) | environment.contains(wanted, omega)
 
 
-def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: float = 0.0) -> Real:
+def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange) -> Real:
     """Return the softest wall [N/m] with which some hand of the range oscillates, per omega.
 
-    Walls below the minimum over omega keep all hands stable that are stable without wall. `damping`
-    is the wall's [N s/m].
+    Walls below the minimum over omega keep all hands stable that are stable without wall.
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
     z = hand.corners(omega)
-    wall: Complex = np.array(damping, dtype=complex)
+    wall: Complex = np.zeros((), dtype=complex)
     stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
     t, u = _edge_crossings(h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer)
     limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))

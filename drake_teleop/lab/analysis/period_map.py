@@ -1,19 +1,19 @@
-"""Sampled one-axis model of the station over the common period of its rates.
+"""Sampled one-axis model of the station over a period of the hand.
 
 Order of events; all updates at one instant read earlier values:
 
 * The device advances by one hand period with held force; the other blocks read its prediction.
 * The servo reads the command and the slave's state; its force is held.
 * The sensor samples just before the servo's update; its low-pass is digital.
-* A channel with a delay of d hand periods returns its input of d periods ago.
+* A channel with a delay of d hand periods returns its input of d periods ago (`cut_loop`).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -48,30 +48,14 @@ def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
 
 
 def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the map (..., n + 3, n + 3) over one hand period, for the cut loop without delay.
+    """Return the matrix over one hand period, for the loop cut at the received force.
+
+    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force; it has no
+    delay.
 
     Raises:
-        DrakeTeleopError: if the rate of servo or sensor is no whole multiple of the hand's rate.
-    """
-    M, periods = period_map(axis, sampling, 0, cut=True)
-    if periods != 1:
-        raise DrakeTeleopError(
-            "the hand's period is not the period of all rates",
-            where="sampling",
-            remedy="let servo and sensor run a whole number of times faster",
-        )
-    return M
-
-
-def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> tuple[Array, int]:
-    """Return the matrix over the common period of all rates, and the hand periods in it.
-
-    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force. `steps`:
-    one-way delay in hand periods; `cut`: the received force is an input.
-
-    Raises:
-        DrakeTeleopError: for an ideal servo, rates without short common period, or a low-pass not
-            below half the sensor's rate.
+        DrakeTeleopError: for an ideal servo, if the rate of servo or sensor is no whole multiple of
+            the hand's rate, or if the low-pass is not below half the sensor's rate.
     """
     if axis.ideal_servo:
         raise DrakeTeleopError(
@@ -79,40 +63,32 @@ def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> t
             where="axis.ideal_servo",
             remedy="give it high gains, or use the continuous model",
         )
-    periods, events = _events(sampling)
+    servo_samples, sensor_samples = (
+        _samples(sampling, name) for name in ("joint_control_hz", "sensor_hz")
+    )
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
     sections = _sections(sampling)
-    first_line = FILTER + 2 * sections.shape[-2]
-    n = first_line + 2 * steps
+    n = FILTER + 2 * sections.shape[-2]
     rows = _Rows(axis, n + 3)
-    command = first_line + steps - 1 if steps else X_M
-    received = RECEIVED if cut else (n - 1 if steps else SAMPLE)
-    hand, servo, sensor = (
-        rows.hand(hand_period, received),
-        rows.servo(command),
-        rows.sensor(sections),
-    )
-    gaps = {gap for gap, *_ in events}
-    flows = {gap: rows.slave(float(gap) * hand_period) for gap in gaps}
+    hand, servo, sensor = rows.hand(hand_period), rows.servo(), rows.sensor(sections)
+    times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
+    gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
+    flows = {gap: rows.slave(float(gap) * hand_period) for gap in set(gaps)}
     shape = np.broadcast_shapes(
         *(part.shape[:-2] for part in (hand, servo, sensor, *flows.values()))
     )
     M = np.broadcast_to(np.eye(n + 3), (*shape, n + 3, n + 3)).copy()
-    for gap, at_hand, at_servo, at_sensor in events:
+    for time, gap in zip(times, gaps, strict=True):
         new = M.copy()
-        if at_hand:
+        if time == 0:
             new[..., [X_M, V_M], :] = hand @ M
-            for line, source in ((first_line, X_M), (first_line + steps, SAMPLE)):
-                if steps:
-                    new[..., line, :] = M[..., source, :]
-                    new[..., line + 1 : line + steps, :] = M[..., line : line + steps - 1, :]
-        if at_servo:
+        if (time * servo_samples).denominator == 1:
             new[..., [SERVO], :] = servo @ M
-        if at_sensor:
-            new[..., SAMPLE:first_line, :] = sensor @ M
+        if (time * sensor_samples).denominator == 1:
+            new[..., SAMPLE:n, :] = sensor @ M
         M = new
         M[..., [X_S, V_S], :] = flows[gap] @ M
-    return M, periods
+    return M
 
 
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
@@ -148,43 +124,18 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     return np.moveaxis(H, 2, 0)
 
 
-def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    hand = np.asarray(sampling.hand_hz, dtype=float)
-    ratios = []
-    for name in ("joint_control_hz", "sensor_hz"):
-        ratio = np.unique(np.asarray(getattr(sampling, name) / hand, dtype=float))
-        exact = Fraction(float(ratio[0])).limit_denominator(100)
-        if exact <= 0 or np.ptp(ratio) > 1e-9 * ratio[0] or abs(exact - ratio[0]) > 1e-9 * ratio[0]:
-            raise DrakeTeleopError(
-                f"{name} is not in a simple ratio to hand_hz",
-                where=f"sampling.{name}",
-                remedy="choose rates whose ratios are ratios of small whole numbers",
-            )
-        ratios.append(exact)
-    return _schedule(*ratios)
-
-
-@cache
-def _schedule(
-    servo: Fraction, sensor: Fraction
-) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    lengths = [Fraction(1), 1 / servo, 1 / sensor]
-    common = Fraction(
-        math.lcm(*(length.numerator for length in lengths)),
-        math.gcd(*(length.denominator for length in lengths)),
-    )
-    times = sorted({i * length for length in lengths for i in range(int(common / length))})
-    if len(times) > _MAX_EVENTS:
+def _samples(sampling: Sampling, name: str) -> int:
+    """Return the number of samples of servo or sensor in a hand period."""
+    hand_hz = np.asarray(sampling.hand_hz, dtype=float)
+    ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
+    count = round(float(ratios.flat[0]))
+    if not (1 <= count <= _MAX_EVENTS and (np.abs(ratios - count) <= 1e-9 * count).all()):
         raise DrakeTeleopError(
-            f"the rates take {float(common):g} hand periods to meet again",
-            where="sampling",
-            remedy="choose rates whose ratios are ratios of small whole numbers",
+            f"{name} is no whole multiple of hand_hz",
+            where=f"sampling.{name}",
+            remedy=f"let servo and sensor run 1 to {_MAX_EVENTS} times as fast as the hand",
         )
-    ends = [*times[1:], common]
-    return int(common), [
-        (end - time, *(time % length == 0 for length in lengths))  # type: ignore[misc]
-        for time, end in zip(times, ends, strict=True)
-    ]
+    return count
 
 
 def _sections(sampling: Sampling) -> Array:
@@ -218,7 +169,7 @@ class _Rows:
     def _environment(self) -> dict[int, Any]:
         return {X_S: self._axis.wall_stiffness, V_S: self._axis.wall_damping, _ENVIRONMENT: 1.0}
 
-    def hand(self, period: Array, received: int) -> Array:
+    def hand(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
         x, v, push = _held_response(0.0, axis.device_damping / mass, period)
@@ -227,15 +178,15 @@ class _Rows:
             V_M: -axis.hand_damping / mass,
             _HAND: 1 / mass,
         }
-        force = self._row(hand_force) + self._row({received: -1 / mass})
+        force = self._row(hand_force) + self._row({RECEIVED: -1 / mass})
         ahead = [force * push[..., i, None] for i in range(2)]
         for i in range(2):
             ahead[i] = ahead[i] + self._row({X_M: x[..., i], V_M: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
 
-    def servo(self, command: int) -> Array:
+    def servo(self) -> Array:
         kv, kp = self._axis.velocity_gain, self._axis.position_gain
-        row = self._row({command: kv * kp * self._axis.position_scale})
+        row = self._row({X_M: kv * kp * self._axis.position_scale})
         return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
 
     def sensor(self, sections: Array) -> Array:

@@ -43,17 +43,9 @@ class TaskDirection:
     tool_coupling: float
 
 
-def OneAxisFromScenario(
-    scenario: Scenario,
-    direction: Sequence[float],
-    *,
-    load_estimate: Array | None = None,
-    displacement: Sequence[float] = (0.0, 0.0, 0.0),
-) -> OneAxis:
+def OneAxisFromScenario(scenario: Scenario, direction: Sequence[float]) -> OneAxis:
     """Return the one-axis parameters of a scenario along a direction in W; see `task_direction`."""
-    return task_direction(
-        scenario, direction, load_estimate=load_estimate, displacement=displacement
-    ).axis
+    return task_direction(scenario, direction).axis
 
 
 def task_direction(

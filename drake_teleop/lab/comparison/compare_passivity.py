@@ -9,8 +9,9 @@ decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_
           leaked_J. If unstable, these are empty or null
 station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with the energy between
           hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
-          left_behind [m]; leaked [J]. A run that is not at rest in its hold ends there
-          (left_behind and drift are null); `error` says why a run ended early (others are null)
+          left_behind [m]; leaked [J]; fast_force, rms above 5 Hz in the hold [N]. A run that is
+          not at rest in its hold ends there (left_behind and drift are null); `error` says why a
+          run ended early (others are null)
 hands     list: method, network, fields of `release_and_taps.ReleaseAndTaps`
 one_dof   list: method, wall_N_per_m, jitter, loss; longest_s, up to which all round trips of
           grid_s were stable (0: none)
@@ -55,6 +56,7 @@ from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_ta
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
+from drake_teleop.station.oscillation import fast_part
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, steps_of
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
@@ -84,7 +86,7 @@ def compare_command(
     out: Path,
     *,
     networks: Sequence[str] = NETWORKS,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] | None = None,
     scenario: str | Path = "contact_transition",
     seed: int = 0,
     jobs: int = -1,
@@ -94,7 +96,7 @@ def compare_command(
     """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
 
     Args:
-        networks, methods: names of networks and passivity methods.
+        networks, methods: names of networks and passivity methods; None: all methods.
         scenario: shipped name or YAML file; its rates, integrator and environment are not used.
         seed: seed of sensor noise and networks.
         jobs: number of processes; -1: one for each core.
@@ -103,8 +105,14 @@ def compare_command(
     Returns:
         The content of summary.json; the module lists it.
     """
-    _check_names("network", networks, tuple(PRESETS))
-    _check_names("method", methods, METHODS)
+    for name in networks:
+        if name not in PRESETS:
+            remedy = suggestion(name, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
+            what = f"there is no network '{name}'"
+            raise DrakeTeleopError(what, where="networks", remedy=remedy)
+    methods = tuple(METHODS) if methods is None else methods
+    for name in methods:
+        METHODS.check(name, "methods")
     make_folder(out)  # before the work, so that a bad path fails early
     with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
@@ -182,7 +190,7 @@ def station_run(
     """
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]
-    names += ["pressed_force", "felt_share", "left_behind", "leaked"]
+    names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
@@ -194,7 +202,9 @@ def station_run(
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
+    fast = fast_part(result.t[held], result["force_to_master"][held, :3])
     additional = {
+        "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),
         "felt_share": max(1 + found.force_error, 0.0),
         "left_behind": abs(found.drift),
@@ -328,16 +338,6 @@ def _run_parallel(
         results.append(result)
         progress(len(results) / len(cases))
     return results
-
-
-def _check_names(what: str, requested: Sequence[str], known: Sequence[str]) -> None:
-    for name in requested:
-        if name not in known:
-            raise DrakeTeleopError(
-                f"there is no {what} '{name}'",
-                where=f"{what}s",
-                remedy=suggestion(name, known, f"choose among {', '.join(known)}"),
-            )
 
 
 def _finite_or_none(figures: dict[str, Any]) -> dict[str, Any]:

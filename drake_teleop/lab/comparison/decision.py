@@ -5,6 +5,7 @@ the runs of `release_and_taps`)::
 
     unstable      the station does not come to rest, or the run ended early
     left behind   the slave is more than 5 mm from the master 2 s after contact
+    chatters      the rendered force in the hold has more than 0.05 N rms above 5 Hz
     leaks         more than 1 mJ came out between hand and actual motion, beyond the energy put in
                   and stored at the start
     holds         otherwise
@@ -17,8 +18,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from drake_teleop.lab.comparison.one_dof import TIP
+from drake_teleop.station.oscillation import MAX_FAST_FORCE_N
 
-UNSTABLE, LEFT_BEHIND, LEAKS, HOLDS = "unstable", "left behind", "leaks", "holds"
+UNSTABLE, LEFT_BEHIND, CHATTERS = "unstable", "left behind", "chatters"
+LEAKS, HOLDS = "leaks", "holds"
 MAX_DRIFT_M, MIN_LEAK_J = 5e-3, 1e-3  #: m; J
 
 
@@ -69,6 +72,8 @@ def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
         return Cell(LEFT_BEHIND, forces, leaked=leaked)
+    if max(run["fast_force"] for run in runs) > MAX_FAST_FORCE_N:
+        return Cell(CHATTERS, forces, leaked=leaked)
     return Cell(LEAKS if leaked > MIN_LEAK_J else HOLDS, forces, leaked=leaked)
 
 

@@ -26,7 +26,7 @@ from drake_teleop.station.channel.channel import (
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.memory import LEDGER
-from drake_teleop.station.passivity.methods import AT_THE_MOTOR, PassivityConfig
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 PERIOD = 1e-3  #: period of the channel [s]
@@ -214,7 +214,7 @@ def run_one_dof(
     course = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in inputs]
     # These methods use the motor's force, which is held over a period; the others interpolate the
     # command over it.
-    held = passivity.method in AT_THE_MOTOR and not model.ideal_servo
+    held = METHODS[passivity.method].balance_at_motors and not model.ideal_servo
     rows = _simulate(
         methods.steps_of(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
         ends, start, timeout, np.concatenate(course, axis=1),

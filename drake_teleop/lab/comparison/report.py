@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from drake_teleop.common.files import write_picture, write_text
 from drake_teleop.common.html import embedded, render
 from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, plot_style
-from drake_teleop.lab.comparison.decision import HOLDS, LEAKS, LEFT_BEHIND, UNSTABLE, decide
+from drake_teleop.lab.comparison.decision import (
+    CHATTERS,
+    HOLDS,
+    LEAKS,
+    LEFT_BEHIND,
+    UNSTABLE,
+    decide,
+)
 from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
 from drake_teleop.station.channel.network import PRESETS
 
@@ -25,6 +32,7 @@ COLUMNS = (
     ("felt_force", "Felt [N]", 1.0, 2),
     ("felt_share", "Felt share [%]", 1e2, 1),
     ("chatter", "Chatter [N]", 1.0, 2),
+    ("fast_force", "Above 5 Hz [N]", 1.0, 3),
     ("left_behind", "Left behind [mm]", 1e3, 2),
     ("free_force", "Free force [N]", 1.0, 2),
     ("rise_delay", "Rise delay [ms]", 1e3, 0),
@@ -35,6 +43,7 @@ COLUMNS = (
 VERDICTS = {
     HOLDS: ("✓", "#CBE4F4", BLACK),
     LEAKS: ("⚠", "#FBEBB8", BLACK),
+    CHATTERS: ("≈", "#F7D39B", BLACK),
     LEFT_BEHIND: ("↷", "#F0B878", BLACK),
     UNSTABLE: ("✗", "#565C66", "white"),
 }

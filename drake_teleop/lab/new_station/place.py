@@ -144,7 +144,6 @@ def find_place(
     *,
     plane: float = 0.0,
     axis: str = "z",
-    seed: int = 0,
 ) -> Place:
     """Find a start with the tool down and reachable space in all directions.
 
@@ -159,7 +158,7 @@ def find_place(
     R_SA = TOOL_AXES[axis]
     pointed = with_tool_axis(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
-    postures, region = suitable(random_postures(pointed, seed), plane, length)
+    postures, region = suitable(random_postures(pointed), plane, length)
     postures = _strong_ones(pointed, postures)
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = [

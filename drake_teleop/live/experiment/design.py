@@ -44,7 +44,7 @@ class Condition:
         "network between master and slave",
     )
     delay: float | None = quantity(None, "s", 0.0, 2.0, "delay of one way, in place of a network")
-    method: str = choice(OWN, (OWN, *METHODS), "passivity method")
+    method: str = choice(OWN, (OWN,), "passivity method", METHODS)
 
 
 @dataclass

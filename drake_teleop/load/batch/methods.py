@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, checked_rows, number
+from drake_teleop.common.registry import Registry
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import (
     Fit,
@@ -161,22 +162,19 @@ class Method(NamedTuple):
     fit: Callable[[Record, Options], Fit]
 
 
-METHODS = {
-    "ordinary": Method("batch least squares", _ordinary),
-    "whitened": Method("whitened least squares", _whitened),
-    "robust": Method("robust least squares", _robust),
-    "total": Method("total least squares", _total),
-    "consistent": Method("physically consistent least squares", _consistent),
-}
-"""Estimators by name; add a line for a new one."""
+METHODS = Registry(
+    "estimator",
+    {
+        "ordinary": Method("batch least squares", _ordinary),
+        "whitened": Method("whitened least squares", _whitened),
+        "robust": Method("robust least squares", _robust),
+        "total": Method("total least squares", _total),
+        "consistent": Method("physically consistent least squares", _consistent),
+    },
+)
+"""Estimators by name."""
 
 DEFAULT_METHOD = "consistent"
-
-
-def check_method(method: str) -> None:
-    """Raise DrakeTeleopError unless `method` names a batch estimator (`METHODS`)."""
-    if not isinstance(method, str) or method not in METHODS:
-        raise DrakeTeleopError(f"{method!r} is not one of {sorted(METHODS)}", where="method")
 
 
 def identify_batch(
@@ -199,7 +197,7 @@ def identify_batch(
 
     Args:
         wrench, s, omega, alpha, delay_s: as for `normal_equations.identify`, in the order of time.
-        method: "ordinary", "whitened", "total", "robust" or "consistent".
+        method: "ordinary", "whitened", "total", "robust", "consistent" or a registered name.
         noise: of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
         shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
@@ -210,7 +208,7 @@ def identify_batch(
     Raises:
         DrakeTeleopError: for unsuitable options, fewer than 3 samples, or a zero wrench.
     """
-    check_method(method)
+    METHODS.check(method, "method")
     expect((Noise, type(None)), noise, "noise")
     if not number("gain_std", gain_std) >= 0.0:
         raise DrakeTeleopError("is negative", where="gain_std")

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, checked
+from drake_teleop.common.registry import Registry
 from drake_teleop.load.moments import coefficients
 from drake_teleop.load.online.recursive import (
     PRIOR_STD,
@@ -421,8 +422,7 @@ def _cholesky(A: Array) -> Array:
     return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))
 
 
-METHODS: dict[str, type[RecursiveEstimator]] = {
-    "rls": RecursiveLeastSquares,
-    "rtls": RecursiveTotalLeastSquares,
-}
-"""Recursive estimators by name; add a line for a new one."""
+METHODS: Registry[type[RecursiveEstimator]] = Registry(
+    "recursive estimator", {"rls": RecursiveLeastSquares, "rtls": RecursiveTotalLeastSquares}
+)
+"""Recursive estimators by name."""

@@ -47,7 +47,7 @@ _ROW_SHAPES: dict[str, tuple[int, ...]] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Log:
     """Wrench and motion of the sensor frame S: N samples on one clock, SI units.
 
@@ -113,6 +113,12 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def __repr__(self) -> str:
+        kind = "poses at rest" if self.static else f"samples, {self.t[0]:g} to {self.t[-1]:g} s"
+        largest = np.linalg.norm(self.wrench[:, :3], axis=1).max()
+        lines = [f"Log {self.source}: {len(self)} {kind}, force up to {largest:.3g} N"]
+        return "\n  ".join([*lines, *self.notes])
 
     @cached_property
     def dt(self) -> float:

@@ -10,7 +10,7 @@ import math
 import os
 import zipfile
 from collections import UserDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
 from drake_teleop.common.parquet_sizes import check_parquet
+from drake_teleop.common.registry import Registry
 from drake_teleop.logs.read.array_files import read_mat
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.tables import Table
@@ -27,10 +28,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
-_FRAMES = (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx")
-_ARRAYS = (".npz", ".npy", ".mat", ".h5", ".hdf5", ".zarr")
-FORMATS = (*_TEXT, *_FRAMES, *_ARRAYS)
-"""Suffixes of files that `read_table` reads."""
 _CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _Column = TypeVar("_Column")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
@@ -43,29 +40,19 @@ def read_table(path: Path, *, header: bool = True) -> Table:
 
     Without a header the columns of a text file are named from "0" on.
     """
-    kind = path.suffix.lower()
-    if kind not in FORMATS:
-        raise DrakeTeleopError(
-            f"format {path.suffix!r} is not known",
-            where=str(path),
-            remedy=f"convert it to one of {', '.join(FORMATS)}",
-        )
+    kind = FORMATS.check(path.suffix.lower(), str(path))
     if not (os.path.isdir if kind == ".zarr" else os.path.isfile)(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     refuse_fork()
     with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
-        if kind in _ARRAYS:
-            table = _table_from_arrays(path, _read_arrays(path))
-        elif kind in _FRAMES:
-            table = Table(path, _frame_columns(path))
-        else:
-            table = _read_text(path, header)
+        columns = _read_text(path, header) if kind in _TEXT else FORMATS[kind](path)
+        table = columns if isinstance(columns, Table) else Table(path, columns)
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
     return table
 
 
-def _read_text(path: Path, header: bool) -> Table:
+def _read_text(path: Path, header: bool = True) -> Table:
     frame, first_row = read_csv(path, header)
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_to_numpy(series) for series in frame.get_columns()]
@@ -193,7 +180,8 @@ def _to_numpy(series: pl.Series) -> NDArray:
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
 
-def _table_from_arrays(path: Path, arrays: dict[str, NDArray]) -> Table:
+def array_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Return arrays (N, ...) by name as columns, also their elements as `name[k]`."""
     arrays = {name: array for name, array in arrays.items() if len(array)}
     parts = {
         f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
@@ -201,19 +189,19 @@ def _table_from_arrays(path: Path, arrays: dict[str, NDArray]) -> Table:
         for k in range(math.prod(array.shape[1:]) if 1 < array.ndim <= 3 else 0)
         if k < _MAX_ELEMENT_COLUMNS
     }
-    return Table(path, parts | arrays)
+    return parts | arrays
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray]:
-    from drake_teleop.logs.read.array_files import read_hdf5, read_zarr
+def _read_hdf5(path: Path) -> dict[str, NDArray]:
+    from drake_teleop.logs.read.array_files import read_hdf5
 
-    readers: dict[str, Callable[[Path], dict[str, NDArray]]] = {
-        ".npz": _read_npz,
-        ".npy": _read_npy,
-        ".mat": read_mat,
-        ".zarr": read_zarr,
-    }
-    return readers.get(path.suffix.lower(), read_hdf5)(path)
+    return read_hdf5(path)
+
+
+def _read_zarr(path: Path) -> dict[str, NDArray]:
+    from drake_teleop.logs.read.array_files import read_zarr
+
+    return read_zarr(path)
 
 
 def _read_npz(path: Path) -> dict[str, NDArray]:
@@ -231,3 +219,28 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
     if array.ndim != 2:
         raise ValueError(f"it has {array.ndim} axes; give an array of rows and columns")
     return {str(k): array[:, k] for k in range(array.shape[1])}
+
+
+_Arrays = Callable[[Path], dict[str, NDArray]]
+
+
+def _arrays(read: _Arrays) -> _Arrays:
+    return lambda path: array_columns(read(path))
+
+
+FORMATS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(
+    "log format",
+    {
+        **dict.fromkeys(_TEXT, _read_text),
+        **dict.fromkeys(
+            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _frame_columns
+        ),
+        ".npz": _arrays(_read_npz),
+        ".npy": _arrays(_read_npy),
+        ".mat": _arrays(read_mat),
+        ".h5": _arrays(_read_hdf5),
+        ".hdf5": _arrays(_read_hdf5),
+        ".zarr": _arrays(_read_zarr),
+    },
+)
+"""Readers of files by suffix; a reader returns columns by name."""

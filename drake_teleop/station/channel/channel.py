@@ -391,7 +391,7 @@ class TeleopChannel(LeafSystem):
         ]
         parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
         self._steps = methods.steps_of(passivity.method)
-        self._uses_load = passivity.method == "ledger"
+        self._uses_load = methods.METHODS[passivity.method].needs_load_apart
         self._constants = (
             *(
                 period,

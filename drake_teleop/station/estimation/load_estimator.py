@@ -38,7 +38,7 @@ class LoadEstimatorConfig:
     )
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
     method: str = choice(
-        "rls", tuple(METHODS), "recursive least squares, or total: allows for noisy accelerations"
+        "rls", (), "recursive least squares, or total: allows for noisy accelerations", METHODS
     )
     settled_bound: float = quantity(
         0.05,

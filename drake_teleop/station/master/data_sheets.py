@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.registry import Registry
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINTS, Leader
@@ -118,10 +119,13 @@ _COLUMNS = (
     *("turn", "resolution", "turn_resolution", "rate_hz"),
 )
 #: Data sheets by name, for `Master.figures`.
-FIGURES: dict[str, DeviceFigures] = {
-    name: DeviceFigures(**dict(zip(_COLUMNS, copy.deepcopy(row), strict=True)))
-    for name, row in _SHEETS.items()
-}
+FIGURES = Registry(
+    "device",
+    {
+        name: DeviceFigures(**dict(zip(_COLUMNS, copy.deepcopy(row), strict=True)))
+        for name, row in _SHEETS.items()
+    },
+)
 FIGURES["virtuose_6d"] = dataclasses.replace(
     FIGURES["virtuose_6d"], inertia=5e-3, friction_torque=0.03, peak_torque=[3.1] * 3
 )
@@ -134,8 +138,9 @@ class Master:
 
     model: str = choice(
         PHANTOM,
-        (PHANTOM, *FIGURES, "custom", LEADER),
+        (PHANTOM, "custom", LEADER),
         "device; custom: `figures` only; leader: arm from a file",
+        FIGURES,
     )
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"

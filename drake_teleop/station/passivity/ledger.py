@@ -86,7 +86,7 @@ _FORWARD_LEVEL = 0.5  # of the master's reserve
 _LEAST_LEVEL = 0.05  # of the master's reserve
 _DRAIN_RATE = 50.0  # 1/s
 _RELEASE_M = 0.03
-_RECOVERY_S = 0.2
+_RECOVERY_S = 0.1
 _HAND_ACCELERATION = 5.0  # m/s^2
 _DRAG_SPEED = 0.02  # m/s
 _REST_S = 0.1
@@ -110,8 +110,6 @@ _WORK_ON_HAND, _WITHHELD_SHARE = _places.vector(2), _places.vector(2)
 _DRAG_ACTIVE = _places.vector(2)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
 _NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _places.number(), _places.vector(2), _places.vector(6)
-
-AT_THE_MOTOR = True  #: the energy balance is at the port of the slave's motors
 
 
 @settings
@@ -263,6 +261,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
             put(offset, 0, offset_to_slave, 0, 6)
         memory[IN_CONTACT] = 1.0
         memory[_FRICTION_CONE][:] = 0.0
+        memory[_RETREAT] = 0.0
         for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
             memory[friction] = 0.0
         put(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
@@ -281,7 +280,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     if abs(hand_speed) < _DRAG_SPEED:
         retreat *= 1.0 - min(T / _REST_S, 1.0)
     memory[_RETREAT] = retreat
-    force *= max(1.0 - retreat / _RELEASE_M, 0.0)
+    force *= min(max(3.0 * (1.0 - retreat / _RELEASE_M), 0.0), 1.0)
     _find_slave_step(received, memory)
     for g in range(2):
         _add_friction(g, T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)

@@ -7,21 +7,39 @@ of the slave's command is the work at the hand, docs/theory.md (T29).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
-from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import address_of, call_at, njit
-from drake_teleop.common.config import choice, quantity, settings
+from drake_teleop.common.config import (
+    check_name,
+    check_ranges,
+    choice,
+    plain,
+    quantity,
+    settings,
+    unchecked_assignments,
+)
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.registry import Registry
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity import none
+from drake_teleop.station.passivity import (
+    force_limit,
+    four_channel,
+    ledger,
+    ledger_slave,
+    none,
+    pspm,
+    tdpa,
+    two_layer,
+    wave,
+)
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig
 from drake_teleop.station.passivity.four_channel import FourChannelConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
@@ -48,16 +66,80 @@ from drake_teleop.station.passivity.two_layer import TwoLayerConfig
 from drake_teleop.station.passivity.wave import WaveConfig
 
 
+@njit(cache=True)
+def _ignore_command(requested, command, pose, twist, p, memory):
+    """Substitute for `command_sent` in methods without one."""
+
+
+class PassivityMethod(NamedTuple):
+    """Both ends of a passivity method, and what it needs from the station.
+
+    Attributes:
+        master_step, slave_step, command_sent: compiled functions with the arguments of those of
+            this module except `steps`.
+        initialize: `initialize(p, memory)` of an end before its first step.
+        config: settings dataclass of a registered method with `pack_into(p)`, or None.
+        balance_at_motors: the energy balance is at the slave's motors, not at its command.
+        needs_arm_mass: `slave_mass` and servo are by default those of the arm at the start.
+        needs_load_apart: the ends need the load's part of the wrench, `load_wrench_B`.
+        speed_limit: `speed_limit(config, slave_mass)` [m/s, rad/s] (2,) of the slave by the
+            `reserve` and `hand_reserve` of the method's settings; a run warns above it.
+    """
+
+    master_step: Any
+    slave_step: Any
+    command_sent: Any = _ignore_command
+    initialize: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
+    config: type[Any] | None = None
+    balance_at_motors: bool = False
+    needs_arm_mass: bool = False
+    needs_load_apart: bool = False
+    speed_limit: Callable[[Any, NDArray[np.float64]], NDArray[np.float64]] | None = None
+
+
+_TDPA = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.command_sent)
+METHODS = Registry(
+    "passivity method",
+    {
+        "none": PassivityMethod(none.master_step, none.slave_step),
+        "wave": PassivityMethod(wave.master_step, wave.slave_step),
+        "tdpa": _TDPA,
+        "charged_tdpa": _TDPA,
+        "two_layer": PassivityMethod(
+            two_layer.master_step,
+            two_layer.slave_step,
+            two_layer.command_sent,
+            two_layer.initialize,
+            balance_at_motors=True,
+        ),
+        "pspm": PassivityMethod(
+            pspm.master_step,
+            pspm.slave_step,
+            pspm.command_sent,
+            pspm.initialize,
+            balance_at_motors=True,
+        ),
+        "ledger": PassivityMethod(
+            ledger.master_step,
+            ledger_slave.slave_step,
+            ledger_slave.command_sent,
+            ledger.initialize,
+            balance_at_motors=True,
+            needs_arm_mass=True,
+            needs_load_apart=True,
+            speed_limit=ledger.fastest,
+        ),
+        "four_channel": PassivityMethod(four_channel.master_step, four_channel.slave_step),
+        "force_limit": PassivityMethod(force_limit.master_step, force_limit.slave_step),
+    },
+)
+"""All methods by name."""
+
+
 @settings
 @dataclass
 class Methods:
-    """Parameters of all passivity methods; each field registers the method of its name.
-
-    The module of the field's class implements the method: compiled `master_step` and `slave_step`,
-    with the arguments of those below except `steps`; the class has `pack_into(p)`. Optional:
-    `initialize(p, memory)` of an end; compiled `command_sent`; `AT_THE_MOTOR = True` for an energy
-    balance at the slave's motors instead of its command.
-    """
+    """Parameters of the shipped passivity methods."""
 
     wave: WaveConfig = field(default_factory=WaveConfig)
     tdpa: TdpaConfig = field(default_factory=TdpaConfig)
@@ -71,14 +153,7 @@ class Methods:
     )
 
 
-_FIELDS = {entry.metadata.get("method", entry.name): entry for entry in fields(Methods)}
-_MODULES: dict[str, Any] = {"none": none} | {
-    name: import_module(entry.type.__module__) for name, entry in _FIELDS.items()
-}
-METHODS = tuple(_MODULES)
-"""Names of all methods."""
-AT_THE_MOTOR = tuple(name for name, file in _MODULES.items() if hasattr(file, "AT_THE_MOTOR"))
-"""Methods with an energy balance at the port of the slave's motors."""
+_FIELDS = {entry.metadata.get("method", entry.name): entry.name for entry in fields(Methods)}
 
 
 _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
@@ -86,7 +161,13 @@ _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 @dataclass
 class _CommonConfig:
-    method: str = choice("none", METHODS, "passivity method of the channel")
+    method: str = choice(
+        "none",
+        (),
+        "passivity method of the channel; two_layer, pspm, four_channel and force_limit are"
+        " references for comparison",
+        METHODS,
+    )
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest rendered force at the hand")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
@@ -110,6 +191,7 @@ class _CommonConfig:
         "mass of arm and tool at the tool, likewise; null: 15.13, 0.5 (E), with ledger"
         " mass and servo of the station's arm at the start",
     )
+    registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
 
 
 @settings
@@ -120,6 +202,26 @@ class PassivityConfig(Methods, _CommonConfig):
     The servo's force on the slave is K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
     `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the slave's mass.
     """
+
+    def check(self, where: str) -> None:
+        """Raise a DrakeTeleopError for invalid parameters of a registered method."""
+        METHODS.check(self.method, f"{where}.method")
+        self.of_method(where)
+
+    def of_method(self, where: str = "passivity") -> Any:
+        """Return the parameters of the selected method; None if it has none."""
+        schema = METHODS[self.method].config
+        if schema is None:
+            if self.registered:
+                what = f"'{self.method}' has its own fields, or no parameters"
+                raise DrakeTeleopError(what, where=f"{where}.registered")
+            return getattr(self, _FIELDS[self.method]) if self.method in _FIELDS else None
+        for name in self.registered:
+            check_name(schema, name, f"{where}.registered.{name}")
+        with unchecked_assignments():
+            config = schema(**self.registered)
+        check_ranges(config, f"{where}.registered")
+        return config
 
 
 def parameters(
@@ -144,8 +246,9 @@ def parameters(
     p[MASS] = np.multiply(config.slave_mass or _SLAVE_MASS, power_scale)
     p[MOTION_SCALE] = motion_scale
     p[RETREAT] = np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
-    if config.method in _FIELDS:
-        getattr(config, _FIELDS[config.method].name).pack_into(p)
+    own = config.of_method()
+    if own is not None:
+        own.pack_into(p)
     return p
 
 
@@ -161,23 +264,13 @@ def initial_memory(
     Raises:
         DrakeTeleopError: for an unknown method.
     """
-    if method not in METHODS:
-        raise DrakeTeleopError(
-            f"there is no method '{method}'",
-            where="passivity.method",
-            remedy=f"choose one of {', '.join(METHODS)}",
-        )
+    own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(MEMORY)
     memory[COMMAND_POSE] = pose
     memory[PACKET][POSE] = pose
-    if hasattr(_MODULES[method], "initialize"):
-        _MODULES[method].initialize(parameters, memory)
+    if own.initialize is not None:
+        own.initialize(parameters, memory)
     return memory
-
-
-@njit(cache=True)
-def _ignore_command(requested, command, pose, twist, p, memory):
-    """Substitute for `command_sent` in methods without one."""
 
 
 _ROW = types.Array(types.float64, 1, "C")
@@ -189,15 +282,17 @@ _master_step, _slave_step, _command_sent = map(
 )
 
 
-@cache
 def steps_of(method: str) -> tuple[int, int, int]:
     """Return the addresses of a method's `master_step`, `slave_step` and `command_sent`."""
-    file = _MODULES[method]
-    return (
-        address_of(file.master_step, _MASTER_ARGUMENTS),
-        address_of(file.slave_step, _SLAVE_ARGUMENTS),
-        address_of(getattr(file, "command_sent", _ignore_command), _SENT_ARGUMENTS),
+    return _addresses(*METHODS[method][:3])
+
+
+@cache
+def _addresses(*steps: Any) -> tuple[int, int, int]:
+    master, slave, sent = zip(
+        steps, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _SENT_ARGUMENTS), strict=True
     )
+    return address_of(*master), address_of(*slave), address_of(*sent)
 
 
 @njit(cache=True)

@@ -49,8 +49,6 @@ _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
 _places = own_memory()
 _OFFSET, _REQUESTED = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: the energy balance is at the port of the slave's motors
-
 
 @settings
 @dataclass

@@ -54,8 +54,6 @@ _RESERVE_SHARE = 0.01  # share of the capacity
 _places = own_memory()
 _SPRING_WRENCH, _BRAKE_WRENCH = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: the energy balance is at the port of the slave's motors
-
 
 @settings
 @dataclass

@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.registry import Registry
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.slave.arm import SLIDES, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import (
@@ -24,10 +25,13 @@ Array = NDArray[np.float64]
 AUTOMATIC = "automatic"
 """Name that selects the closed form where it exists, otherwise the numeric method."""
 
-IK_METHODS: dict[str, Callable[[ArmModel, Array, float], LeafSystem]] = {
-    "closed_form": lambda arm, q_start, period: InverseKinematics(arm.lower, arm.upper),
-    "numeric": NumericInverseKinematics,
-}
+IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
+    "inverse kinematics",
+    {
+        "closed_form": lambda arm, q_start, period: InverseKinematics(arm.lower, arm.upper),
+        "numeric": NumericInverseKinematics,
+    },
+)
 """Constructors of blocks by name, called with the arm, the start posture (n,) [rad] and the period
 [s]; the blocks have the ports of `InverseKinematics`."""
 

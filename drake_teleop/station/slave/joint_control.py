@@ -178,6 +178,38 @@ class JointControl(LeafSystem):
         )
 
 
+class HeldTorque(LeafSystem):
+    """Motors that hold a requested torque for a period, within their limits.
+
+    An invalid request keeps the last torque; `q_start` is the posture held before the first.
+
+    .. pydrake_system::
+
+        name: HeldTorque
+        input_ports:
+        - requested_torque: (n,) [N m]
+        - slave_state: (2 n,) [q; v] of the arm; unused
+        output_ports:
+        - joint_torque: (n,) [N m]
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, arm: ArmModel, period: float, q_start: Array) -> None:
+        super().__init__()
+        self._limit = arm.effort_limit
+        self._request = self.DeclareVectorInputPort("requested_torque", arm.num_joints)
+        self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
+        self.DeclareStateOutputPort("joint_torque", holding)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        torque = self._request.Eval(context)
+        if sound(torque):
+            discrete_state.set_value(0, np.clip(torque, -self._limit, self._limit))
+
+
 def MakeJointControl(
     arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
 ) -> LeafSystem:

@@ -133,11 +133,11 @@ class PostureShapes:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
-    def near(self, within: float = 0.0) -> list[Near]:
-        """Return the pairs of bodies closer than `within` [m] that do not overlap by design."""
+    def near(self) -> list[Near]:
+        """Return the pairs of overlapping bodies, except those that overlap by design."""
         return [
             Near(self.plant.get_body(first), self.plant.get_body(second), distance)
-            for (first, second), distance in self._distances(within).items()
+            for (first, second), distance in self._distances().items()
             if (first, second) not in self._by_design
         ]
 
@@ -171,11 +171,11 @@ class PostureShapes:
             plant.GetCollisionGeometriesForBody(body) or plant.GetVisualGeometriesForBody(body)
         )
 
-    def _distances(self, within: float) -> dict[tuple[BodyIndex, BodyIndex], float]:
+    def _distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
         query = self._scene_graph.get_query_output_port().Eval(scene)
         found: dict[tuple[BodyIndex, BodyIndex], float] = {}
-        for each in query.ComputeSignedDistancePairwiseClosestPoints(within):
+        for each in query.ComputeSignedDistancePairwiseClosestPoints(0.0):
             frames = [query.inspector().GetFrameId(shape) for shape in (each.id_A, each.id_B)]
             bodies = [self.plant.GetBodyFromFrameId(frame).index() for frame in frames]
             first, second = sorted(bodies, key=int)
@@ -205,7 +205,7 @@ class PostureShapes:
             *sampled_range(self.arm), (_NUM_POSTURES, len(self.arm.lower))
         ):
             self.move_to(posture)
-            for pair in self._distances(0.0):
+            for pair in self._distances():
                 counts[pair] = counts.get(pair, 0) + 1
         return {
             pair

@@ -36,9 +36,10 @@ class Slave:
     payload: Payload = field(default_factory=Payload)
     inverse_kinematics: str = choice(
         AUTOMATIC,
-        (AUTOMATIC, *IK_METHODS),
+        (AUTOMATIC,),
         "closed_form: for arms with the geometry of the RX90; numeric: for any arm, within joint"
         " speeds; automatic: closed_form where possible",
+        IK_METHODS,
     )
     model: str = plain(
         "",

@@ -1,0 +1,102 @@
+"""Tables of parts by name, which a script can extend (docs/extend.md)."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Mapping
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeVar
+
+from drake_teleop.common.errors import DrakeTeleopError, suggestion
+
+_Part = TypeVar("_Part")
+_SCRIPTS = "DRAKE_TELEOP_REGISTER"  # paths, which the processes of a study inherit
+REGISTRIES: dict[str, Registry[Any]] = {}
+"""All tables by the kind of their parts, as far as their modules are imported."""
+
+
+class Registry(dict[str, _Part]):
+    """Parts of one kind by name; an unknown name raises DrakeTeleopError.
+
+    Args:
+        kind: what the parts are, such as "passivity method".
+        shipped: parts of this package by name.
+    """
+
+    def __init__(self, kind: str, shipped: Mapping[str, _Part]) -> None:
+        super().__init__(shipped)
+        self.kind, self.shipped = kind, tuple(shipped)
+        REGISTRIES[kind] = self
+
+    def register(self, name: str, part: _Part | None = None) -> Any:
+        """Add a part, or decorate its definition; an earlier part of this name is replaced.
+
+        Raises:
+            DrakeTeleopError: for the name of a shipped part, or a name with other characters than
+                letters, digits and `._-`.
+        """
+        if part is None:
+            return partial(self.register, name)
+        if not isinstance(name, str) or not re.fullmatch(r"[.\w][\w.-]*", name, re.ASCII):
+            raise DrakeTeleopError(f"{name!r} is not a name", where=self.kind)
+        if name in self.shipped:
+            raise DrakeTeleopError(f"'{name}' is shipped", where=self.kind, remedy="rename yours")
+        self[name] = part
+        return part
+
+    def remove(self, name: str) -> None:
+        """Remove a registered part; raise DrakeTeleopError if there is none of this name."""
+        if name in self.shipped:
+            raise DrakeTeleopError(f"'{name}' is shipped", where=self.kind)
+        del self[self.check(name)]
+
+    def check(self, name: Any, where: str = "", *others: str) -> str:
+        """Return the name; raise DrakeTeleopError unless it is in the table or in `others`."""
+        if isinstance(name, str) and (name in others or name in self):
+            return name
+        names = (*others, *self)
+        remedy = suggestion(name, names, f"choose one of {', '.join(names)}, or register it")
+        raise DrakeTeleopError(f"there is no {self.kind} {name!r}", where=where, remedy=remedy)
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or (_run_scripts() and super().__contains__(name))
+
+    def __missing__(self, name: str) -> _Part:
+        return self[self.check(name)]
+
+
+def register_from(script: Path) -> None:
+    """Import a Python file that registers parts, here and in the processes of studies.
+
+    Raises:
+        DrakeTeleopError: if it is not a Python file, has the name of a module, or fails.
+    """
+    script = script.absolute()
+    if script.suffix != ".py" or not script.is_file():
+        raise DrakeTeleopError("is not a Python file", where=str(script))
+    sys.path.append(str(script.parent))
+    try:
+        module = import_module(script.stem)
+    except DrakeTeleopError:
+        raise
+    except Exception as error:
+        what = f"cannot be imported: {type(error).__name__}: {error}"
+        raise DrakeTeleopError(what, where=str(script)) from error
+    if module.__file__ != str(script):
+        what = f"has the name of the module {module.__file__ or script.stem}"
+        raise DrakeTeleopError(what, where=str(script), remedy="rename the file")
+    paths = os.environ.get(_SCRIPTS, "").split(os.pathsep)
+    os.environ[_SCRIPTS] = os.pathsep.join(dict.fromkeys([*filter(None, paths), str(script)]))
+
+
+def _run_scripts() -> bool:
+    """Register the parts of the parent process; return whether there were any new ones."""
+    paths = [Path(path) for path in os.environ.get(_SCRIPTS, "").split(os.pathsep) if path]
+    new = [path for path in paths if path.stem not in sys.modules]
+    for path in new:
+        register_from(path)
+    return bool(new)
