@@ -23,6 +23,7 @@ RUNS = {
     "errors_in_variables": "benchmarks/errors_in_variables.py --json FILE",
     "foreign_analysis": "benchmarks/foreign_analysis.py --json FILE",
     "frequency_response": "benchmarks/frequency_response.py --json FILE",
+    "half_mass": "benchmarks/half_mass.py --json FILE",
     "identification": "benchmarks/identification.py --json FILE",
     "kernel": "benchmarks/kernel.py --json FILE",
     "intervals": "benchmarks/intervals.py --json FILE",
@@ -392,6 +393,15 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(PUBLISHED, "and not its completion time"),
         *("the same; time over that without", "delay.md", "literature_peg"),
         *(lambda f: f["peg"]["time_ratio"], "", 0.0, 1.1),
+    ),
+    Claim(
+        *(ANALYSIS, "The best sigma_weight does not move if accelerated masses count as half"),
+        *("simulated operator, 40 swings; smallest noticed force, difference", "choose.md"),
+        *(
+            "half_mass",
+            lambda f: abs(f["best"]["by half"]["smallest_N"] - f["best"]["fully"]["smallest_N"]),
+            *("N", 0.0, 0.05),
+        ),
     ),
     # Tuning
     Claim(
