@@ -93,7 +93,7 @@ def _draft(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
         return Draft(*draft_of_bag(path, topics, out))
     if path.suffix.lower() in (".yaml", ".yml"):
         raise DrakeTeleopError(
-            "is a description, which contains all files of a recording",
+            "is a log description, which already names all files of a recording",
             where=str(path),
             remedy="inspect it alone, or give only tables and bags",
         )

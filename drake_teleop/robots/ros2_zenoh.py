@@ -77,7 +77,7 @@ def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
 def liveliness_tokens(
     domain: int, session: str, node: str, topic: str, kind: str, hashed: str
 ) -> list[str]:
-    """Return the liveliness tokens of a node with one publisher."""
+    """Return the Zenoh liveliness tokens by which ROS 2 finds a node with one publisher."""
     here = f"@ros2_lv/{domain}/{session}/0"
     name = "%" + topic.replace("/", "%")
     return [

@@ -387,7 +387,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         raise DrakeTeleopError(
             "contact detection needs a load estimate",
             where="load_estimate",
-            remedy="pass the estimate of identify_load, as its noise_floor",
+            remedy="pass the estimate of identify_load as load_estimate",
         )
 
 

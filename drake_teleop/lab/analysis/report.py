@@ -83,7 +83,7 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
 
 
 def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the one-axis parameters as rows (name, value with unit)."""
+    """Return the parameters of the one-axis model as rows (name, value with unit)."""
     scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
     return [
         (

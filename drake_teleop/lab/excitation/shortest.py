@@ -193,7 +193,7 @@ class ShortestProblem(Problem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return the bounds of the unknowns near x, of log T only."""
+        """Return bounds around the unknowns x; only the log of the period, the last, is bounded."""
         shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
         around = (
             np.clip(x[-1] + step, shortest_period, largest)

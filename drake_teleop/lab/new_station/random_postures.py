@@ -163,9 +163,10 @@ def _on_side(angle: Array, side: float) -> NDArray[np.bool_]:
 
 
 def scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
-    """Return a score (k,): far from limits and singularities, elbow up, near the preferred place.
+    """Return a score (k,) of each posture; the highest is the best.
 
-    Metres below the base plane count 30 times.
+    Distance from limits and singularities and a raised elbow increase it. Links below the base
+    plane and distance of the sensor from the preferred place decrease it.
     """
     margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
     L = orientation_length(arm)

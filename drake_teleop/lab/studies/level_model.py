@@ -221,7 +221,7 @@ def level_model(
     Args:
         columns: for each factor, its values (n,) at the points.
         known: (n,) True where the measure has a value; None: everywhere.
-        by_chance: True if cells without points are empty by chance.
+        by_chance: True if combinations of levels without points are missing by chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:

@@ -85,7 +85,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
             raise DrakeTeleopError(f"{wall:g} kN/m is outside {limits}", where="walls")
     if not walls:
         raise DrakeTeleopError(
-            "there is no wall", where="walls", remedy="give 0.5,20, for instance"
+            "there is no wall", where="walls", remedy="give kN/m, such as 0.5,20"
         )
     ordered = tuple(name for name in GRIPS if name in hands)
     return StatedSet(ordered, (1e3 * min(walls), 1e3 * max(walls)), task)

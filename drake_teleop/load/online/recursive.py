@@ -198,7 +198,8 @@ class RecursiveEstimator(ABC):
         shapes = [np.shape(part) for part in parts]
         if shapes != [(6,), (3,), (3,), (3,)]:
             names = "wrench, s, omega, alpha"
-            raise DrakeTeleopError(f"{names} have shapes {shapes}", where="sample")
+            remedy = "pass shapes (6,), (3,), (3,), (3,)"
+            raise DrakeTeleopError(f"{names} have shapes {shapes}", where="sample", remedy=remedy)
         sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
             raise DrakeTeleopError("is not finite", where="sample")

@@ -87,7 +87,7 @@ class Instants:
 
     @cached_property
     def block(self) -> int:
-        """Number of rows in a block of the search for contacts and changes."""
+        """Number of rows in one block, in which contacts and changes of the load are searched."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 

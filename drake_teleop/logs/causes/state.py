@@ -62,7 +62,7 @@ class Rows:
         return np.asarray(y[at])
 
     def whitened(self, filters: Array) -> Array:
-        """Return sums of products (6, W, W) of the signals after filters (6, 5) per channel."""
+        """Return sums of products (6, n, n) of n signals, filtered with 5 taps for each channel."""
         width = self.y.shape[1]
         taps = [(filters[:, : ORDER + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.sums.reshape(ORDER + 1, -1)

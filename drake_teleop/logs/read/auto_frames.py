@@ -112,8 +112,8 @@ def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> Leve
             lever = other
     if lever is None:
         raise DrakeTeleopError(
-            "the data do not determine the position of the accelerometer: no pose position fits,"
-            " and the wrench contains more than the load",
+            "the data do not determine the position of the accelerometer: no position of"
+            " the pose agrees with it, and the wrench contains more than the load",
             where=where,
             remedy="give imu.position in metres, or pose.position",
         )

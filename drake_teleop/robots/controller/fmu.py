@@ -128,7 +128,7 @@ def _description(target: Target, version: str, token: str, compiled: list[str]) 
 
 
 def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
-    """List value references (FMI 3.0) or places, counted from 1 (FMI 2.0)."""
+    """Add the outputs to the model structure: by value reference (FMI 3.0) or index (FMI 2.0)."""
     for tag in ("Output", "InitialUnknown"):
         group = structure if new else SubElement(structure, f"{tag}s")
         for k in outputs:

@@ -267,7 +267,7 @@ class LeaderDevice(DisplayDevice):
         return J
 
     def mass_matrix(self, q: Array) -> Array:
-        """Return the mass matrix (n, n), including the hand, at q (n,)."""
+        """Return the mass matrix (n, n), including the operator's hand, at q (n,)."""
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:

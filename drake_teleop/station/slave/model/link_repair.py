@@ -27,10 +27,10 @@ _MARGIN = 1e-9
 
 
 def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
-    """Give a link a mass and an inertia that a body can have; state what changed.
+    """Replace impossible mass and inertia of a link by possible ones; state the change.
 
-    Nothing depends on those of links at rest: they are removed if impossible. Return whether the
-    file gives the link neither.
+    Links fixed to the world (`at_rest`) lose impossible values, because nothing depends on them.
+    Return True if the file has neither mass nor inertia of the link.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     if inertial is None or inertial.find("mass") is None:
