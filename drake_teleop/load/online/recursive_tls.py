@@ -247,6 +247,10 @@ class MomentEstimator(RecursiveEstimator):
         residual_products(self._memory[:19], self._theta, *terms(), L, LZ, S)
         return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
 
+    def _within_prior(self, covariance: Array) -> Array:
+        shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
+        return np.asarray(covariance * np.outer(shrink, shrink))
+
 
 @njit(cache=True)
 def select_compensated(G, N, strength, K, taper):
@@ -401,9 +405,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         factor = inverse @ _cholesky(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
-        covariance = factor @ factor.T + unknown @ unknown.T
-        shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
-        return np.asarray(covariance * np.outer(shrink, shrink))
+        return self._within_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
