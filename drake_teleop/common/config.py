@@ -355,7 +355,10 @@ def _changed_lines(config: Any) -> Iterator[str]:
 
 def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
     place = f"{type(self).__name__}.{name}"
-    if _checks_assignments.get():
+    # Drake's `yaml_load_typed` sets an optional field to float(), list() etc. before the value of
+    # the file. Such a value is checked again when a station is made.
+    is_created = getattr(self, name, value) is None and not value
+    if _checks_assignments.get() and not is_created:
         check_field(type(self), name, value, place)
     else:
         check_name(type(self), name, place)

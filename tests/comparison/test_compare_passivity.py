@@ -93,7 +93,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         ({"networks": ["mars"]}, r"networks.*no network 'mars'.*lunar"),
-        ({"methods": ["magic"]}, r"methods.*no method 'magic'.*tdpa"),
+        ({"methods": ["magic"]}, r"methods.*no passivity method 'magic'.*tdpa"),
     ],
 )
 def test_unknown_names_raise(tmp_path, arguments, message):

@@ -306,7 +306,7 @@ def test_a_canonical_table_and_base_axes_get_other_remedies(tmp_path: Path) -> N
     cause = Cause("axes", "D", values={"matrix": PERMUTATIONS[14].tolist()})
     log = read_log(record.write(tmp_path))
     [of_table] = with_lines([cause], replace(log, source="log.csv"), by_pose=True)
-    assert "in a description of this table" in of_table.message
+    assert "in a log description of this table" in of_table.message
     record.wrench_lines = {"frame": "base"}
     [of_base] = with_lines([cause], read_log(record.write(tmp_path)), by_pose=True)
     assert of_base.message == "D; correct the columns of wrench.force and wrench.torque"
