@@ -255,7 +255,7 @@ def test_limits_are_those_of_the_default_device_unless_given():
 
 
 def test_unknown_method_is_rejected():
-    with pytest.raises(DrakeTeleopError, match="there is no method 'waves'"):
+    with pytest.raises(DrakeTeleopError, match="there is no passivity method 'waves'"):
         initial_memory("waves", np.zeros(1), START)
     with pytest.raises(DrakeTeleopError, match="method"):
         check_ranges(PassivityConfig(method="waves"), "passivity")
