@@ -701,4 +701,4 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
 
 def test_picture_of_a_shortest_motion_states_its_period(short):
     figure = draw(dataclasses.replace(short, criterion="period"))
-    assert figure.axes[3].get_title() == "period down to 2.4"
+    assert figure.axes[3].get_title("left") == "period down to 2.4"
