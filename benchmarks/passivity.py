@@ -290,9 +290,10 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
             start = initial_memory("none" if own else method, p, POSE)
             initial = start[LEDGER]
             memories = np.stack([start, start])
+            at_motors = not own and METHODS[method].balance_at_motors
             began = time.thread_time()
             _run(
-                steps_of, METHODS[method].balance_at_motors, p, memories, newest, motion, poses,
+                steps_of, at_motors, p, memories, newest, motion, poses,
                 wrench, PERIOD, sent, figures,
             )  # fmt: skip
             seconds[name] += time.thread_time() - began

@@ -569,7 +569,8 @@ def test_four_channels_add_force_to_motion_at_both_ends(over_a_network, slave):
     for g, scale in ((0, TRANSLATION), (1, ROTATION)):
         group = slice(3 * g, 3 * g + 3)
         K, D = (
-            servo[g] * FORCE / scale for servo in (config.servo_stiffness, config.servo_damping)
+            servo[g] * GAMMA * FORCE / scale
+            for servo in (config.servo_stiffness, config.servo_damping)
         )
         shift = (hand[sent, group] + D * speed[sent, group]) / K
         received = log["pose_received"][now]

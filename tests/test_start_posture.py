@@ -150,7 +150,7 @@ def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain
         lower=np.array([-np.inf, *arm.lower[1:5], -np.inf]),
         upper=np.array([np.inf, *arm.upper[1:5], np.inf]),
     )
-    drawn = random_postures(endless, 0).q
+    drawn = random_postures(endless).q
     assert np.isfinite(drawn).all() and np.abs(drawn).max() <= np.pi
     assert joint_margins(endless, np.array([[9.0, 0, 0, 0, 0, -9.0]]))[0] == 1.0
     assert joint_margins(endless, np.array([[0.0, _HALF, 0, 0, 0, 0]]))[0] == pytest.approx(0.5)
@@ -169,7 +169,7 @@ def test_reason_of_a_failure_counts_the_postures_of_each_condition(plain):
 
 def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
     arm = plain[1].shapes.arm
-    at_random = random_postures(arm, 3)
+    at_random = random_postures(arm)
     for k in (0, 17, 4000):
         pose = np.empty(7)
         pose_into(arm.table, at_random.q[k], pose)
@@ -184,7 +184,7 @@ def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
     short = replace(
         arm, table=table, **{n: v if n == names[0] else np.array(v) for n, v in fewer.items()}
     )
-    assert degrees_of_freedom(short, random_postures(short, 0)) == 4
+    assert degrees_of_freedom(short, random_postures(short)) == 4
 
 
 def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):

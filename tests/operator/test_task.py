@@ -278,13 +278,17 @@ def test_the_operators_noise_is_normal():
     assert abs(np.mean(draws[1:] * draws[:-1])) < 0.03
 
 
+def test_invalid_force_is_rejected_when_assigned():
+    with pytest.raises(DrakeTeleopError, match=r"^Press\.force: -1 N is outside"):
+        Press(force=-1.0)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         (with_task(Reach(width=0.4)), r"operator\.task\.translation: the target is 0\.1 m away"),
         (with_task(Insert(translation=[0.0, 0.0, -0.01])), r"operator\.task\.translation"),
         (with_task(Touch(standoff=0.3)), r"operator\.task\.translation"),
-        (with_task(Press(force=-1.0)), r"operator\.task\.force"),
         (with_task(Reach(), kinematic_scaling__translation_scale=0.0), "translation_scale"),
     ],
 )

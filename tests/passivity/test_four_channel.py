@@ -23,7 +23,7 @@ START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
 def test_motion_and_force_of_both_ends_with_local_feedback():
     own = FourChannelConfig([70.0, 0.7], [4.0, 0.03], slave_feedback=0.3, hand_feedback=-0.4)
     p = parameters(
-        PassivityConfig("four_channel", force_limit=1e6, torque_limit=1e6, four_channel=own)
+        PassivityConfig("four_channel", force_limit=1e4, torque_limit=1e3, four_channel=own)
     )
     rng, zero = np.random.default_rng(0), np.zeros(6)
     memory = [initial_memory("four_channel", p, START) for _ in range(2)]
