@@ -143,5 +143,5 @@ def test_a_robust_fit_says_what_it_left_out(
     assert 40 / 1500 < summary["rejected"] < 90 / 1500
     assert "rejected as disturbed" in capsys.readouterr().out
     assert errors["robust"] < 0.1 * errors["ordinary"]
-    with pytest.raises(DrakeTeleopError, match="'best' is not one of"):
+    with pytest.raises(DrakeTeleopError, match="there is no estimator 'best'"):
         identify_log(log, method="best")
