@@ -20,7 +20,7 @@ from drake_teleop.live.session import Session
 
 scenario = live_scenario(dt.LoadScenario("contact_transition"))
 session = Session(scenario, identified_load(scenario))
-internet = {"network": NETWORKS.index("internet"), "method": METHODS.index("ledger")}
+internet = {"network": NETWORKS.index("internet"), "method": list(METHODS).index("ledger")}
 while session.ms < 3500:
     t = 1e-3 * session.ms
     wanted = {"z": round(-7500 * min(t, 1.0))}  # in steps of 10 um
