@@ -101,7 +101,7 @@ def slices(seconds: float) -> dict[str, float]:
     cells = list(product(NETWORK_PRESETS, METHODS))
     drives: dict[tuple[str, str], list[list[float]]] = {cell: [] for cell in cells}
     for network, method in cells * DRIVES:
-        choice = {"network": NETWORKS.index(network), "method": METHODS.index(method)}
+        choice = {"network": NETWORKS.index(network), "method": list(METHODS).index(method)}
         drives[network, method].append(spent(Session(scenario, load), choice, seconds))
     for network, method in cells:
         counted = np.min(drives[network, method], axis=0)

@@ -36,7 +36,10 @@ CHOICES = (
     (0.20, {"detection": 1}),
     (0.25, {"detection": 0}),
     (0.30, {"object": 0}),
-    (0.40, {"network": NETWORKS.index("custom"), "method": METHODS.index("tdpa"), "delay": 200}),
+    (
+        0.40,
+        {"network": NETWORKS.index("custom"), "method": list(METHODS).index("tdpa"), "delay": 200},
+    ),
     (0.50, {"delay": 350, "jitter": 10, "loss": 20}),
     (0.60, {"grip": 2}),
     (0.65, {"grip": 1}),
