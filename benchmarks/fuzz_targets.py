@@ -35,7 +35,7 @@ from drake_teleop.common.parquet_sizes import check_parquet_content
 from drake_teleop.common.texts import read_json, yaml_data
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
-from drake_teleop.live.inputs import RANGES, Inputs, header, read_inputs
+from drake_teleop.live.inputs import RANGES, Inputs, header, range_of, read_inputs
 from drake_teleop.live.inputs import row as inputs_row
 from drake_teleop.live.live import MAX_SLOWDOWN, parse
 from drake_teleop.load.identification import Identification
@@ -514,8 +514,8 @@ def _message(path: Path) -> None:
     said = [parse(text) for text in (content, content.decode(errors="replace"))]
     for found in filter(None, said):
         inputs = Inputs().changed(found.get("set", {}))
-        for name, (low, high) in RANGES.items():
-            value = getattr(inputs, name)
+        for name in RANGES:
+            value, (low, high) = getattr(inputs, name), range_of(name)
             if not (isinstance(value, int) and low <= value <= high):
                 raise AssertionError(f"{name} = {value!r}")
         pose = inputs.changed({"held": 1}).pose(np.zeros(3))
