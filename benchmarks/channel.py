@@ -1,4 +1,4 @@
-"""What does a passivity method cost in the station, compared with the same network without one?
+"""How much does a passivity method cost in the station, over the same network without one?
 
 Free motion over `internet`, so that all take the same steps (in contact, the methods bounce
 differently); all stations interleaved in this process, thread CPU time.

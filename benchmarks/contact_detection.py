@@ -1,4 +1,4 @@
-"""Which contacts are detected, how soon, and by which detector?
+"""How many contacts are detected, how soon, and by which detector?
 
 `python benchmarks/contact_detection.py [--json FILE] [--hours 1]` moves a load of 3.1 kg fast and
 touches it 500 times with 0.05 to 5 N in any direction, 0.3 s each. The wrench has white noise

@@ -1,4 +1,4 @@
-"""Which share of planted faults of a dataset is named, and how good are wrench and contacts?
+"""How many planted faults of a dataset are named, and how good are wrench and contacts?
 
 Usage: python benchmarks/dataset.py [EPISODES] [FRAMES]: clean episodes per rate, frames for time.
 """

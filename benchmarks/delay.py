@@ -1,4 +1,4 @@
-"""Which delay does each method tolerate in one degree of freedom?
+"""How long a delay does each method tolerate in one degree of freedom?
 
 `python benchmarks/delay.py [--json FILE] [--seeds N]` presses on a wall, holds, lets go and rests
 with `drake_teleop.lab.comparison.one_dof` over networks with jitter 0, 25 and 50 % of the delay and

@@ -1,4 +1,4 @@
-"""Which claims of README and docs are shown by which run, and when was it run?
+"""Is each claim of README and docs shown by a run, and when was it run?
 
     python benchmarks/evidence.py                       writes docs/evidence.md and the README
     python benchmarks/evidence.py RUN ... [--beside T]  runs these first, and keeps their figures
@@ -180,7 +180,7 @@ def readme() -> str:
         if not question.endswith("?"):
             helpers.append(f"| `{script.name}` | {question} |")
             continue
-        parts.append(f"## {script.name}: {question}\n")
+        parts.append(f"## {script.name}\n\n{question}\n")
         runs = [name for name in RUNS if RUNS[name].split()[0] == f"benchmarks/{script.name}"]
         if not runs:
             parts.append("No record is kept.\n")

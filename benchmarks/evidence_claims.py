@@ -457,7 +457,10 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["ledger"]["searched"]["actual"], "J", -1e-6),
     ),
     Claim(
-        *(NETWORK, "nor without a reserve and with another servo than configured"),
+        *(
+            NETWORK,
+            "`ledger` creates none without a reserve and with an inexact servo",
+        ),
         *("the same, charged by drag, servo ±20 %, 3 ms lag, encoder, noise", "delay.md"),
         *("adversary_drag", lambda f: f["ledger"]["searched"]["actual"], "J", -1e-6),
     ),

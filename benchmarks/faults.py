@@ -1,4 +1,4 @@
-"""Which force do 560 faults in the running station display to the operator?
+"""How large a force do 560 faults in the running station display to the operator?
 
 `python benchmarks/faults.py [--json FILE] [--each N]`. The tool presses on a leaf, the hand feels
 1 to 1.5 N and moves by 4 mm. Into ten stations, all methods and no channel at all, faults come at

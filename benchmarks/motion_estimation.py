@@ -1,4 +1,4 @@
-"""Which part of the paper's 100 N remains after elimination, by source of the motion?
+"""How much of the paper's 100 N remains after elimination, by source of the motion?
 
 The tool goes up and down at 2.63 Hz without turning, as in the scenario free_motion_force; truth ->
 sensor -> estimation of the motion -> F - F_o - V phi with the true phi. The baseline is the same

@@ -1,4 +1,4 @@
-"""Which share of planted mistakes of a description is found, and how many are false alarms?
+"""How many planted mistakes of a description are found, and how many are false alarms?
 
 Records of 24 s of the arm and the load of `pose_noise`, F and P, as files with a description: a
 wrench at 500 Hz with noise and offsets, poses at 125 Hz, an IMU at 250 Hz; wrench and pose, wrench

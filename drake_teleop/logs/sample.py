@@ -169,7 +169,7 @@ def _print(out: Path) -> None:
         f"  drake-teleop identify {out}/free.yaml --out out/load",
         f"  drake-teleop eliminate {out}/touched.yaml --load {load}",
         f"  drake-teleop detect {out}/touched.yaml --load {load} --free {out}/free.yaml",
-        f"what they should find is in {out}/truth.json",
+        f"the true values are in {out}/truth.json",
     ):
         Console(soft_wrap=True).print(line, highlight=False, markup=False)
 

@@ -259,7 +259,7 @@ def calibrate(
                         if done:
                             break
                 done = done or recorder.seconds >= seconds
-    except Exception:
+    except Exception:  # raised again: the record is kept whatever ended the loop
         if recorder.seconds:
             write_record()
         raise

@@ -192,7 +192,7 @@ def with_new_parameter(n):
 
 @pytest.mark.parametrize("function", [with_while, with_integer_division, with_new_parameter])
 def test_syntax_that_is_not_supported_is_named(function):
-    with pytest.raises(NotImplementedError, match=rf"^{function.__name__}: .*cannot be translated"):
+    with pytest.raises(ValueError, match=rf"^{function.__name__}: .*cannot be translated"):
         Translator().add(function, n="int")
 
 

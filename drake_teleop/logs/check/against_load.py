@@ -268,12 +268,13 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
         offset = description.wrench.time.offset + delay
         text = (
             f"the motion is {abs(delay):.3f} s {side} the wrench: a clock is wrong;"
-            f" set wrench.time.offset: {offset:.3f} (or shift the others the other way)"
+            f" set wrench.time.offset: {offset:.3f} (or shift the other streams in the opposite"
+            " direction)"
         )
         return [Finding("clock", text)]
     text = (
-        f"the motion is {abs(delay) * 1e3:.1f} ms {side} the wrench; identify takes this out;"
-        f" to say so in the description, add {delay:.4f} to wrench.time.offset"
+        f"the motion is {abs(delay) * 1e3:.1f} ms {side} the wrench; identify corrects"
+        f" this. To state it in the description, add {delay:.4f} to wrench.time.offset"
     )
     return [Finding("lag", text)]
 

@@ -3,7 +3,7 @@
 The translator reads the source of numba functions. A function of `njit` becomes a C function. A
 function of `register_jitable`, which may return tuples, is expanded at its call. Supported are
 arithmetic, branches, `for` over `range`, tuples and slices of arrays of doubles; other syntax
-raises `NotImplementedError`.
+raises `ValueError`.
 """
 
 from __future__ import annotations
@@ -310,7 +310,7 @@ class _Function:
             return self._call_of_c(function, values)
         if inspect.isfunction(function):
             return self._expanded(function, values)
-        raise NotImplementedError(f"{self.name}: a call of {function!r} cannot be translated to C")
+        raise ValueError(f"{self.name}: a call of {function!r} cannot be translated to C")
 
     def _call_of_c(self, function: Any, values: list[Any]) -> _Scalar:
         given = dict(zip(inspect.signature(function.py_func).parameters, values, strict=True))
@@ -348,9 +348,9 @@ class _Function:
         self._values, self._globals, self._expanding = outer
         return result
 
-    def _unsupported(self, node: ast.AST, why: str = "") -> NotImplementedError:
+    def _unsupported(self, node: ast.AST, why: str = "") -> ValueError:
         what = f"{self.name}: {ast.unparse(node)!r} {why}".rstrip()
-        return NotImplementedError(f"{what} cannot be translated to C")
+        return ValueError(f"{what} cannot be translated to C")
 
 
 def _parsed(function: Any) -> tuple[ast.FunctionDef, dict[str, Any]]:
