@@ -20,9 +20,9 @@ from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 _COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
 _HEAD = """\
-# Every field: its value, [what it may be] and what it means. What you leave out has its default.
-# Lines that begin with # say nothing until you take the # away: blocks that this scenario does
-# without, and the figures of the wrist sensor's preset.
+# Each field has its value, [the permitted values] and its meaning. Omitted fields have their
+# defaults. Lines that begin with # are fields and blocks that this scenario does not use; remove
+# the # to use them.
 """
 
 _REFERENCE = """\

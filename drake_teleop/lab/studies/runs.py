@@ -18,7 +18,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.numeric import Array, one_blas_thread
-from drake_teleop.common.progress import Progress, show_progress
+from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.design import Study, Values
 from drake_teleop.lab.studies.processes import Chunk, processes
@@ -55,7 +55,7 @@ def run_study(
     executor: Executor | None = None,
     shard: str | None = None,
     merge: bool = False,
-    progress: bool = True,
+    progress: bool | Stage = True,
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
@@ -64,7 +64,7 @@ def run_study(
         basis: JSON data of all inputs of the rows besides the study.
         shard: "K/N" for the runs and rows of this shard only; see `shards.py`.
         merge: True collects the rows of the shards in `out`, and runs nothing.
-        progress: whether to show a progress bar.
+        progress: whether to show a progress bar, or the `Stage` of the caller.
 
     Raises:
         DrakeTeleopError: for the reasons of `study_command`.

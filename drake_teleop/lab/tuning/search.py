@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.progress import Progress, show_progress
 from drake_teleop.lab.studies.design import Factor, Study, Value
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
@@ -174,7 +175,12 @@ def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> E
     """Return a function that runs a named study in a folder of `out`, or continues it."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
-        found = run_study(study, out / name, work, basis, jobs=jobs, progress=progress)
+        with show_progress(progress) as stage:
+
+            def named(_: str) -> Progress:
+                return stage(f"Trials {name}")
+
+            found = run_study(study, out / name, work, basis, jobs=jobs, progress=named)
         for row in found.rows(named=True):
             if row["error"]:
                 raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
