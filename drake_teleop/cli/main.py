@@ -787,8 +787,10 @@ def main(arguments: list[str] | None = None) -> None:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
             os.environ["PYTHONWARNINGS"] = "ignore"  # for the processes of a study
-        status = _run(arguments)
-    INTERRUPTED.clear()
+        try:
+            status = _run(arguments)
+        finally:
+            INTERRUPTED.clear()
     sys.exit(status if isinstance(status, int) else 0)
 
 

@@ -1,7 +1,7 @@
 """Handling of SIGINT and SIGTERM where C code would lose the KeyboardInterrupt.
 
-C code that calls Python can drop an exception, e.g. llvmlite in a callback of the compiler, or
-replace it, e.g. rclpy in the constructor of a message.
+C code that calls Python can drop an exception, e.g. llvmlite in a callback of the compiler and
+imports in that of a weak reference, or replace it, e.g. rclpy in the constructor of a message.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 def install_handlers() -> None:
     """Handle SIGINT, unless it is ignored, and SIGTERM by a KeyboardInterrupt and `INTERRUPTED`."""
-    INTERRUPTED.clear()
     for number in _SIGNALS:
         if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _interrupt)
