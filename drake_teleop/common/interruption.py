@@ -9,38 +9,59 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ContextDecorator, contextmanager
 from typing import Any
 
 INTERRUPTED = threading.Event()
 """Set from the first signal on, until the command ends; an endless loop checks it."""
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class _Delays(threading.local):
+    depth, received = 0, 0  # open contexts, and the last signal in them
+
+
+_DELAYS = _Delays()
 
 
 def install_handlers() -> None:
     """Handle SIGINT, unless it is ignored, and SIGTERM by a KeyboardInterrupt and `INTERRUPTED`."""
-    for number in _SIGNALS:
-        if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+@contextmanager
+def handled_sigint() -> Iterator[None]:
+    """Install the handler of SIGINT for a context, if Python's own is installed."""
+    before = signal.getsignal(signal.SIGINT)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if before is not signal.default_int_handler or not in_main_thread:
+        yield
+        return
+    signal.signal(signal.SIGINT, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        INTERRUPTED.clear()
 
 
 def _interrupt(number: int, _frame: Any) -> None:
     INTERRUPTED.set()
+    if _DELAYS.depth:
+        _DELAYS.received = number
+        return
     raise KeyboardInterrupt(*["SIGTERM"] * (number == signal.SIGTERM))
 
 
-@contextmanager
-def delayed_signals() -> Iterator[None]:
-    """Handle SIGINT and SIGTERM at the end of the context; also a decorator."""
-    received: list[int] = []
-    handlers = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in filter(signal.getsignal, _SIGNALS):  # those that Python handles
-            handlers[number] = signal.signal(number, lambda n, _: received.append(n))
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for first in received[:1]:
-            signal.raise_signal(first)
+class delayed_signals(ContextDecorator):
+    """Delay the KeyboardInterrupt of these handlers to the end of the context; also a decorator."""
+
+    def __enter__(self) -> None:
+        _DELAYS.depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        _DELAYS.depth -= 1
+        if _DELAYS.received and not _DELAYS.depth:
+            number, _DELAYS.received = _DELAYS.received, 0
+            _interrupt(number, None)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.files import set_aside
-from drake_teleop.common.interruption import INTERRUPTED
+from drake_teleop.common.interruption import INTERRUPTED, handled_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import Changes
@@ -85,7 +85,7 @@ def run(
         left = compensator.time_to_stale(time.monotonic())
         return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
 
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), handled_sigint():
         while not INTERRUPTED.is_set() and (readings := source.read(timeout_s())) is not None:
             if (
                 source.live

@@ -18,6 +18,7 @@ import numpy as np
 import polars as pl
 import pytest
 from full_disk import small_disk
+from shown import hearing_ctrl_c
 from test_compensator import DT, load, readings
 
 import drake_teleop.robots.udp as udp
@@ -289,9 +290,13 @@ def test_ctrl_c_returns_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
 class SignalLost(Interrupted):
     """Source of which C code loses the KeyboardInterrupt of a signal."""
 
+    def __init__(self, number: signal.Signals) -> None:
+        super().__init__()
+        self._number = number
+
     def read(self, timeout_s: float) -> list[Reading]:
         with suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(self._number)
         return [self._left.pop()]
 
 
@@ -307,7 +312,16 @@ def handlers() -> Iterator[None]:
 
 @pytest.mark.usefixtures("handlers")
 def test_loop_ends_at_a_signal_whose_exception_is_lost() -> None:
-    assert run(SignalLost(), Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+    source = SignalLost(signal.SIGTERM)
+    assert run(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+
+
+def test_loop_of_a_program_ends_at_ctrl_c_whose_exception_is_lost() -> None:
+    with hearing_ctrl_c():
+        for _ in range(2):
+            source = SignalLost(signal.SIGINT)
+            assert run(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.usefixtures("handlers")
