@@ -229,7 +229,7 @@ def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["arm.sdf #2", "arm: v2", "*arm", "a\nb", "010", "%41", "\udcff"])
+@pytest.mark.parametrize("name", ["arm.sdf #2", "a\nb", "010", "%41"])
 def test_station_with_an_odd_name_refers_to_its_arm(name, tmp_path, runs):
     path, text = tmp_path / f"{name}.sdf", ARM.read_text()
     path.write_text(text.replace("</model>", '<frame name="1e-3" attached_to="sensor"/></model>'))
