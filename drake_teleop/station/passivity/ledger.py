@@ -77,7 +77,9 @@ _LEAD_STEPS = 2.0
 _OFFSET_FADE_S = 0.3
 _FRICTION_MEMORY_S = 1.0
 _FRICTION_LAG_S, _SLIP_SPEED = 0.1, 1e-3
-_MAX_CONE = 1.0
+_TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS = 0.6, 30.0
+_TORQUE_STIFFNESS_FACTOR, _MAX_CONE = 4.0, 1.0
+_LEAST_METRIC = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
 _MAX_PREDICTION_N = 3.0
 _MAX_REMEMBERED_N = 10.0
 _SAME_WALL_M, _SAME_WALL_COSINE = 5e-3, 0.7
@@ -305,18 +307,23 @@ def _add_friction(T, size, force, received, dx, p, memory, wrench):
     """Write the friction (6,) into `wrench`: model of the hand plus the model's error (T68)."""
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
     slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
+    normal = memory[NORMAL]
+    step, far_step = work_along(normal, dx), work_along(normal, slave_step)
     put(wrench, 0, received, WRENCH.start, 6)
     _remove_normal(wrench, p, memory)
     decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
     for g in range(2):
-        # A torque's weight in the metric is 0 where rotation is not transmitted.
-        metric = max(p[METRIC][g], 1e-12)
-        spring, largest = _MAX_STIFFNESS / metric, _MAX_CONE / math.sqrt(metric)
+        metric = max(p[METRIC][g], _LEAST_METRIC)
+        spring, largest = _friction_stiffness(g, p), _MAX_CONE / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length(wrench, g) / size, largest))
-        share = T / max(cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED), _FRICTION_LAG_S)
+        lag = max(cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED), _FRICTION_LAG_S)
+        if g == 1:
+            lag = max(_TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS * received[ROUND_TRIP])
+        share = T / lag
         for i in range(3 * g, 3 * g + 3):
-            far[i] -= spring * slave_step[i] + share * far[i]
-            near[i] -= spring * dx[i] + share * near[i]
+            inward = metric * normal[i]
+            far[i] -= spring * (slave_step[i] - far_step * inward) + share * far[i]
+            near[i] -= spring * (dx[i] - step * inward) + share * near[i]
             rest[i] += share * (wrench[i] - far[i] - rest[i])
     for friction in (near, far, rest):
         _remove_normal(friction, p, memory)
@@ -324,10 +331,18 @@ def _add_friction(T, size, force, received, dx, p, memory, wrench):
         limit(far, g, cone[g] * size)
         limit(near, g, cone[g] * force)
         for i in range(3 * g, 3 * g + 3):
-            wrench[i] = near[i] + rest[i] - _MAX_STIFFNESS / max(p[METRIC][g], 1e-12) * dx[i]
+            across = dx[i] - step * max(p[METRIC][g], _LEAST_METRIC) * normal[i]
+            wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
     _remove_normal(wrench, p, memory)
     for g in range(2):
         limit(wrench, g, cone[g] * force)
+
+
+@njit(cache=True)
+def _friction_stiffness(g, p):
+    """Return k_h of (T68) for translation [N/m] or rotation [N m/rad]."""
+    factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
+    return factor * _MAX_STIFFNESS / max(p[METRIC][g], _LEAST_METRIC)
 
 
 @njit(cache=True)
