@@ -158,7 +158,9 @@ def _refuse(*options: object) -> None:
     names = ("--sensor-frame", "--package-path", "--acceleration", "--payload")
     for name, value in zip(names, options, strict=True):
         if value not in (None, ()):
-            raise DrakeTeleopError("needs --model", where=name)
+            raise DrakeTeleopError(
+                "requires --model", where=name, remedy="add --model or remove it"
+            )
 
 
 def summarise(found: Excitation) -> dict[str, Any]:

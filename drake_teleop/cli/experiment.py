@@ -65,8 +65,9 @@ def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
     number = max(known, default=0) + 1
     if number > MAX_PARTICIPANT:
         raise DrakeTeleopError(
-            f"there are {MAX_PARTICIPANT} participants already (the largest number)",
+            f"participant numbers 1 to {MAX_PARTICIPANT} are used",
             where=str(store.folder),
+            remedy="choose another folder",
         )
     return number
 

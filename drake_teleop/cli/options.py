@@ -347,7 +347,9 @@ def _arm(model: Path | None, sensor_frame: str | None, package_paths: tuple[Path
     if model is None:
         if sensor_frame is not None or package_paths:
             name = "--package-path" if sensor_frame is None else "--sensor-frame"
-            raise DrakeTeleopError("needs --model", where=name)
+            raise DrakeTeleopError(
+                "requires --model", where=name, remedy="add --model or remove it"
+            )
         return None
     if sensor_frame is None:
         raise DrakeTeleopError(

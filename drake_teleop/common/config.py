@@ -86,7 +86,9 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
             remedy=f"the fields are {', '.join(_field_names(schema))}",
         )
     if "_tag" in data and not tagged:
-        raise DrakeTeleopError(f"the tag {data['_tag']} is not allowed here", where=where)
+        raise DrakeTeleopError(
+            f"the tag {data['_tag']} is not allowed here", where=where, remedy="remove the tag"
+        )
     kinds = _field_types(schema)
     for key, value in data.items():
         if key == "_tag":

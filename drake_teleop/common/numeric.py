@@ -33,7 +33,9 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
     finite = np.isfinite(array)
     if not finite.all():
         first = tuple(int(i) for i in np.argwhere(~finite)[0])
-        raise DrakeTeleopError(f"is not finite at index {first}", where=name)
+        raise DrakeTeleopError(
+            f"is not finite at index {first}", where=name, remedy="replace NaN and infinity"
+        )
     return array
 
 
@@ -99,7 +101,11 @@ def positive(name: str, value: ArrayLike, *shape: int) -> Array:
     """Return an array as `checked`; raise DrakeTeleopError unless all values are positive."""
     array = checked(name, value, *shape)
     if not (array > 0.0).all():
-        raise DrakeTeleopError("is not positive throughout", where=name)
+        raise DrakeTeleopError(
+            f"has the value {array.min():g}, which is not positive",
+            where=name,
+            remedy="give values above 0",
+        )
     return array
 
 

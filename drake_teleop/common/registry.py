@@ -42,7 +42,11 @@ class Registry(dict[str, _Part]):
         if part is None:
             return partial(self.register, name)
         if not isinstance(name, str) or not re.fullmatch(r"[.\w][\w.-]*", name, re.ASCII):
-            raise DrakeTeleopError(f"{name!r} is not a name", where=self.kind)
+            raise DrakeTeleopError(
+                f"{name!r} is not a valid name",
+                where=self.kind,
+                remedy="use only letters, digits, _ . -, first a letter, digit, _ or .",
+            )
         if name in self.shipped:
             raise DrakeTeleopError(f"'{name}' is shipped", where=self.kind, remedy="rename yours")
         self[name] = part
@@ -51,7 +55,9 @@ class Registry(dict[str, _Part]):
     def remove(self, name: str) -> None:
         """Remove a registered part; raise DrakeTeleopError if there is none of this name."""
         if name in self.shipped:
-            raise DrakeTeleopError(f"'{name}' is shipped", where=self.kind)
+            raise DrakeTeleopError(
+                f"'{name}' is shipped", where=self.kind, remedy="remove only registered parts"
+            )
         del self[self.check(name)]
 
     def check(self, name: Any, where: str = "", *others: str) -> str:
@@ -77,7 +83,9 @@ def register_from(script: Path) -> None:
     """
     script = script.absolute()
     if script.suffix != ".py" or not script.is_file():
-        raise DrakeTeleopError("is not a Python file", where=str(script))
+        raise DrakeTeleopError(
+            "is not a Python file", where=str(script), remedy="give an existing .py file"
+        )
     sys.path.append(str(script.parent))
     try:
         module = import_module(script.stem)

@@ -98,7 +98,9 @@ def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
     except yaml.YAMLError as error:
         raise DrakeTeleopError(f"is not YAML ({error})", where=where) from None
     except RecursionError:
-        raise DrakeTeleopError("is nested too deeply", where=where) from None
+        raise DrakeTeleopError(
+            "is nested too deeply", where=where, remedy="use fewer levels of lists and mappings"
+        ) from None
 
 
 def yaml_text(
@@ -118,7 +120,11 @@ def yaml_text(
         lines.append(f"{line}  # {comment}" if comment else line)
     text = "\n".join(lines) + "\n"
     if yaml_data(text, "YAML", tagged=True) != data:
-        raise DrakeTeleopError(f"{reprlib.repr(data)} cannot be written", where="YAML")
+        raise DrakeTeleopError(
+            f"{reprlib.repr(data)} cannot be written",
+            where="YAML",
+            remedy="use numbers, texts, lists and mappings",
+        )
     return text
 
 
@@ -143,7 +149,9 @@ def read_json(path: str | Path) -> Any:
         found: dict[str, Any] = {}
         for name, value in pairs:
             if name in found:
-                raise DrakeTeleopError("is defined twice", where=field_place(where, name))
+                raise DrakeTeleopError(
+                    "is defined twice", where=field_place(where, name), remedy="remove one"
+                )
             found[name] = value
         return found
 
@@ -156,7 +164,9 @@ def read_json(path: str | Path) -> Any:
         what = f"is not JSON (line {error.lineno}: {error.msg})"
         raise DrakeTeleopError(what, where=where) from None
     except RecursionError:
-        raise DrakeTeleopError("is nested too deeply", where=str(path)) from None
+        raise DrakeTeleopError(
+            "is nested too deeply", where=str(path), remedy="use fewer levels of lists and objects"
+        ) from None
 
 
 def read_text(path: str | Path) -> str:

@@ -215,6 +215,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
         raise DrakeTeleopError(
             f"it moves {len(trajectory.q0)} joints, the arm has {robot.arm.num_joints}",
             where="trajectory",
+            remedy="compute a trajectory for this arm",
         )
     if not np.isclose(trajectory.period, duration, rtol=1e-9):
         raise DrakeTeleopError(
@@ -224,7 +225,9 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
         )
     worst = check(robot, trajectory)[0]
     if worst.share > 1:
-        raise DrakeTeleopError(f"it uses {worst}", where="trajectory")
+        raise DrakeTeleopError(
+            f"it uses {worst}", where="trajectory", remedy="compute a trajectory for these limits"
+        )
 
 
 def simulate_with_timing(

@@ -81,7 +81,11 @@ def run_command(
         KeyboardInterrupt: its message contains the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
-        raise DrakeTeleopError("a drive has its own seed and load", where="run --inputs")
+        raise DrakeTeleopError(
+            "a drive has its own seed and load",
+            where="run --inputs",
+            remedy="remove --seed and --fresh",
+        )
     if drive is not None and out.resolve() == drive.folder.resolve():
         raise DrakeTeleopError(
             "is the folder of the drive", where=str(out), remedy="give another --out"

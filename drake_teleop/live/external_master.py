@@ -92,7 +92,7 @@ class ExternalMaster(LeafSystem):
         input_ports:
         - wrench_command: (6,) F_E_B [N, N m]
         output_ports:
-        - pose_master: (7,) X_BE
+        - pose_master: (7,) X_BE of the end effector in the master's base
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - master_state: (12,) position [m], yaw, pitch, roll [rad]; zero speeds
         - force_to_master: (6,) wrench for the device [N, N m]
@@ -130,7 +130,7 @@ class ExternalMaster(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Move the device's pose to `target` (7,) X_BE within 2 ms; None releases the device."""
+        """Interpolate the device's X_BE to `target` (7,) over 2 ms; None releases the device."""
         now, path = self._present(context), np.zeros(_PATH)
         path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:

@@ -107,7 +107,9 @@ class HaplyDevice:
             return None
         except ConnectionClosed as error:
             raise DrakeTeleopError(
-                "the service has closed the connection", where="haply"
+                "the service has closed the connection",
+                where="haply",
+                remedy="restart the Haply service",
             ) from error
         if message is None:
             return None

@@ -248,7 +248,9 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             raise _cannot_repeat(changed if name == "files" else what, path)
     changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
-        raise DrakeTeleopError("has a duration of 0 s", where=str(path))
+        raise DrakeTeleopError(
+            "has a duration of 0 s", where=str(path), remedy="record the drive again"
+        )
     return changes
 
 
@@ -262,7 +264,11 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
         if len(line) != len(_COLUMNS):
-            raise DrakeTeleopError(f"has {len(line)} values, not {len(_COLUMNS)}", where=where)
+            raise DrakeTeleopError(
+                f"has {len(line)} values, must have {len(_COLUMNS)}",
+                where=where,
+                remedy="use the file as recorded",
+            )
         for column, name in enumerate(_COLUMNS):
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
@@ -271,7 +277,11 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
         try:
             ms, *values = map(int, line)
         except ValueError:
-            raise DrakeTeleopError("has a value that is not a whole number", where=where) from None
+            raise DrakeTeleopError(
+                "has a value that is not a whole number",
+                where=where,
+                remedy="use the file as recorded",
+            ) from None
         if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
             raise DrakeTeleopError(
                 f"{ms} ms is not a valid time",
@@ -283,6 +293,8 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
             low, high = range_of(name)
             if not low <= inputs[name] <= high:
                 raise DrakeTeleopError(
-                    f"{name} = {inputs[name]} is outside {low} to {high}", where=where
+                    f"{name} = {inputs[name]} is outside {low} to {high}",
+                    where=where,
+                    remedy="use the file as recorded",
                 )
         yield ms, Inputs(**inputs)

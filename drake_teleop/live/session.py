@@ -379,6 +379,10 @@ def read_drive(folder: str | Path) -> Drive:
     load = read_load(folder / LOAD)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD).exists()):
-        raise DrakeTeleopError("is damaged, or not a load of a drive", where=str(folder / LOAD))
+        raise DrakeTeleopError(
+            "is damaged, or not a load of a drive",
+            where=str(folder / LOAD),
+            remedy="record the drive again",
+        )
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
     return Drive(driven, load, changes, (folder / DEVICE).exists(), folder)

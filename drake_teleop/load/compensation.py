@@ -199,11 +199,19 @@ def scales_from_eta(eta: float) -> tuple[float, float, float]:
         DrakeTeleopError: if eta is outside [0, 1].
     """
     if not 0.0 <= number("eta", eta) <= 1.0:
-        raise DrakeTeleopError(f"{eta:g} is outside 0 to 1", where="eta")
+        raise DrakeTeleopError(
+            f"{eta:g} is outside 0 to 1",
+            where="eta",
+            remedy="give the share of the object that stays",
+        )
     return 0.0, float(eta), 1.0
 
 
 def _scale(name: str, value: float) -> float:
     if not 0.0 <= number(name, value) < np.inf:
-        raise DrakeTeleopError(f"{value} is not a finite number >= 0", where=name)
+        raise DrakeTeleopError(
+            f"{value} is not a finite number >= 0",
+            where=name,
+            remedy="give a scale, such as 0 or 1",
+        )
     return float(value)

@@ -177,14 +177,22 @@ class Identification:
 
         def numbers(name: str, *shape: int, largest: float = np.inf) -> Array:
             if not _only_numbers(document[name]):
-                raise DrakeTeleopError("holds no numbers", where=f"{path}:{name}")
+                raise DrakeTeleopError(
+                    "contains values that are not numbers",
+                    where=f"{path}:{name}",
+                    remedy=_REIDENTIFY,
+                )
             array = checked(f"{path}:{name}", document[name], *shape)
             if np.abs(array).max() > largest:
-                raise DrakeTeleopError(f"is above {largest:g} in magnitude", where=f"{path}:{name}")
+                raise DrakeTeleopError(
+                    f"has an absolute value above {largest:g}",
+                    where=f"{path}:{name}",
+                    remedy=_REIDENTIFY,
+                )
             return array
 
         if not isinstance(document["method"], str):
-            raise DrakeTeleopError("is not a text", where=f"{path}:method")
+            raise DrakeTeleopError("is not a text", where=f"{path}:method", remedy=_REIDENTIFY)
         readers: dict[str, Callable[[str, Any], Any]] = {
             "weight_removed": _read_flag,
             "degrees_of_freedom": _read_degrees,
@@ -195,7 +203,7 @@ class Identification:
         }
         phi = check_identified(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
-            raise DrakeTeleopError("has no mass", where=f"{path}:phi")
+            raise DrakeTeleopError("has no mass", where=f"{path}:phi", remedy=_REIDENTIFY)
         result = cls(
             phi=phi,
             offsets=numbers("offsets", 6, largest=_MAX_VALUE),
@@ -210,7 +218,9 @@ class Identification:
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
             raise DrakeTeleopError(
-                "does not follow from phi, covariance and flags", where=f"{path}:verdicts"
+                "does not follow from phi, covariance and flags",
+                where=f"{path}:verdicts",
+                remedy=_REIDENTIFY,
             )
         for name, value in result._derived().items():
             if isinstance(value, bool):
@@ -281,7 +291,7 @@ def _read_json(path: str | Path) -> dict[str, Any]:
         )
     document = read_json(path)
     if not isinstance(document, dict):
-        raise DrakeTeleopError("is not a JSON object", where=str(path))
+        raise DrakeTeleopError("is not a JSON object", where=str(path), remedy=_REIDENTIFY)
     return document
 
 
@@ -297,19 +307,23 @@ def _read_covariance(where: str, value: Any) -> Array:
     except ValueError:
         raw = np.empty(0)
     if raw.shape != (16, 16):
-        raise DrakeTeleopError("is not a (16, 16) table of numbers", where=where)
+        raise DrakeTeleopError(
+            "is not a (16, 16) table of numbers", where=where, remedy=_REIDENTIFY
+        )
     unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
     if not _only_numbers(raw[~unknown].tolist()):
-        raise DrakeTeleopError("holds no numbers", where=where)
+        raise DrakeTeleopError(
+            "contains values that are not numbers", where=where, remedy=_REIDENTIFY
+        )
     covariance = checked(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
-        raise DrakeTeleopError("has a negative variance", where=where)
+        raise DrakeTeleopError("has a negative variance", where=where, remedy=_REIDENTIFY)
     return np.where(unknown, np.inf, covariance)
 
 
 def _read_flag(where: str, value: Any) -> bool:
     if not isinstance(value, bool):
-        raise DrakeTeleopError("is not true or false", where=where)
+        raise DrakeTeleopError("is not true or false", where=where, remedy=_REIDENTIFY)
     return value
 
 
@@ -317,17 +331,19 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
     if not (
         isinstance(value, list) and len(value) == 16 and all(isinstance(v, bool) for v in value)
     ):
-        raise DrakeTeleopError("is not a list of 16 true or false", where=where)
+        raise DrakeTeleopError("is not a list of 16 true or false", where=where, remedy=_REIDENTIFY)
     return np.array(value, dtype=bool)
 
 
 def _read_degrees(where: str, value: Any) -> Array:
     if not (isinstance(value, list) and _only_numbers([v for v in value if v is not None])):
-        raise DrakeTeleopError("is not a list of 16 numbers or null", where=where)
+        raise DrakeTeleopError(
+            "is not a list of 16 numbers or null", where=where, remedy=_REIDENTIFY
+        )
     degrees = checked(where, [0.0 if v is None else v for v in value], 16)
     unknown = np.array([v is None for v in value])
     if not (degrees[~unknown] > 0.0).all():
-        raise DrakeTeleopError("is not positive throughout", where=where)
+        raise DrakeTeleopError("has a value that is not positive", where=where, remedy=_REIDENTIFY)
     return np.where(unknown, np.inf, degrees)
 
 

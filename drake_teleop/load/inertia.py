@@ -37,7 +37,11 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
     p = checked("p_SoBcm_S", p_SoBcm_S, 3)
     I = checked("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
     if np.abs(I - I.T).max() > 1e-9 * np.abs(I).max():
-        raise DrakeTeleopError("the inertia tensor is not symmetric", where="I_BBcm_S")
+        raise DrakeTeleopError(
+            "the inertia tensor is not symmetric",
+            where="I_BBcm_S",
+            remedy="give equal products of inertia above and below the diagonal",
+        )
     about_origin = I + _point_inertia(p, m)
     return np.concatenate([[m], m * p, about_origin[np.triu_indices(3)]])
 
@@ -53,7 +57,11 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
     phi = checked("phi", phi, 10)
     m = float(phi[0])
     if m == 0.0:
-        raise DrakeTeleopError("a load without mass has no centre of mass", where="phi")
+        raise DrakeTeleopError(
+            "a load without mass has no centre of mass",
+            where="phi",
+            remedy="give a mass phi[0] other than 0",
+        )
     p = phi[1:4] / m
     return m, p, inertia_about_origin(phi) - _point_inertia(p, m)
 
@@ -82,7 +90,9 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
     """Return the load phi (10,) with this pseudo-inertia J (4, 4)."""
     J = checked("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
-        raise DrakeTeleopError("the pseudo-inertia is not symmetric", where="J")
+        raise DrakeTeleopError(
+            "the pseudo-inertia is not symmetric", where="J", remedy="give, say, (J + J.T) / 2"
+        )
     Sigma = J[:3, :3]
     I = np.trace(Sigma) * np.eye(3) - Sigma  # noqa: E741
     return np.concatenate([[J[3, 3]], J[:3, 3], I[np.triu_indices(3)]])
@@ -123,7 +133,11 @@ def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Arr
     """
     R = checked("R_AB", R_AB, 3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
-        raise DrakeTeleopError("is not a rotation matrix", where="R_AB")
+        raise DrakeTeleopError(
+            "is not a rotation matrix",
+            where="R_AB",
+            remedy="give an orthonormal, right-handed matrix",
+        )
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = checked("p_AoBo_A", p_AoBo_A, 3)

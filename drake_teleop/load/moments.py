@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, checked_rows
+from drake_teleop.common.numeric import Array, checked, checked_rows, positive
 from drake_teleop.load.regressor import regressor
 
 _MAX_BLOCKS = 1024
@@ -50,16 +50,24 @@ class Noise:
     def __post_init__(self) -> None:
         walk = checked("noise.walk", np.broadcast_to(self.walk, 12), 12)
         if (walk < 0.0).any():
-            raise DrakeTeleopError("is negative", where="noise.walk")
+            raise DrakeTeleopError(
+                f"has the negative value {walk.min():g}",
+                where="noise.walk",
+                remedy="give steps of 0 or more",
+            )
         rows = []
         for name in ("s", "omega", "alpha"):
             std = checked(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
             if (std < 0.0).any():
-                raise DrakeTeleopError("is negative", where=f"noise.{name}")
+                raise DrakeTeleopError(
+                    f"has the negative value {std.min():g}",
+                    where=f"noise.{name}",
+                    remedy="give standard deviations of 0 or more",
+                )
             rows.append(std)
         object.__setattr__(self, "motion", np.stack(rows))
-        if self.wrench is not None and not (checked("noise.wrench", self.wrench, 6) > 0.0).all():
-            raise DrakeTeleopError("is not positive throughout", where="noise.wrench")
+        if self.wrench is not None:
+            positive("noise.wrench", self.wrench, 6)
 
 
 class Moments:
@@ -107,10 +115,7 @@ class Moments:
             self._sums += part + np.triu(part, 1).T
 
     def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
-        """Return the mean noise covariance (19, 19) of z, for wrench noise (6,) [N, N m].
-
-        z are the signals of `Moments`.
-        """
+        """Return the mean noise covariance (19, 19) of z, for wrench noise (6,) [N, N m]."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
@@ -125,7 +130,7 @@ class Moments:
 
     @staticmethod
     def walk_covariance(noise: Noise) -> Array:
-        """Return the covariance (19, 19) of a random-walk step of the signals z."""
+        """Return the covariance (19, 19) of a random-walk step of z, Eq. (T4)."""
         Q = np.zeros((19, 19))
         Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
         return Q
@@ -133,7 +138,7 @@ class Moments:
 
 @cache
 def coefficients() -> Array:
-    """Return the constant T (6, 16, 19) with regressor [E V] = T z, z the signals of `Moments`."""
+    """Return the constant T (6, 16, 19) with regressor [E V] = T z, Eq. (T4)."""
     T, unit, zero = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
     T[np.arange(6), np.arange(6), 0] = 1.0
     T[:, 6:, 7:10] = np.moveaxis(regressor(unit, zero, zero), 0, -1)

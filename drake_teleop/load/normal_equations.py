@@ -35,7 +35,7 @@ _SAME_POSE_M_S2, _F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
 _ROUNDING_RESIDUAL = 1e-6
 _WRENCH, _FORCE = slice(1, 7), slice(7, 10)
-"""Positions of wrench and specific force in the signals z of `Moments`."""
+"""Indices of wrench and specific force in the vector z of `Moments`, Eq. (T4)."""
 
 
 class NormalEquations(Moments):
@@ -61,7 +61,7 @@ class NormalEquations(Moments):
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
             raise DrakeTeleopError(
-                "the mass cannot be identified from this wrench",
+                "the mass cannot be identified: the wrench does not depend on the motion",
                 where="wrench",
                 remedy="check that the sensor is connected and that its orientation changes",
             )

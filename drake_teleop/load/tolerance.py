@@ -75,12 +75,16 @@ def read_tolerance(text: str) -> Tolerance:
             value = 0.0
         if name not in QUANTITIES or (unit == "%") == (name == "com") or name in found:
             raise DrakeTeleopError(
-                f"{part.strip()!r} is not a tolerance",
+                f"{part.strip()!r} cannot be read as one tolerance per quantity",
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
         if not _MIN_VALUE <= value <= _MAX_VALUE:
-            raise DrakeTeleopError(f"{part.strip()!r} is outside 1e-9 to 10", where=text)
+            raise DrakeTeleopError(
+                f"{part.strip()!r} is outside 1e-9 to 10 (as a share, or in m)",
+                where=text,
+                remedy="correct the number or its unit",
+            )
         found[name] = value
     return Tolerance(**found)
 

@@ -104,7 +104,9 @@ class FourierTrajectory:
             )
             frequency = float(data["frequency"])
         except KeyError as error:
-            raise DrakeTeleopError(f"{error} is missing", where=str(path)) from None
+            raise DrakeTeleopError(
+                f"{error} is missing", where=str(path), remedy="give q0, rho, delta and frequency"
+            ) from None
         except DrakeTeleopError:
             raise
         except (AttributeError, TypeError, ValueError) as error:
@@ -113,11 +115,14 @@ class FourierTrajectory:
         numbers = np.concatenate([q0.ravel(), rho.ravel(), delta.ravel(), [frequency]])
         if not (shapes_fit and np.isfinite(numbers).all() and frequency > 0):
             raise DrakeTeleopError(
-                "is not a trajectory: q0 is a number, rho and delta have one for each harmonic",
+                "is not a trajectory: q0, rho and delta differ in shape, or a number is not finite",
                 where=str(path),
+                remedy="give each joint one q0, and one rho and delta per harmonic",
             )
         if np.abs(numbers).max() > _MAX_NUMBER:
-            raise DrakeTeleopError(f"contains numbers above {_MAX_NUMBER:g}", where=str(path))
+            raise DrakeTeleopError(
+                f"contains numbers above {_MAX_NUMBER:g}", where=str(path), remedy="give rad and Hz"
+            )
         return cls(q0, rho, delta, frequency)
 
 

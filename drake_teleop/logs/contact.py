@@ -268,7 +268,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 
 def noise_floor(contact: Array) -> Array:
-    """Return the noise (6,) of a contact wrench (N, 6), calm for half of the record, Eq. (T12)."""
+    """Return the noise (6,) of a contact wrench (N, 6), at least half contact-free, Eq. (T12)."""
     floor = narrowest_half(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):

@@ -113,7 +113,7 @@ def _are_numbers(names: Sequence[str]) -> bool:
 
 
 def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
-    """Write a draft; correct it by the data, and add what is missing as comments and findings."""
+    """Write a draft description, corrected by the data; missing fields become comments."""
     write_text(path, draft.text())
     summary["draft"] = str(path)
     lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft.text() else []
@@ -132,7 +132,7 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
 
 
 def _fitted_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
-    """Return the draft with the corrections that its data require, and inspect it.
+    """Return the draft description corrected by its data, and inspect it.
 
     Each round applies the first finding that names the right values of fields.
     """
@@ -259,7 +259,7 @@ def _repeated(
     if period > 1 and rate is not None:
         what = f"every value is held for {period} rows{news}, not {rate:.4g} Hz"
     else:
-        what = f"{held} rows repeat the one before in all channels, up to {longest} in a row{news}"
+        what = f"{held} rows repeat the one before in all channels, at most {longest} at once{news}"
     remedy = "delete the repeated rows"
     if time is not None and time.column is None:
         remedy = f"give time stamps (time.column) and {remedy}"

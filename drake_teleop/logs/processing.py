@@ -107,7 +107,7 @@ class EliminatedLog:
     Attributes:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
-        point_mass: names of inertias that are those of a point mass.
+        point_mass: unidentified inertial parameters, set to those of a point mass.
         offsets: (6,) sensor offsets of this record [N, N m].
         tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
@@ -375,7 +375,11 @@ def eliminate_log(
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
         source = (free_motion if free_motion.log.static else found).log.source
-        raise DrakeTeleopError("contains poses at rest, which have no contact", where=source)
+        raise DrakeTeleopError(
+            "contains poses at rest, which have no contact",
+            where=source,
+            remedy="give a log of a motion",
+        )
     if found.log.static:
         return found
     samples = samples_of(found.log, found.contact, cutoff_hz)
@@ -408,7 +412,9 @@ def _eliminated(
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
-            "is for the causal wrench only", where="causal_tare_s", remedy="give causal as well"
+            "applies only to wrenches as in a control loop (`causal`)",
+            where="causal_tare_s",
+            remedy="give causal as well, or remove it",
         )
     phi, point_mass = usable_phi(identification)
     phi_object = phi - phi_gripper
@@ -521,10 +527,7 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return the load phi (10,), and names of unidentified inertias.
-
-    They are replaced by those of a point mass.
-    """
+    """Return phi (10,) with unidentified inertias set to a point mass's, and their names."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(~identification.identifiable[10:])
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
@@ -577,7 +580,11 @@ def _scales(
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
         if value is not None and not 0.0 <= number(name, value) <= _LARGEST_SCALE:
-            raise DrakeTeleopError(f"{value:g} is outside 0 to {_LARGEST_SCALE:g}", where=name)
+            raise DrakeTeleopError(
+                f"{value:g} is outside 0 to {_LARGEST_SCALE:g}",
+                where=name,
+                remedy="give a scale, such as 0 or 1",
+            )
     if sigma_object is not None and not split:
         raise DrakeTeleopError(
             "sigma_object requires a gripper",
@@ -633,7 +640,9 @@ def detect_log(
     )
     if found.log.static:
         raise DrakeTeleopError(
-            "contains poses at rest, which have no contact", where=found.log.source
+            "contains poses at rest, which have no contact",
+            where=found.log.source,
+            remedy="give a log of a motion",
         )
     if found.detection is None:
         raise DrakeTeleopError(

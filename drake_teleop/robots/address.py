@@ -48,7 +48,9 @@ class Address:
             values = []
         if len(values) != count or not all(0.0 < value < math.inf for value in values):
             raise DrakeTeleopError(
-                f"{name}={text!r} is not {count} positive numbers", where=self.text
+                f"{name}={text!r} is not {count} positive numbers",
+                where=self.text,
+                remedy="separate them by commas",
             )
         return values
 
@@ -57,7 +59,9 @@ class Address:
         text = self._parameters.get(name, among[0])
         if text not in among:
             raise DrakeTeleopError(
-                f"{name}={text!r} is neither {' nor '.join(among)}", where=self.text
+                f"{name}={text!r} is unknown",
+                where=self.text,
+                remedy=f"give {' or '.join(among)}",
             )
         return text
 
@@ -68,5 +72,7 @@ class Address:
         """
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
-            raise DrakeTeleopError(f"sign={text!r} is neither 1 nor -1", where=self.text)
+            raise DrakeTeleopError(
+                f"sign={text!r} is unknown", where=self.text, remedy="give 1 or -1"
+            )
         return -1.0 if text == "-1" else 1.0

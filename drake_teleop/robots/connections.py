@@ -69,7 +69,7 @@ def open_source(
         )
     if motion is not None or sensor_pose is not None or arm is not None:
         raise DrakeTeleopError(
-            "delivers the motion of the sensor itself",
+            "this source already contains the motion of sensor frame S",
             where=address,
             remedy="remove --motion, --model and --sensor-pose",
         )

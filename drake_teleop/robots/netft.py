@@ -128,7 +128,7 @@ class NetFtSource:
 def _read_page(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
-    remedy = "or give them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
+    remedy = "check the host, or give netft://HOST?counts=FORCE,TORQUE&rate=HZ"
     where = f"http://{address.host}/netftapi2.xml"
     connection = HTTPConnection(address.host, timeout=_PAGE_TIMEOUT_S)
     try:
@@ -136,7 +136,9 @@ def _read_page(address: Address) -> list[float]:
         return parse_page(connection.getresponse().read(_MAX_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
-            f"counts, units and rate cannot be read ({error!r})", where=where, remedy=remedy
+            f"counts per unit, units and rate cannot be read from the sensor's page ({error!r})",
+            where=where,
+            remedy=remedy,
         ) from error
     finally:
         connection.close()

@@ -187,7 +187,7 @@ class _Samples:
     def table(self, width: int, left_out: int) -> tuple[Array, Array]:
         if len(self.t) < 2:
             raise DrakeTeleopError(
-                f"{len(self.t)} good readings received, {left_out} rejected",
+                f"{len(self.t)} valid and {left_out} invalid readings received (2 valid ones are required)",
                 where="calibrate",
                 remedy="check that the source sends to this port",
             )

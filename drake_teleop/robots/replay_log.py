@@ -18,11 +18,13 @@ from drake_teleop.robots.streams import Flag, Reading, Source
 
 
 class LogSource(Source[Reading]):
-    """Source of a log's readings. The motion comes late by its delay, `wait` readings.
+    """Source of a log's readings, with the motion aligned to the wrench.
+
+    `wait`: removed delay of the motion, in readings.
 
     Args:
-        load: load for the estimate of the delay; None keeps wrench and motion as recorded. If the
-            robot removed its weight, the acceleration replaces the specific force.
+        load: load for the estimate of the delay; None: no alignment. If the robot has removed the
+            load's weight from the wrench, s is the acceleration.
         cutoff_hz, delay: see `eliminate_log`.
         real_time: replay in real time; else as fast as possible.
         chunk: maximum number of readings per call.
@@ -40,7 +42,11 @@ class LogSource(Source[Reading]):
     ) -> None:
         log = read_log(path, bandwidth_hz=cutoff_hz)
         if log.static:
-            raise DrakeTeleopError("static poses have no order in time", where=str(path))
+            raise DrakeTeleopError(
+                "static poses have no order in time",
+                where=str(path),
+                remedy="give a log of a motion",
+            )
         delay_s = 0.0
         if load is not None:
             log = accelerated(log) if load.weight_removed else log

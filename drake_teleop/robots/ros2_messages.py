@@ -30,7 +30,11 @@ def domain_of(address: Address) -> int:
     """Return the ROS domain in an address, by default 0; raise DrakeTeleopError if invalid."""
     text = address.parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
-        raise DrakeTeleopError(f"domain={text!r} is not 0 to 232", where=address.text)
+        raise DrakeTeleopError(
+            f"domain={text!r} is not a ROS domain",
+            where=address.text,
+            remedy="give a whole number from 0 to 232",
+        )
     return int(text)
 
 
@@ -65,7 +69,11 @@ def source_topics(
     if (text := address.parameter("tf")) is not None:
         frames, topics["tf"] = tuple(text.split(",")), "tf"
         if len(frames) != 2 or not all(frames):
-            raise DrakeTeleopError("tf is not PARENT,CHILD", where=address.text)
+            raise DrakeTeleopError(
+                f"tf={text!r} does not name two frames",
+                where=address.text,
+                remedy="give tf=PARENT,CHILD",
+            )
     if JOINTS in topics and not joints:
         raise DrakeTeleopError(
             "joint positions need the model of the arm",

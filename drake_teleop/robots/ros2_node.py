@@ -180,7 +180,9 @@ def ros2_command(
     """
     for address in (source, sink):
         if not address.startswith("ros2://"):
-            raise DrakeTeleopError("is not ros2://TOPIC", where=address)
+            raise DrakeTeleopError(
+                "is not an address of a ROS topic", where=address, remedy="give ros2://TOPIC"
+            )
     node = shared_node(domain_of(parse_address(source, SOURCE_PARAMETERS)))
     scales = {name: -1.0 if options.get(name) is None else options[name] for name in _SCALES}
     served: list[ServedCompensator] = []

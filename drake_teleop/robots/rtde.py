@@ -32,7 +32,9 @@ class RtdeSource:
     def __init__(self, address: str) -> None:
         parsed = Address(address, PORT, allowed=("sign",))
         if parsed.port != PORT:
-            raise DrakeTeleopError("RTDE always uses port 30004", where=address)
+            raise DrakeTeleopError(
+                "RTDE always uses port 30004", where=address, remedy="remove the port"
+            )
         require_library("rtde_receive", "ur_rtde", "robots", address)
         self._host, self._sign, self._partial, self._started = parsed.host, parsed.sign(), b"", 0.0
         self._start()
@@ -43,7 +45,11 @@ class RtdeSource:
             self._first += self._samples(left)
         if len(self._first) < _RATE_SAMPLES:
             self.close()
-            raise DrakeTeleopError("no robot answers on port 30004", where=address)
+            raise DrakeTeleopError(
+                "no robot answers on port 30004",
+                where=address,
+                remedy="check the host, and that RTDE is enabled",
+            )
         spacing = min(abs(b[0] - a[0]) for a, b in pairwise(self._first))
         self.dt = 0.002 if spacing < 0.005 else 0.008
 

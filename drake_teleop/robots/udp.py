@@ -70,7 +70,11 @@ def pack_wrench(out: Compensated) -> bytes:
 def unpack_wrench(packet: bytes) -> Compensated:
     """Return the compensated wrench in a packet; raise DrakeTeleopError if it is invalid."""
     if len(packet) != WRENCH.size or packet[:4] != _WRENCH_TAG:
-        raise DrakeTeleopError("is not a wrench packet", where="packet")
+        raise DrakeTeleopError(
+            f"its {len(packet)} bytes are not a compensated wrench",
+            where="packet",
+            remedy=f"check the sender: a wrench has {WRENCH.size} bytes and begins with {_WRENCH_TAG!r}",
+        )
     _, flags, number, t, *values = WRENCH.unpack(packet)
     return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
@@ -163,7 +167,11 @@ class UdpSink:
             self._socket.sendto(pack_wrench(out), self._to)
         except OSError as error:
             if isinstance(error, socket.gaierror):
-                raise DrakeTeleopError("is not a known host", where=self._to[0]) from error
+                raise DrakeTeleopError(
+                    "is not a known host",
+                    where=self._to[0],
+                    remedy="check the name, or give an IP address",
+                ) from error
 
     def close(self) -> None:
         """See `Sink`."""

@@ -172,7 +172,9 @@ def _row_norms(vectors: Array) -> Array:
 
 def _find_logs(run: Path) -> list[Path]:
     if not os.path.exists(run):
-        raise DrakeTeleopError("there is no such folder", where=str(run))
+        raise DrakeTeleopError(
+            "there is no such folder", where=str(run), remedy="give the folder of a run"
+        )
     if run.suffix == ".parquet":
         return [run]
     if (run / "log.parquet").exists():

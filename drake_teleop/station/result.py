@@ -70,7 +70,9 @@ class Signal:
             expect(str, text, "signal")
         if len(units) != len(self.components):
             raise DrakeTeleopError(
-                f"{len(self.components)} components, {len(units)} units", where=self.name
+                f"{len(self.components)} components, but {len(units)} units",
+                where=self.name,
+                remedy="give one unit, or one per component",
             )
 
     @property
@@ -102,7 +104,11 @@ class SimulationResult:
         self._specs = {spec.name: spec for spec in specs}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
-            raise DrakeTeleopError(f"names and specs differ in {', '.join(odd)}", where="signals")
+            raise DrakeTeleopError(
+                f"names and specs differ in {', '.join(odd)}",
+                where="signals",
+                remedy="give each signal one spec",
+            )
         self._values: Mapping[str, NDArray[np.float64]]
         if isinstance(signals, _SignalsOnDisk):
             self._values = signals
@@ -115,7 +121,11 @@ class SimulationResult:
         if array.ndim == 1:
             array = array[:, np.newaxis]
         if array.shape != shape:
-            raise DrakeTeleopError(f"has shape {array.shape}, expected {shape}", where=name)
+            raise DrakeTeleopError(
+                f"has shape {array.shape} instead of {shape}",
+                where=name,
+                remedy="give a row per time and a column per component",
+            )
         return _read_only(array)
 
     @property

@@ -287,7 +287,11 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
         if inner:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):
-                raise DrakeTeleopError(f"there is no block {block} to change", where=place)
+                raise DrakeTeleopError(
+                    f"the scenario has no block {block} to change",
+                    where=place,
+                    remedy=f"set the whole block {block} first",
+                )
             check_field(type(config), inner, value, place)
             value = dataclasses.replace(config, **{inner: value})
         check_field(Scenario, block, value, f"scenario:{block}")

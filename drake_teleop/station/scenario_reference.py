@@ -75,7 +75,15 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
     if found != scenario and _all_texts(found) != _all_texts(scenario):
-        raise DrakeTeleopError("the scenario cannot be written to YAML", where=where)
+        names = [field.name for field in dataclasses.fields(scenario)]
+        lost = [
+            n for n in names if _all_texts(getattr(found, n)) != _all_texts(getattr(scenario, n))
+        ]
+        raise DrakeTeleopError(
+            f"YAML cannot represent the scenario's block {' and '.join(lost)}",
+            where=where,
+            remedy="use printable texts, numbers and lists",
+        )
     write_text(path, text)
 
 

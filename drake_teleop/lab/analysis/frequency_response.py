@@ -147,6 +147,7 @@ def measure_frequency_response(
         raise DrakeTeleopError(
             f"{excitation.period:g} s are not a whole number of steps at {rate:g} Hz",
             where="MultiSine.period",
+            remedy="choose a multiple of the step",
         )
     start = max((move.t_start + move.duration for move in approach), default=0.0)
     intent: list[MinimumJerk | Sine] = [*approach, *excitation.segments(task.hand, start)]

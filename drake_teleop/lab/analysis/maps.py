@@ -125,7 +125,11 @@ def _increasing(name: str, values: ArrayLike) -> Array:
         )
     array = np.asarray(values, dtype=float)
     if array.ndim != 1 or array.size == 0 or not (np.diff(array) > 0).all():
-        raise DrakeTeleopError("the values do not increase", where=f"stability_map:{name}")
+        raise DrakeTeleopError(
+            "the values do not increase",
+            where=f"stability_map:{name}",
+            remedy="give a list of increasing numbers",
+        )
     return array
 
 

@@ -95,7 +95,9 @@ def _sampled_device(
     _checked_positive(period, "period")
     m, b, k = np.broadcast_arrays(mass, damping, stiffness)
     if not np.all(k >= 0):
-        raise DrakeTeleopError("the stiffness of the hand is negative")
+        raise DrakeTeleopError(
+            "the stiffness of the hand is negative", remedy="give 0 or more [N/m]"
+        )
     rates = np.zeros((*m.shape, 3, 3))
     rates[..., 0, 1] = 1
     rates[..., 1, 0], rates[..., 1, 1], rates[..., 1, 2] = -k / m, -b / m, 1 / m
@@ -106,5 +108,5 @@ def _sampled_device(
 def _checked_positive(value: ArrayLike, what: str) -> Array:
     value = np.asarray(value, dtype=float)
     if not np.all(value > 0):
-        raise DrakeTeleopError(f"the {what} is not positive")
+        raise DrakeTeleopError(f"the {what} is not positive", remedy="give values above 0")
     return value

@@ -70,7 +70,9 @@ def task_direction(
     check_scenario(scenario)
     n_W = checked("direction", direction, 3)
     if not np.linalg.norm(n_W) > 0.0:
-        raise DrakeTeleopError("a direction of length zero", where="direction")
+        raise DrakeTeleopError(
+            "has length zero", where="direction", remedy="give a vector (3,) in W"
+        )
     sigma, sigma_object, gamma = scenario.force_scaling.scales()[:3]
     if sigma != sigma_object:
         raise DrakeTeleopError(
@@ -158,6 +160,8 @@ def _slave_posture(slave: SlavePlant, moved: Array) -> Array:
         q, status = find_posture(arm, pose, slave.start)
     if status != IkStatus.OK:
         raise DrakeTeleopError(
-            f"the arm cannot follow by {moved} m ({IkStatus(status).name})", where="displacement"
+            f"the arm cannot follow by {moved} m ({IkStatus(status).name})",
+            where="displacement",
+            remedy="choose a smaller displacement or another start posture",
         )
     return q

@@ -92,7 +92,9 @@ def smallest_stiffness_change(
     stiffness 0: the softest detectable wall.
     """
     if weber <= 0:
-        raise DrakeTeleopError("must be positive", where="weber")
+        raise DrakeTeleopError(
+            f"is {weber:g}, must be positive", where="weber", remedy="give, say, 0.1"
+        )
     _, h12, h21, h22 = entries(H)
     s = 1j * omega
     environment = np.asarray(damping) + np.asarray(stiffness) / s

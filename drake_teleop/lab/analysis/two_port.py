@@ -104,7 +104,9 @@ def power_scaled(H: Complex, ratio: ArrayLike) -> Complex:
     """
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
-        raise DrakeTeleopError("ratio of powers must be positive", where="ratio")
+        raise DrakeTeleopError(
+            "the ratio of powers is not positive", where="ratio", remedy="give values above 0"
+        )
     h11, h12, h21, h22 = entries(H)
     return two_port(h11, h12 / root, h21 * root, h22)
 

@@ -79,6 +79,7 @@ def new_command(
                 raise DrakeTeleopError(
                     "does not describe the given models (their names cannot be written)",
                     where=str(scenario),
+                    remedy="use simpler names of files and frames",
                 )
     except BaseException:
         for each in made:

@@ -84,12 +84,22 @@ class Factor:
         numbers = [*self.values, *itertools.chain(*self.vectors)]
         numbers += [self.high - self.low] if self.low is not None and self.high is not None else []
         if not all(map(math.isfinite, numbers)):
-            raise DrakeTeleopError("its numbers, or their range, are not finite", where=where)
+            raise DrakeTeleopError(
+                "its numbers, or their range, are not finite",
+                where=where,
+                remedy="replace NaN and infinity",
+            )
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise DrakeTeleopError(f"{self.high:g} is not above low", where=f"{where}.high")
+            raise DrakeTeleopError(
+                f"{self.high:g} is not above low, {self.low:g}",
+                where=f"{where}.high",
+                remedy="raise high or lower low",
+            )
         listed = self.listed()
         if any(value in listed[:index] for index, value in enumerate(listed)):
-            raise DrakeTeleopError("a value is repeated", where=where)
+            raise DrakeTeleopError(
+                "a value is repeated", where=where, remedy="list each value once"
+            )
 
 
 @settings
@@ -138,13 +148,17 @@ class Study:
         for index, name in enumerate(fields):
             place = f"{where}:factors[{index}].field"
             if name in fields[:index]:
-                raise DrakeTeleopError(f"{name} is varied twice", where=place)
+                raise DrakeTeleopError(
+                    f"{name} is varied twice", where=place, remedy="remove one factor"
+                )
             if name == "simulation.seed":
                 raise DrakeTeleopError(
                     "the seed cannot be a factor", where=place, remedy="set repeats and seed"
                 )
         if not self.factors:
-            raise DrakeTeleopError("there are no factors", where=f"{where}:factors")
+            raise DrakeTeleopError(
+                "there are no factors", where=f"{where}:factors", remedy="add at least one"
+            )
         if self.design == "sobol" and self.samples & (self.samples - 1):
             raise DrakeTeleopError(
                 f"{self.samples} Sobol points are not balanced",

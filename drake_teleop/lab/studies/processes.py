@@ -56,7 +56,9 @@ def processes(
     if executor is not None:
         if not isinstance(executor, Executor):
             raise DrakeTeleopError(
-                f"{type(executor).__name__} is not a concurrent.futures.Executor", where="executor"
+                f"{type(executor).__name__} is not a concurrent.futures.Executor",
+                where="executor",
+                remedy="pass a ProcessPoolExecutor, for instance",
             )
         yield Processes(
             getattr(executor, "_max_workers", max(jobs, 1)),
@@ -176,7 +178,9 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
             client = Client(**local) if address == "local" else Client(address)
         except (OSError, ValueError) as error:
             raise DrakeTeleopError(
-                f"no Dask scheduler answers at {address} ({error})", where="--cluster"
+                f"no Dask scheduler answers at {address} ({error})",
+                where="--cluster",
+                remedy="start one, or check the address",
             ) from None
         with client:
             yield client

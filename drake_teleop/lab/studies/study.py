@@ -111,7 +111,11 @@ def study_command(
         ("cluster", "executor", cluster and executor is not None),
     ):
         if both:
-            raise DrakeTeleopError(f"{first} and {second} exclude each other", where=str(path))
+            raise DrakeTeleopError(
+                f"{first} and {second} exclude each other",
+                where=str(path),
+                remedy="remove one of them",
+            )
     study, path = LoadStudy(path), shipped_file("study", path, studies_dir())
     study.repeats = repeats or study.repeats
     study.check_size(str(path), yes)

@@ -82,7 +82,11 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
     limits = f"{_MIN_WALL / 1e3:g} to {_MAX_WALL / 1e3:g} kN/m"
     for wall in walls:
         if not (math.isfinite(wall) and _MIN_WALL <= 1e3 * wall <= _MAX_WALL):
-            raise DrakeTeleopError(f"{wall:g} kN/m is outside {limits}", where="walls")
+            raise DrakeTeleopError(
+                f"{wall:g} kN/m is outside {limits}",
+                where="walls",
+                remedy="give stiffnesses in kN/m",
+            )
     if not walls:
         raise DrakeTeleopError(
             "there is no wall", where="walls", remedy="give kN/m, such as 0.5,20"

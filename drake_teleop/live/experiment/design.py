@@ -139,7 +139,9 @@ class Experiment:
                 )
         kinds = [type(task).__name__ for task in self.tasks]
         if len(set(kinds)) < len(kinds):
-            raise DrakeTeleopError("a task is listed twice", where=f"{where}:tasks")
+            raise DrakeTeleopError(
+                "a task is listed twice", where=f"{where}:tasks", remedy="remove one"
+            )
         for index, task in enumerate(self.tasks):
             if not isinstance(task, PegInSlot) and not 2.0 * task.low <= task.high:
                 raise DrakeTeleopError(
@@ -151,7 +153,11 @@ class Experiment:
         for index, condition in enumerate(self.conditions):
             place = f"{where}:conditions[{index}]"
             if not condition.name or condition.name in names[:index]:
-                raise DrakeTeleopError("is empty or not unique", where=f"{place}.name")
+                raise DrakeTeleopError(
+                    "is empty or not unique",
+                    where=f"{place}.name",
+                    remedy="give each condition a name",
+                )
             if condition.eta is not None and condition.sigma != 0.0:
                 raise DrakeTeleopError(
                     "cannot be combined with sigma", where=f"{place}.eta", remedy="set sigma: 0"

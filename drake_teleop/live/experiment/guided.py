@@ -179,7 +179,7 @@ class Guided:
 
     @property
     def ms(self) -> int:
-        """Simulated time of the present interval [ms]."""
+        """Simulated time since the present interval of the trial began [ms]."""
         return self._live.ms
 
     @property

@@ -89,7 +89,11 @@ def serve_experiment(
     reason, (done, trials) = live.until_signal(), live.done()
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
-        raise DrakeTeleopError(f"the session has ended: {live.ended}; {what}", where="drive")
+        raise DrakeTeleopError(
+            f"the session has ended: {live.ended}; {what}",
+            where="drive",
+            remedy="run the same command again to continue",
+        )
     if done < trials:
-        raise KeyboardInterrupt(f"{reason}: {what}; the same command continues")
+        raise KeyboardInterrupt(f"{reason}: {what}; run the same command again to continue")
     print(f"\nended by {reason}: {what}")

@@ -45,11 +45,23 @@ class Prior:
 
     def __post_init__(self) -> None:
         if self.kind not in _PRIORS:
-            raise DrakeTeleopError(f"{self.kind!r} is not one of {_PRIORS}", where="prior.kind")
+            raise DrakeTeleopError(
+                f"{self.kind!r} is unknown",
+                where="prior.kind",
+                remedy=f"choose {' or '.join(_PRIORS)}",
+            )
         if not 0.0 < self.weight < np.inf:
-            raise DrakeTeleopError(f"{self.weight} is not positive", where="prior.weight")
+            raise DrakeTeleopError(
+                f"{self.weight} is not positive and finite",
+                where="prior.weight",
+                remedy="give a number above 0",
+            )
         if np.linalg.eigvalsh(pseudo_inertia(self.phi))[0] <= 0.0:
-            raise DrakeTeleopError("is not a body with extent in all directions", where="prior.phi")
+            raise DrakeTeleopError(
+                "its body has no extent in some direction",
+                where="prior.phi",
+                remedy="give a body with mass, and inertia about all axes",
+            )
 
     def information(self, samples: int) -> Array:
         """Return the inverse covariance (10, 10) of phi from the prior, for `samples` samples."""
@@ -73,7 +85,11 @@ class Ellipsoid:
         """Return coefficients (10,); their product with a phi of a mass inside is not negative."""
         A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
-            raise DrakeTeleopError("is not positive definite", where="ellipsoid.matrix")
+            raise DrakeTeleopError(
+                "is not positive definite",
+                where="ellipsoid.matrix",
+                remedy="give a symmetric matrix with positive eigenvalues",
+            )
         E = np.block([[-A, (A @ c)[:, None]], [A @ c, 1.0 - c @ A @ c]])
         return np.array([np.sum(unit * E) for unit in _BASIS])
 
@@ -110,7 +126,11 @@ def consistent_least_squares(
 def _parameter_units(phi: Array) -> Array:
     m = abs(phi[0])
     if m == 0.0:
-        raise DrakeTeleopError("the mass cannot be identified from this wrench", where="wrench")
+        raise DrakeTeleopError(
+            "the mass is 0, and cannot be identified",
+            where="wrench",
+            remedy="check that the sensor is connected and its orientation changes",
+        )
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
     L = max(_MIN_LENGTH_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])

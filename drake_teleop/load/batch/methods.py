@@ -211,7 +211,7 @@ def identify_batch(
     METHODS.check(method, "method")
     expect((Noise, type(None)), noise, "noise")
     if not number("gain_std", gain_std) >= 0.0:
-        raise DrakeTeleopError("is negative", where="gain_std")
+        raise DrakeTeleopError(f"{gain_std} is negative", where="gain_std", remedy="give 0 or more")
     if method != "consistent" and (prior, ellipsoid) != (None, None):
         raise DrakeTeleopError(
             f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"

@@ -50,7 +50,9 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
     By Student's t distribution; (-inf, inf) for undetermined parameters.
     """
     if not 0.0 < level < 1.0:
-        raise DrakeTeleopError(f"{level} is not within (0, 1)", where="level")
+        raise DrakeTeleopError(
+            f"{level} is not between 0 and 1", where="level", remedy="give, say, 0.95"
+        )
     degrees = np.minimum(load.degrees_of_freedom, _NORMAL_DEGREES)
     half = stdtrit(degrees, 0.5 + 0.5 * level) * load.standard_deviations
     theta = np.concatenate([load.offsets, load.phi])
@@ -64,7 +66,9 @@ def prior_dominated(
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
-            f"needs positive numbers of shape {deviations.shape}", where="prior_std"
+            f"has shape {prior.shape}, or values that are not positive",
+            where="prior_std",
+            remedy=f"give positive numbers of shape {deviations.shape}",
         )
     return np.asarray(deviations >= share * prior)
 
@@ -255,7 +259,7 @@ def _inverse_gram(fit: Fit) -> Array:
 def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
-    `kept` (N,) marks used samples; `steps` (6, 6) is the covariance of a step, as wrenches.
+    `kept` (N,) marks used samples; `steps` (6, 6): covariance of the resulting wrench steps.
     """
     covariance = np.zeros((16, 16))
     if not steps.any():

@@ -57,7 +57,7 @@ LEAVE = 0.7 * RARE
 def detection_update(
     memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
 ):
-    """Update the memory by one sample and write the `STATISTICS` to memory[5:8].
+    """Process one sample and write the `STATISTICS` to memory[5:8].
 
     Args:
         memory: (SIZE,), zeros before the first sample.
@@ -178,7 +178,7 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 @njit(cache=True)
 def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Update the memory by one sample and return whether there is contact.
+    """Process one sample and return whether there is contact.
 
     The last two arguments are `ContactDetector.settings`.
     """
@@ -223,7 +223,11 @@ class ContactDetector:
         column = statistic_index(statistic)
         enter, exit_level = float(positive("threshold", threshold)), float(positive("leave", leave))
         if not 0.0 <= following < 1.0:
-            raise DrakeTeleopError(f"{following} is not within [0, 1)", where="following")
+            raise DrakeTeleopError(
+                f"{following} is not at least 0 and below 1",
+                where="following",
+                remedy="give 0 for no following",
+            )
         sums = float(positive("slack", slack)), float(following)
         decision = column, enter, exit_level, int(hold)
         #: Last arguments of `flag_update`.
@@ -236,7 +240,7 @@ class ContactDetector:
         return np.zeros(SIZE)
 
     def update(self, *sample: ArrayLike) -> bool:
-        """Update by one sample, as in `Samples`; return whether there is contact."""
+        """Process one sample (fields of `Samples`); return whether there is contact."""
         named = zip(Samples._fields, sample, strict=True)
         arrays = [checked(name, x, 6 if name == "contact" else 3) for name, x in named]
         return bool(flag_update(self._memory, *arrays, *self.settings))

@@ -100,13 +100,17 @@ class NoiseFloor:
             checked("rho", self.rho, 6),
         )
         if (np.abs(rho) >= 1.0).any():
-            raise DrakeTeleopError("is not within -1 to 1", where="rho")
+            raise DrakeTeleopError(
+                "has a value that is not between -1 and 1", where="rho", remedy=_REFIT
+            )
         positive("widths", self.widths, LENGTHS)
         checked("reached", self.reached, 3)
         if not 0.0 <= self.fade < 1.0:
-            raise DrakeTeleopError(f"{self.fade} is not within [0, 1)", where="fade")
+            raise DrakeTeleopError(
+                f"{self.fade} is not at least 0 and below 1", where="fade", remedy=_REFIT
+            )
         if np.linalg.eigvalsh(correlation).min() <= 0.0:
-            raise DrakeTeleopError("is not positive definite", where="correlation")
+            raise DrakeTeleopError("is not positive definite", where="correlation", remedy=_REFIT)
 
     def threshold(self, statistic: str, margin: float = MARGIN) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""

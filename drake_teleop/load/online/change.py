@@ -202,7 +202,7 @@ def _inflate_inertia_variances(memory, noise, block):
 
 @njit(cache=True)
 def change_update(memory, sample, block, noise, window, hold, bound):
-    """Update the change detector by one sample.
+    """Process one sample in the change detector.
 
     Args:
         memory: from `change_memory`, updated.
@@ -310,7 +310,11 @@ def change_parameters(
     """
     positive("period", period)
     if not 0.0 <= model_error < 1.0:
-        raise DrakeTeleopError(f"{model_error} is not within [0, 1)", where="model_error")
+        raise DrakeTeleopError(
+            f"{model_error} is not at least 0 and below 1",
+            where="model_error",
+            remedy="give the relative error of the model",
+        )
     bound = max(BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
     block = max(1, round(BLOCK / period))
     window, hold, memory = (max(1, round(x / (block * period))) for x in (WINDOW, HOLD, MEMORY))

@@ -117,9 +117,15 @@ class RecursiveEstimator(ABC):
         bound: float = SETTLED,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
-            raise DrakeTeleopError(f"{forgetting} is not within (0, 1]", where="forgetting")
+            raise DrakeTeleopError(
+                f"{forgetting} is not above 0 and at most 1",
+                where="forgetting",
+                remedy="give 1 for no forgetting",
+            )
         if not bound > 0.0:
-            raise DrakeTeleopError(f"{bound} is not positive", where="bound")
+            raise DrakeTeleopError(
+                f"{bound} is not positive", where="bound", remedy="give a number above 0"
+            )
         self._noise_std = positive("noise_std", noise_std, 6)
         self._forgetting, self._bound = float(forgetting), float(bound)
         self._prior = positive("prior_std", prior_std, 16) ** 2
@@ -172,7 +178,7 @@ class RecursiveEstimator(ABC):
         """Return the covariance (16, 16) of an external theta and memory [SI]."""
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
-        """Update an external theta and memory by one sample, without checks.
+        """Process one sample with an external theta and memory, without checks.
 
         Args:
             theta: (16,) estimate, updated.
@@ -189,7 +195,7 @@ class RecursiveEstimator(ABC):
         """Return the RMS (6,) of the residuals [N, N m]."""
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Update by one sample of a free motion, (6,) and (3,), arguments as for `identify`.
+        """Process one sample of a free motion: wrench (6,), others (3,), as for `identify`.
 
         Raises:
             DrakeTeleopError: for invalid input; the estimate is then unchanged.
@@ -202,7 +208,9 @@ class RecursiveEstimator(ABC):
             raise DrakeTeleopError(f"{names} have shapes {shapes}", where="sample", remedy=remedy)
         sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
-            raise DrakeTeleopError("is not finite", where="sample")
+            raise DrakeTeleopError(
+                "contains NaN or infinity", where="sample", remedy="leave the sample out"
+            )
         self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 
@@ -215,7 +223,9 @@ class RecursiveEstimator(ABC):
     def identification(self) -> Identification:
         """Return the present estimate."""
         if self._theta[6] == 0.0:
-            raise DrakeTeleopError("there was no update yet", where="estimator")
+            raise DrakeTeleopError(
+                "has not received a sample", where="estimator", remedy="call update first"
+            )
         covariance = self.covariance
         deviations = np.sqrt(np.diag(covariance))
         return Identification(

@@ -374,7 +374,11 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     ) -> None:
         self._motion_std = checked("motion_std", motion_std, 9)
         if (self._motion_std < 0.0).any():
-            raise DrakeTeleopError("is negative", where="motion_std")
+            raise DrakeTeleopError(
+                f"has the negative value {self._motion_std.min():g}",
+                where="motion_std",
+                remedy="give standard deviations of 0 or more",
+            )
         super().__init__(noise_std, forgetting, prior_std, bound)
 
     @classmethod

@@ -118,7 +118,7 @@ def _is_within_reach(known, new):
 
 @njit(cache=True)
 def watched_update(out, memory, sample, fallback, period, block, noise, window, hold, bound):
-    """Update the load to eliminate by one sample, without checks.
+    """Process one sample: monitor the known load and write the load to eliminate; no checks.
 
     Args:
         out: (16,) [offsets; phi] to eliminate, updated.

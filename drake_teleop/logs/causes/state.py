@@ -141,7 +141,7 @@ class Fit:
 def fit(
     model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
 ) -> Fit:
-    """Fit a model to rows in at most `steps` iterations, from the parameters `start` (size,)."""
+    """Fit a model to rows from parameters `start` (size,), in at most `steps` iterations."""
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
@@ -219,7 +219,7 @@ class State:
         return self.fit.x
 
     def extension(self, name: str) -> tuple[Array, Array]:
-        """Return the parameters of an extension, and their covariance."""
+        """Return the parameters of a named extension of the load model, and their covariance."""
         where = self.model.slices[name]
         return self.x[where], self.fit.covariance[where, where]
 

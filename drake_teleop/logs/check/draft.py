@@ -103,7 +103,7 @@ class Draft(NamedTuple):
         return yaml_text(self.streams, head=self.head)
 
     def corrected(self, finding: Finding) -> Draft:
-        """Return the draft with the fields of a finding, which follow from the data."""
+        """Return a copy of the draft with the corrected fields of a finding."""
         streams = copy.deepcopy(self.streams)
         for path, value in finding.fields.items():
             *outer, last = path.split(".")
@@ -115,7 +115,7 @@ class Draft(NamedTuple):
 
 
 def join_drafts(drafts: Sequence[Draft]) -> Draft:
-    """Return one draft; each stream is that of the first draft that contains it."""
+    """Join drafts of a log description; the first draft with a stream provides it."""
     streams: dict[str, Any] = {}
     for draft in drafts:
         whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
@@ -204,7 +204,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
 
 
 def _static(draft: dict[str, Any]) -> dict[str, Any]:
-    """Return the draft of a table of poses at rest, if it has wrench and orientation."""
+    """Return the streams as poses at rest (`static`), if wrench and orientation are known."""
     pose, wrench = draft.get("pose"), draft.get("wrench")
     if pose is None or wrench is None or _is_template(wrench):
         return draft

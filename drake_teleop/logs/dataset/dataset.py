@@ -163,7 +163,7 @@ def _described(streams: dict[str, Any], episode: Episode, fps: float) -> Descrip
 
 
 def _drafted(dataset: Dataset) -> dict[str, Any]:
-    """Return the draft that most of the first, middle and last episode agree on."""
+    """Return the draft description that most of the first, middle and last episode give."""
     count = len(dataset.episodes)
     chosen = sorted({0, count // 2, count - 1})[:_DRAFTS]
     drafts = [_draft(dataset, dataset.episodes[k]) for k in chosen]

@@ -71,12 +71,12 @@ class Hypothesis:
     cost: float = np.inf
 
     def apply(self, load_wrench: Array) -> Array:
-        """Return the reading (N, 6) without offsets for a wrench (N, 6) of the load."""
+        """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
         f, tau = load_wrench[:, :3], load_wrench[:, 3:]
         return np.hstack([self.gain[0] * f @ self.force.T, self.gain[1] * tau @ self.torque.T])
 
     def correct(self, wrench: Array) -> Array:
-        """Return readings (N, 6) without offsets in SI units, with the described axes."""
+        """Invert `apply`: map readings (N, 6) without offsets to wrenches in S [N, N m]."""
         f, tau = wrench[:, :3] @ self.force, wrench[:, 3:] @ self.torque
         return np.hstack([f / self.gain[0], tau / self.gain[1]])
 

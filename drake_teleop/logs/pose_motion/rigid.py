@@ -80,8 +80,8 @@ class RigidFit:
 def motion_map(R: Array, r: Array) -> Array:
     """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79).
 
-    It maps the 16 signals zeta of pose frame P and the wrench F to the signals z of the sensor, for
-    R = R_PS and r = p_PoSo [m].
+    zeta (16): motion signals of pose frame P, F: wrench, z (19): Eq. (T4) in sensor frame S;
+    R = R_PS, r = p_PoSo [m].
     """
     M = np.zeros((19, SIGNALS + 6))
     M[0, 0] = 1.0

@@ -48,7 +48,7 @@ class Grid:
 
     @classmethod
     def of(cls, t: Array, wrench: Array, load: Array | None = None) -> Grid:
-        """Return the grid of evenly spaced times (N,) and wrenches (N, 6)."""
+        """Return the grid for even times (N,) [s] and wrenches (N, 6); `load` is only stored."""
         dt = (t[-1] - t[0]) / (len(t) - 1)
         stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
@@ -157,7 +157,7 @@ def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:
 
 
 def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Complex:
-    """Return the spectrum (count, 16) of the tapered signals zeta (M, 16)."""
+    """Return the spectrum (count, 16) of tapered motion signals zeta (M, 16), Eq. (T73)."""
     out = np.empty((count, zeta.shape[1]), np.complex128)
     for c, column in enumerate(zeta.T):
         out[:, c] = np.fft.rfft(column * taper, grid.length)[:count]
@@ -165,7 +165,7 @@ def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Comple
 
 
 def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
-    """Return spectra (K, 16) of signals and taper `shift` [s] later; the constant is unchanged."""
+    """Return spectra (K, 16) of zeta and taper `shift` [s] later; the constant is unchanged."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
     return out
@@ -270,7 +270,7 @@ def noise_moments(
 ) -> Array:
     """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `Spectra.moments`.
 
-    `zeta` (M, 16) are the signals, `noise` standard deviations of position [m] and rotation [rad].
+    `zeta` (M, 16): motion signals; `noise`: standard deviations of position [m], rotation [rad].
     """
     w2 = (2.0 * np.pi * of.frequency) ** 2
     per_number = np.sum(taper**2) / (grid.dt * splines.rate)

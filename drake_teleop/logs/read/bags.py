@@ -121,7 +121,7 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
 
 
 def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dict[str, Any], list]:
-    """Return the draft of a description, and its head, with paths relative to `folder`."""
+    """Return a draft log description and its comment lines; paths are relative to `folder`."""
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)

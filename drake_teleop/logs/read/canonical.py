@@ -100,7 +100,9 @@ class Log:
                 continue
             if np.shape(value) != shape:
                 raise DrakeTeleopError(
-                    f"has shape {np.shape(value)}, needs {shape}", where=f"{self.source}:{name}"
+                    f"has shape {np.shape(value)} instead of {shape}",
+                    where=f"{self.source}:{name}",
+                    remedy="give one row per time",
                 )
             if not np.isfinite(value).all():
                 raise DrakeTeleopError(
@@ -109,7 +111,11 @@ class Log:
                     remedy="cut or repair these samples",
                 )
         if np.any(np.diff(self.t) <= 0):
-            raise DrakeTeleopError("does not increase", where=f"{self.source}:t")
+            raise DrakeTeleopError(
+                "does not increase",
+                where=f"{self.source}:t",
+                remedy="sort the rows, and remove repeated times",
+            )
 
     def __len__(self) -> int:
         return len(self.t)

@@ -99,7 +99,7 @@ class Orientation(Strict):
         if self.axes is not None and self.axes not in EULER_AXES:
             raise ValueError(
                 f"axes {self.axes!r} are not known: give three letters, xyz for fixed and XYZ for"
-                " moving axes, none twice in a row"
+                " moving axes, none twice consecutively"
             )
         return self
 

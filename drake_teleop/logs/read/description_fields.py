@@ -97,7 +97,7 @@ def _parse_gravity(value: Any) -> Any:
 def _parse_scale(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
     if any(_is_number(x) and abs(x) < _MIN_SCALE for x in factors):
-        raise ValueError(f"must be at least {_MIN_SCALE:g} in size")
+        raise ValueError(f"must have absolute values of at least {_MIN_SCALE:g}")
     return [float(value)] * 3 if _is_number(value) else value
 
 

@@ -62,9 +62,9 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         config = NetworkConfig() if config is None else config
         if config.silence != "hold" and size not in (LOAD.start, PACKET_SIZE):
             raise DrakeTeleopError(
-                f"'{config.silence}' needs packets of a passivity method, not {size} numbers",
+                f"'{config.silence}' requires packets of a passivity method; packets have {size} numbers",
                 where="NetworkChannel.silence",
-                remedy="set silence: hold",
+                remedy="set silence: hold, or use a passivity method",
             )
         self._parameters = network.parameters(config, seed, direction, period, least=1)
         parts = network.initial_state(self._parameters, np.zeros(size))

@@ -129,8 +129,9 @@ def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
     box = inspector.GetObbInGeometryFrame(shape)
     if box is None:
         raise DrakeTeleopError(
-            f"a {type(inspector.GetShape(shape)).__name__} has no end",
+            f"a {type(inspector.GetShape(shape)).__name__} has no bounding box",
             where=inspector.GetName(shape),
+            remedy="use a shape of finite size, such as a box",
         )
     return box
 

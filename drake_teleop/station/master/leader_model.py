@@ -87,8 +87,10 @@ class Leader:
             values = getattr(self, name)
             if not np.isfinite(values).all() or (name != "home" and min(values, default=0.0) < 0.0):
                 raise DrakeTeleopError(
-                    "has to be a list of finite numbers" + ("" if name == "home" else " from 0 on"),
+                    "contains a number that is not finite"
+                    + ("" if name == "home" else ", or is negative"),
                     where=f"{where}.{name}",
+                    remedy="give finite numbers" + ("" if name == "home" else " of 0 or more"),
                 )
 
     def found_from(self, folder: Path) -> "Leader":

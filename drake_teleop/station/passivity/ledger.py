@@ -157,7 +157,7 @@ class LedgerConfig:
 
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
-    """Write half of the initial energy and the servo model's initial pose into an end's memory."""
+    """Write half of the initial energy, and the servo model's pose, into one end's memory."""
     memory[LEDGER] = p[INITIAL] / 2.0
     memory[SERVO_MODEL] = memory[COMMAND_POSE]
 

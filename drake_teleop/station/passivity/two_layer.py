@@ -91,7 +91,7 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Write the initial energy of the tank into the memory of an end."""
+    """Write the tank's initial energy into the memory of one end of the channel."""
     memory[LEDGER] = p[_INITIAL]
 
 

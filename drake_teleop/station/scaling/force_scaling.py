@@ -318,7 +318,9 @@ class ForceScaling(LeafSystem):
         requested = np.array([*both, gamma, force_scale, *weights, duration], dtype=float)
         if not (requested >= 0.0).all() or not np.isfinite(requested).all():
             raise DrakeTeleopError(
-                "scales and duration are not finite or negative", where="SetScales"
+                "a scale or the duration is negative or not finite",
+                where="SetScales",
+                remedy="give finite numbers of 0 or more",
             )
         parameter = context.get_mutable_numeric_parameter(self._change)
         now, start = np.empty(_NUM_SCALES), context.get_time()

@@ -327,7 +327,11 @@ def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
 def _steps(step: float | None, period: float | None) -> tuple[float, int]:
     """Return the period of events [s], and the number of events per sample."""
     if period is not None and not 0.0 < period < np.inf:
-        raise DrakeTeleopError(f"{period} s is not positive", where=f"{_WHERE}: period")
+        raise DrakeTeleopError(
+            f"{period} s is not positive and finite",
+            where=f"{_WHERE}: period",
+            remedy="give the time between samples [s]",
+        )
     if step is None:
         return period or _DEFAULT_PERIOD, 1
     count = (period or step) / step
@@ -345,7 +349,9 @@ def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple
     expect((Joint, Frame), joint_or_frame, f"{_WHERE}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         raise DrakeTeleopError(
-            f"'{joint_or_frame.name()}' is of another plant", where=f"{_WHERE}: joint_or_frame"
+            f"'{joint_or_frame.name()}' is of another plant",
+            where=f"{_WHERE}: joint_or_frame",
+            remedy="pass a joint or frame of this plant",
         )
     welds = [joint for joint in _joints(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):

@@ -144,7 +144,7 @@ def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: A
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
-    """Return the accelerations a = s + g (N, 3) of So, for specific forces s in S, at q (N, n)."""
+    """Return accelerations s + g (N, 3) of So, in S, for specific forces s (N, 3) at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
         acceleration_into(arm.table, q[k], s[k], out[k])
@@ -153,7 +153,7 @@ def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
 
 @njit(cache=True)
 def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
-    """Write a = s + g (3,) of `accelerations` for one sample to `out`."""
+    """Write the acceleration s + g (3,) of So, in S, to `out`; s (3,): specific force in S."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
     g = table[table.shape[0] - 1, GRAVITY : GRAVITY + 3]
@@ -232,7 +232,7 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 @njit(cache=True)
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write the state x of each link, and of S, to the rows of out (n+1, 21)."""
+    """Write the state x (module docstring) of each link, and of S, to the rows of out (n+1, 21)."""
     n = table.shape[0] - 1
     _set_world_at_rest(table, out[0])
     for row in range(n):

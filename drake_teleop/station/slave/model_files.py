@@ -60,7 +60,7 @@ def read_model(
         DrakeTeleopError: if the file, or a file that it names, cannot be read.
     """
     if not os.path.isfile(path):
-        raise DrakeTeleopError("there is no such file", where=str(path))
+        raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
     if kind == ".xacro":
         raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO)

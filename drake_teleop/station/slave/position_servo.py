@@ -92,10 +92,11 @@ INTERFACES: dict[str, PositionInterface] = {
 
 @njit(cache=True)
 def _generate(command, interface, limits, memory, reference):
-    """Take the command (n,) [rad] if due, and advance the reference r by one period.
+    """Accept the command (n,) [rad] if due, and advance the reference r by one period.
 
     Args:
-        interface: (6,) period [s], gain, lookahead, w, periods per command, length of the queue.
+        interface: (6,) period [s], gain [1/s^2], lookahead [s], w [rad/s], periods per command,
+            length of the queue.
         limits: (2, n) speed and acceleration limits.
         memory: see `_COUNT`; updated.
         reference: (3, n) output: r and its two derivatives.

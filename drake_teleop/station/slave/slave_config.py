@@ -100,7 +100,9 @@ class Slave:
         """Raise DrakeTeleopError for invalid numbers, lengths or tool."""
         if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
             raise DrakeTeleopError(
-                "must be a list of finite numbers >= 0", where=f"{where}.friction"
+                "contains a number that is negative or not finite",
+                where=f"{where}.friction",
+                remedy="give finite numbers of 0 or more",
             )
         for name, length in (("home", len(self.home)), ("tip", 3)):
             values = getattr(self, name)

@@ -103,7 +103,11 @@ class Tool:
                 remedy="leave one of them out",
             )
         if self.mass == 0.0 and (self.shapes or any(self.inertia)):
-            raise DrakeTeleopError("shapes and inertia require a mass", where=f"{where}.mass")
+            raise DrakeTeleopError(
+                "shapes and inertia require a mass",
+                where=f"{where}.mass",
+                remedy="give the mass, or remove them",
+            )
         if not _inertia(self).IsPhysicallyValid():
             raise DrakeTeleopError(
                 "no body has this inertia",

@@ -118,7 +118,11 @@ class ModelFiles:
             raise DrakeTeleopError(f"{what} by {path.name}", where=where, remedy="cut the circle")
         if real not in self._sizes:
             if not (real.is_file() or real.is_dir()):
-                raise DrakeTeleopError(f"names {path}, which is no file", where=where)
+                raise DrakeTeleopError(
+                    f"names {path}, which does not exist",
+                    where=where,
+                    remedy="correct the path or add the file",
+                )
             files, size = 1, real.stat().st_size
             _check_size(files, size, path)
             for named in list(self._referenced_files(real)):
@@ -183,7 +187,9 @@ def _check_size(files: int, size: int, path: Path) -> None:
     most = _MAX_BYTES if files > 1 or path.suffix.lower() in _BINARY else _MAX_TEXT
     if files > _MAX_FILES or size > most:
         what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
-        raise DrakeTeleopError(f"takes more than {what} to read", where=str(path))
+        raise DrakeTeleopError(
+            f"takes more than {what} to read", where=str(path), remedy="remove or simplify parts"
+        )
 
 
 def read_xml(path: Path) -> Element:
@@ -241,5 +247,7 @@ def _addresses_in_gltf(path: Path) -> list[str]:
     try:
         json.loads(data, object_pairs_hook=keep)
     except (ValueError, RecursionError) as error:
-        raise DrakeTeleopError(f"is no glTF file ({error})", where=str(path)) from None
+        raise DrakeTeleopError(
+            f"is not a glTF file ({error})", where=str(path), remedy="export it again"
+        ) from None
     return found
