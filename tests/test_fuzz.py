@@ -54,7 +54,7 @@ SAID = {
     "urdf-circle_in_no_xml.urdf": "is not XML (not well-formed (invalid token): line 20",
     "urdf-long_package.urdf": "",
     "urdf-unknown_encoding.urdf": "is not XML (unknown encoding: utf-9)",
-    "trace_npz-empty_delay.npz": "'delay' of case.npz has 0 numbers in a row",
+    "trace_npz-empty_delay.npz": "'delay' of case.npz has 0 numbers per row, not 1",
     "wrenches_ros-damaged_pose.bin": "",
     "wrenches_rtde-no_time_between.bin": "",
 }

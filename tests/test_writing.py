@@ -158,7 +158,7 @@ def sample_log(out: Path) -> None:
 
 COMMANDS: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "run": (run, 7, "keeps log.parquet, scenario.yaml"),
-    "study": (study, 6, "keeps 1 of 2 runs; the same command continues"),
+    "study": (study, 6, "keeps 1 of 2 runs; repeat the command"),
     "sample-log": (sample_log, 8, "keeps free.yaml, free_wrench.csv"),
 }
 """Each command, the files that it writes, and what it says when the third one has no room."""

@@ -95,7 +95,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
             continue
         place = field_place(where, key)
         check_name(schema, key, place)
-        _check_kind(kinds[key], value, place, from_file=True)
+        _check_type(kinds[key], value, place, from_file=True)
 
 
 def check_name(schema: type, name: Any, where: str) -> None:
@@ -130,7 +130,7 @@ def check_ranges(config: Any, where: str) -> None:
 
 def _check_value(field: Any, kind: Kind, value: Any, place: str) -> None:
     metadata = field.metadata
-    _check_kind(kind, value, place, from_file=False)
+    _check_type(kind, value, place, from_file=False)
     if "choices" in metadata:
         words, registry = metadata["choices"], metadata.get("registry")
         if registry is not None:
@@ -208,7 +208,7 @@ def kind_of(hint: Any) -> Kind:
     return inner._replace(optional=len(options) < len(typing.get_args(hint)))
 
 
-def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
+def _check_type(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
     first = kind.items[0]
     if value is None and kind.optional:
         return
@@ -217,13 +217,13 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
             raise _kind_error("a mapping of names", value, place, "write {name: value}")
         for name, item in value.items():
             inner = kind._replace(by_name=False)
-            _check_kind(inner, item, f"{place}.{name}", from_file=from_file)
+            _check_type(inner, item, f"{place}.{name}", from_file=from_file)
     elif kind.lists:
         if not isinstance(value, list):
             raise _kind_error("a list", value, place, "write it in brackets: [...]")
         inner = Kind(kind.lists - 1, kind.items, False)
         for index, item in enumerate(value):
-            _check_kind(inner, item, f"{place}[{index}]", from_file=from_file)
+            _check_type(inner, item, f"{place}[{index}]", from_file=from_file)
     elif first in KINDS:
         if not _has_kind(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"

@@ -177,22 +177,14 @@ class Identification:
 
         def numbers(name: str, *shape: int, largest: float = np.inf) -> Array:
             if not _only_numbers(document[name]):
-                raise DrakeTeleopError(
-                    "contains values that are not numbers",
-                    where=f"{path}:{name}",
-                    remedy=_REIDENTIFY,
-                )
+                raise _file_error("contains values that are not numbers", f"{path}:{name}")
             array = checked(f"{path}:{name}", document[name], *shape)
             if np.abs(array).max() > largest:
-                raise DrakeTeleopError(
-                    f"has an absolute value above {largest:g}",
-                    where=f"{path}:{name}",
-                    remedy=_REIDENTIFY,
-                )
+                raise _file_error(f"has an absolute value above {largest:g}", f"{path}:{name}")
             return array
 
         if not isinstance(document["method"], str):
-            raise DrakeTeleopError("is not a text", where=f"{path}:method", remedy=_REIDENTIFY)
+            raise _file_error("is not a text", f"{path}:method")
         readers: dict[str, Callable[[str, Any], Any]] = {
             "weight_removed": _read_flag,
             "degrees_of_freedom": _read_degrees,
@@ -203,7 +195,7 @@ class Identification:
         }
         phi = check_identified(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
-            raise DrakeTeleopError("has no mass", where=f"{path}:phi", remedy=_REIDENTIFY)
+            raise _file_error("has no mass", f"{path}:phi")
         result = cls(
             phi=phi,
             offsets=numbers("offsets", 6, largest=_MAX_VALUE),
@@ -217,11 +209,7 @@ class Identification:
             **optional,
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
-            raise DrakeTeleopError(
-                "does not follow from phi, covariance and flags",
-                where=f"{path}:verdicts",
-                remedy=_REIDENTIFY,
-            )
+            raise _file_error("does not follow from phi, covariance and flags", f"{path}:verdicts")
         for name, value in result._derived().items():
             if isinstance(value, bool):
                 follows = document[name] is value
@@ -291,7 +279,7 @@ def _read_json(path: str | Path) -> dict[str, Any]:
         )
     document = read_json(path)
     if not isinstance(document, dict):
-        raise DrakeTeleopError("is not a JSON object", where=str(path), remedy=_REIDENTIFY)
+        raise _file_error("is not a JSON object", str(path))
     return document
 
 
@@ -307,23 +295,23 @@ def _read_covariance(where: str, value: Any) -> Array:
     except ValueError:
         raw = np.empty(0)
     if raw.shape != (16, 16):
-        raise DrakeTeleopError(
-            "is not a (16, 16) table of numbers", where=where, remedy=_REIDENTIFY
-        )
+        raise _file_error("is not a (16, 16) table of numbers", where)
     unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
     if not _only_numbers(raw[~unknown].tolist()):
-        raise DrakeTeleopError(
-            "contains values that are not numbers", where=where, remedy=_REIDENTIFY
-        )
+        raise _file_error("contains values that are not numbers", where)
     covariance = checked(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
-        raise DrakeTeleopError("has a negative variance", where=where, remedy=_REIDENTIFY)
+        raise _file_error("has a negative variance", where)
     return np.where(unknown, np.inf, covariance)
+
+
+def _file_error(what: str, where: str) -> DrakeTeleopError:
+    return DrakeTeleopError(what, where=where, remedy="run `identify` again")
 
 
 def _read_flag(where: str, value: Any) -> bool:
     if not isinstance(value, bool):
-        raise DrakeTeleopError("is not true or false", where=where, remedy=_REIDENTIFY)
+        raise _file_error("is not true or false", where)
     return value
 
 
@@ -331,19 +319,17 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
     if not (
         isinstance(value, list) and len(value) == 16 and all(isinstance(v, bool) for v in value)
     ):
-        raise DrakeTeleopError("is not a list of 16 true or false", where=where, remedy=_REIDENTIFY)
+        raise _file_error("is not a list of 16 true or false", where)
     return np.array(value, dtype=bool)
 
 
 def _read_degrees(where: str, value: Any) -> Array:
     if not (isinstance(value, list) and _only_numbers([v for v in value if v is not None])):
-        raise DrakeTeleopError(
-            "is not a list of 16 numbers or null", where=where, remedy=_REIDENTIFY
-        )
+        raise _file_error("is not a list of 16 numbers or null", where)
     degrees = checked(where, [0.0 if v is None else v for v in value], 16)
     unknown = np.array([v is None for v in value])
     if not (degrees[~unknown] > 0.0).all():
-        raise DrakeTeleopError("has a value that is not positive", where=where, remedy=_REIDENTIFY)
+        raise _file_error("has a value that is not positive", where)
     return np.where(unknown, np.inf, degrees)
 
 

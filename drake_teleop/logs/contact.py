@@ -32,7 +32,7 @@ MIN_SAMPLES = 100
 # Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
 _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
 # Without orientation, gravity is the specific force below this frequency.
-_GRAVITY_HZ = 0.5
+_GRAVITY_CUTOFF_HZ = 0.5
 _QUIET_DEVIATIONS = 4.0
 _DEFAULT_CUTOFF_HZ = 30.0  # assumed cut-off without a low-pass
 _BLOCK_S, _BLOCKS = 0.1, 20
@@ -80,7 +80,7 @@ def samples_of(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
     else:
-        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_HZ)
+        gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_CUTOFF_HZ)
     return Samples(contact, s, omega, alpha, s + gravity)
 
 

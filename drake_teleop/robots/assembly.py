@@ -26,10 +26,10 @@ from drake_teleop.robots.streams import (
     POSE,
     VALUES,
     WRENCH,
-    Flag,
     Part,
     PartSource,
     Reading,
+    ReadingFlag,
 )
 from drake_teleop.robots.watch import MODEL_ERROR, raw_noise
 
@@ -404,7 +404,7 @@ class Assembly:
         at = bisect_right(motions, part.t, key=lambda each: each[0])
         after, before = motions[min(at, len(motions) - 1)], motions[max(0, at - 1)]
         if part.t < before[0] or after[0] - before[0] > STALE_S:
-            return Reading(part.number, part.t, values, flags | Flag.STALE)
+            return Reading(part.number, part.t, values, flags | ReadingFlag.STALE)
         share = (part.t - before[0]) / max(after[0] - before[0], 1e-9)
         motion = before[1] + share * (after[1] - before[1])
         values[6:] = motion[:9]

@@ -252,7 +252,7 @@ def calibrate(
                 if (samples := source.read(_IDLE_S)) is None:
                     break
                 for sample in samples:
-                    recorder.take(sample)
+                    recorder.add(sample)
                     if pending is None and recorder.seconds >= next_length_s:
                         next_length_s = max(FIRST_RECORD_S, RECORD_GROWTH * recorder.seconds)
                         write_record()

@@ -20,13 +20,16 @@ from drake_teleop.logs.causes.instants import S, instants
 from drake_teleop.logs.causes.model import Step
 from drake_teleop.logs.causes.state import State
 from drake_teleop.robots.compensator import JUMP_S
-from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Flag, Reading
+from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Reading, ReadingFlag
 
 SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
 SETTLED_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
-_WATCH_FLAGS, _INVALID_FLAGS = int(Flag.IN_CONTACT | Flag.OTHER_LOAD), ~int(NONZERO_FLAGS)
+_WATCH_FLAGS, _INVALID_FLAGS = (
+    int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD),
+    ~int(NONZERO_FLAGS),
+)
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _MAX_RETRY_S, _END_S, _SAME_CHANGE_S = 10.0, 1.0, 1.0
 _MIN_RECORD_S, _MIN_LIKELIHOOD_RATIO = 4.0, 40.0

@@ -34,7 +34,7 @@ from drake_teleop.robots.compensation_step import (
     tare_into,
     value_problem,
 )
-from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Flag, Reading
+from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Reading, ReadingFlag
 from drake_teleop.robots.watch import Detector, Watch
 
 STALE_S = 0.05
@@ -53,14 +53,22 @@ _RATE_READINGS, _RATE_S = 200, 0.4  # readings, and [s]; longer than a burst of 
 _MAX_TIME_S = 1e12  # [s]
 _NO_GRAVITY = np.zeros(3)
 _MAX_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
-# Integers, because each operation on a `Flag` takes a microsecond.
-_DAMAGED, _STALE, _CLIPPED = int(Flag.DAMAGED), int(Flag.STALE), int(Flag.CLIPPED)
-_NONZERO_FLAGS, _GAP, _WRONG_RATE = int(NONZERO_FLAGS), int(Flag.GAP), int(Flag.WRONG_RATE)
-_IN_CONTACT = int(Flag.IN_CONTACT)
+# Integers, because each operation on a `ReadingFlag` takes a microsecond.
+_DAMAGED, _STALE, _CLIPPED = (
+    int(ReadingFlag.DAMAGED),
+    int(ReadingFlag.STALE),
+    int(ReadingFlag.CLIPPED),
+)
+_NONZERO_FLAGS, _GAP, _WRONG_RATE = (
+    int(NONZERO_FLAGS),
+    int(ReadingFlag.GAP),
+    int(ReadingFlag.WRONG_RATE),
+)
+_IN_CONTACT = int(ReadingFlag.IN_CONTACT)
 _PROBLEM_FLAGS = {
-    NOT_FINITE: Flag.NOT_FINITE,
-    TOO_LARGE: Flag.OUT_OF_RANGE,
-    AT_RANGE: Flag.SATURATED,
+    NOT_FINITE: ReadingFlag.NOT_FINITE,
+    TOO_LARGE: ReadingFlag.OUT_OF_RANGE,
+    AT_RANGE: ReadingFlag.SATURATED,
 }
 # Maximum rms of the wrench at rest, as a multiple of the residual of the identification, and at
 # least [N, N m].
@@ -259,19 +267,19 @@ class Compensator:
         # Out-of-order readings are mixed with ordered ones; only such readings mean a restart.
         lost = now - self._now > STALE_S
         if started and reading.number <= self._number and (abs(step) > JUMP_S or lost):
-            return self._restart_clock(reading, ahead, flags | int(Flag.RESTART))
+            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
         if started and (abs(ahead - self._min_offset) > JUMP_S or (step <= 0.0 and lost)):
-            return self._restart_clock(reading, ahead, flags | int(Flag.CLOCK_JUMP))
+            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         if started and step <= 0.0:
-            return flags | int(Flag.REORDERED)
+            return flags | int(ReadingFlag.REORDERED)
         if started and reading.number <= self._number:
-            return self._restart_clock(reading, ahead, flags | int(Flag.RESTART))
+            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
         drift = CLOCK_DRIFT * self._dt if started else 0.0
         self._min_offset = min(ahead, self._min_offset + drift)
         if ahead - self._min_offset <= STALE_S:
             self._last_in_time = now
         elif now - self._last_in_time > JUMP_S:
-            return self._restart_clock(reading, ahead, flags | int(Flag.CLOCK_JUMP))
+            return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         else:
             flags |= _STALE
         return flags | self._rate.flag(reading)

@@ -24,7 +24,15 @@ from drake_teleop.common.files import (
     write_table,
 )
 from drake_teleop.logs.read.canonical import WRENCH
-from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading, Sink, Source
+from drake_teleop.robots.streams import (
+    DAMAGED,
+    VALUES,
+    Compensated,
+    Reading,
+    ReadingFlag,
+    Sink,
+    Source,
+)
 
 _MAX_LINE_BYTES = 4096  # bytes per line
 _BLOCK_BYTES = 65536
@@ -39,7 +47,7 @@ def read_line(line: bytes, number: int) -> Reading:
         parts = [np.array(data[name], float) for name in ("wrench", "s", "omega", "alpha")]
         values = np.concatenate(parts)
         t, number = float(data["t"]), int(data.get("number", number))
-        flags = int(Flag.SATURATED) if data.get("saturated") else 0
+        flags = int(ReadingFlag.SATURATED) if data.get("saturated") else 0
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         return DAMAGED
     good = values.shape == (VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
@@ -60,7 +68,7 @@ def wrench_line(out: Compensated) -> str:
 
 def flag_names(flags: int) -> list[str]:
     """Return the names of the set flags, such as "out of range"."""
-    return [str(flag.name).lower().replace("_", " ") for flag in Flag if flag & flags]
+    return [str(flag.name).lower().replace("_", " ") for flag in ReadingFlag if flag & flags]
 
 
 class LineSource(Source[Reading]):

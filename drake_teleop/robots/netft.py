@@ -17,7 +17,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description_fields import UNITS
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Flag, Part
+from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Part, ReadingFlag
 
 PORT = 49152
 REQUEST = struct.Struct(">HHI")
@@ -99,13 +99,13 @@ class NetFtSource:
         self._last_received = now
         flags = 0
         if record.status & _SATURATED:
-            flags = int(Flag.SATURATED)
+            flags = int(ReadingFlag.SATURATED)
         elif record.status & _ERROR:
-            flags = int(Flag.DAMAGED)
+            flags = int(ReadingFlag.DAMAGED)
         if record.ft_sequence != self._measured:
             self._measured, self._measured_at = record.ft_sequence, now
         elif now - self._measured_at > _MAX_UNCHANGED_S:
-            flags |= int(Flag.STALE)
+            flags |= int(ReadingFlag.STALE)
         t = self._pace.time_of(self._number, now)
         return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
 

@@ -21,9 +21,15 @@ from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.compensator import JUMP_S
-from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, Reading
+from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Part, Reading, ReadingFlag
 
-_INVALID_FLAGS = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
+_INVALID_FLAGS = (
+    ReadingFlag.DAMAGED
+    | ReadingFlag.NOT_FINITE
+    | ReadingFlag.OUT_OF_RANGE
+    | ReadingFlag.SATURATED
+    | ReadingFlag.GAP
+)
 _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
     WRENCH: {"force": canonical.WRENCH[:3], "torque": canonical.WRENCH[3:]},
     POSE: {"orientation": canonical.ORIENTATION, "position": canonical.POSITION},
@@ -85,7 +91,7 @@ class Records(ABC, Generic[_T]):
         return _seconds(self._longest_part())
 
     @abstractmethod
-    def take(self, sample: _T) -> None:
+    def add(self, sample: _T) -> None:
         """Add a sample if it is valid."""
 
     @abstractmethod
@@ -102,7 +108,7 @@ class Recorder(Records[Reading]):
     def __init__(self, largest: Array | None = None) -> None:
         super().__init__({WRENCH: largest})
 
-    def take(self, sample: Reading) -> None:
+    def add(self, sample: Reading) -> None:
         """See `Records`."""
         self._add(WRENCH, sample.t, sample.values, sample.flags)
 
@@ -128,13 +134,15 @@ class PartRecorder(Records[tuple[Part, float]]):
         self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
         self._p_FS = X_FS[4:]
 
-    def take(self, sample: tuple[Part, float]) -> None:
+    def add(self, sample: tuple[Part, float]) -> None:
         """See `Records`."""
         part, now = sample
         if part.stream not in self._part:
             return
         size = float(np.linalg.norm(part.values[:4])) if part.stream == POSE else 1.0
-        flags = part.flags if abs(size - 1.0) < _NORM_TOLERANCE else part.flags | Flag.DAMAGED
+        flags = (
+            part.flags if abs(size - 1.0) < _NORM_TOLERANCE else part.flags | ReadingFlag.DAMAGED
+        )
         self._add(part.stream, part.t, part.values, flags, now)
 
     def write(self, path: Path) -> None:
@@ -187,7 +195,7 @@ class _Samples:
     def table(self, width: int, left_out: int) -> tuple[Array, Array]:
         if len(self.t) < 2:
             raise DrakeTeleopError(
-                f"{len(self.t)} valid and {left_out} invalid readings received (2 valid ones are required)",
+                f"{len(self.t)} valid and {left_out} invalid readings received (minimum: 2 valid)",
                 where="calibrate",
                 remedy="check that the source sends to this port",
             )

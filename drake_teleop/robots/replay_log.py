@@ -14,7 +14,7 @@ from drake_teleop.logs.aligned_log import accelerated
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.alignment import delay_of, measured, undelayed
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.robots.streams import Flag, Reading, Source
+from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 
 
 class LogSource(Source[Reading]):
@@ -58,7 +58,7 @@ class LogSource(Source[Reading]):
         self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
         self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])
         self._gravity = log.gravity
-        self._flags = np.where(measured(log, cutoff_hz), 0, int(Flag.GAP))
+        self._flags = np.where(measured(log, cutoff_hz), 0, int(ReadingFlag.GAP))
         self._at, self._chunk, self._start = 0, chunk, math.nan
 
     def read(self, timeout_s: float) -> list[Reading] | None:

@@ -28,7 +28,7 @@ from drake_teleop.robots.ros2_messages import (
     source_topics,
     topic_of,
 )
-from drake_teleop.robots.streams import NONZERO_FLAGS, Compensated, Flag, Part
+from drake_teleop.robots.streams import NONZERO_FLAGS, Compensated, Part, ReadingFlag
 
 _NODE = "drake_teleop"
 _DIAGNOSTICS_S = 1.0  # longest period of diagnostics [s]
@@ -230,7 +230,7 @@ class Ros2Sink:
         kind = self._kinds.DiagnosticStatus
         level = kind.OK if not out.flags else kind.WARN
         if out.flags & ~NONZERO_FLAGS:
-            level = kind.STALE if out.flags == Flag.STALE else kind.ERROR
+            level = kind.STALE if out.flags == ReadingFlag.STALE else kind.ERROR
         pairs = {"number": out.number, "t": repr(float(out.t)), "flags": out.flags, **self._counts}
         values = [self._kinds.KeyValue(key=key, value=str(value)) for key, value in pairs.items()]
         status = kind(

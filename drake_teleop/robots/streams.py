@@ -17,7 +17,7 @@ VALUES = 15
 """Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
 
-class Flag(IntFlag):
+class ReadingFlag(IntFlag):
     """Reason of a zero wrench, or further information; the bits of the packets."""
 
     SATURATED = 1  #: reported by the sensor, or a channel at its range
@@ -35,7 +35,9 @@ class Flag(IntFlag):
     OTHER_LOAD = 4096  #: explained by another load; the wrench is not zero
 
 
-NONZERO_FLAGS = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LOAD
+NONZERO_FLAGS = (
+    ReadingFlag.WRONG_RATE | ReadingFlag.CLIPPED | ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD
+)
 """Flags with a nonzero wrench."""
 
 
@@ -81,9 +83,9 @@ class Compensated(NamedTuple):
     flags: int
 
 
-DAMAGED = Reading(-1, np.nan, np.full(VALUES, np.nan), int(Flag.DAMAGED))
+DAMAGED = Reading(-1, np.nan, np.full(VALUES, np.nan), int(ReadingFlag.DAMAGED))
 """Reading for invalid packets."""
-DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))
+DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DAMAGED))
 """Part for invalid packets."""
 
 

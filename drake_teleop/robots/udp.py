@@ -1,7 +1,7 @@
 """Sources and sink of UDP packets, with the layout of `drake_teleop_udp.h`.
 
-Little-endian, without padding. Input: "DTW1", flags (`Flag.SATURATED` only), number, time [s],
-15 numbers; or "DTP1", the same head, wrench (6), pose (w x y z, position). Output: "DTC1", the
+Little-endian, without padding. Input: "DTW1", flags (`ReadingFlag.SATURATED` only), number, time
+[s], wrench, s, omega, alpha; or "DTP1", the same head, wrench (6), pose (w x y z, position). Output: "DTC1", the
 same head, contact wrench (6), scaled wrench (6).
 """
 
@@ -18,7 +18,14 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED, DAMAGED_WRENCH, Compensated, Flag, Part, Reading
+from drake_teleop.robots.streams import (
+    DAMAGED,
+    DAMAGED_WRENCH,
+    Compensated,
+    Part,
+    Reading,
+    ReadingFlag,
+)
 
 THIS_MACHINE = "127.0.0.1"
 READING = struct.Struct("<4sIQd15d")
@@ -28,7 +35,7 @@ _READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _HEAD = struct.Struct("<4sIQd")
 _MAX_PACKETS = 256  # packets per call
 _BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
-_SATURATED = int(Flag.SATURATED)
+_SATURATED = int(ReadingFlag.SATURATED)
 
 
 def pack_reading(reading: Reading) -> bytes:
@@ -73,7 +80,7 @@ def unpack_wrench(packet: bytes) -> Compensated:
         raise DrakeTeleopError(
             f"its {len(packet)} bytes are not a compensated wrench",
             where="packet",
-            remedy=f"check the sender: a wrench has {WRENCH.size} bytes and begins with {_WRENCH_TAG!r}",
+            remedy=f"send {WRENCH.size} bytes that begin with {_WRENCH_TAG!r}",
         )
     _, flags, number, t, *values = WRENCH.unpack(packet)
     return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)

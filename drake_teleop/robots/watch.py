@@ -30,7 +30,7 @@ from drake_teleop.logs.causal import low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import LogSource
-from drake_teleop.robots.streams import Flag
+from drake_teleop.robots.streams import ReadingFlag
 
 MODEL_ERROR = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
@@ -72,17 +72,17 @@ class Watch:
         self._memory = watched_memory(self._out, self._covariance)
 
     def flags(self, values: Array) -> int:
-        """Return the `Flag` bits of a valid reading (15,): contact, another load, or 0."""
+        """Return the `ReadingFlag` bits of a valid reading (15,): contact, another load, or 0."""
         watched_update(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
         state = watched_state(self._memory)
         if state == OTHER_LOAD:
-            return int(Flag.OTHER_LOAD)
-        return int(Flag.IN_CONTACT) if state == DISTURBED else 0
+            return int(ReadingFlag.OTHER_LOAD)
+        return int(ReadingFlag.IN_CONTACT) if state == DISTURBED else 0
 
 
 MEAN_TIME_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
-_GRAVITY_HZ = 0.5
+_GRAVITY_CUTOFF_HZ = 0.5
 _STATISTIC = "level"
 _RATE_TOLERANCE = 0.05
 
@@ -112,7 +112,9 @@ class Detector:
                 where=str(free),
                 remedy="use the log that `calibrate` wrote from this stream",
             )
-        self._fast, self._slow = (low_pass_coefficients(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
+        self._fast, self._slow = (
+            low_pass_coefficients(dt, hz) for hz in (cutoff_hz, _GRAVITY_CUTOFF_HZ)
+        )
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
@@ -120,7 +122,7 @@ class Detector:
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
         rows = self._low_passed(np.hstack([contact, values[:, 6:]]))
         # Skip the transient of the low-passes.
-        settled = rows[round(0.5 / (_GRAVITY_HZ * dt)) :]
+        settled = rows[round(0.5 / (_GRAVITY_CUTOFF_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))
         covariance = finite_covariance(phi, load.covariance, tared=True)
@@ -149,14 +151,14 @@ class Detector:
         return out
 
     def flags(self, values: Array, contact: Array) -> int:
-        """Return `Flag.IN_CONTACT` or 0 for a valid reading (15,).
+        """Return `ReadingFlag.IN_CONTACT` or 0 for a valid reading (15,).
 
         `contact` (6,): its low-passed contact wrench [N, N m].
         """
         touched = _detect(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
-        return int(Flag.IN_CONTACT) if touched else 0
+        return int(ReadingFlag.IN_CONTACT) if touched else 0
 
 
 @njit(cache=True)

@@ -37,7 +37,7 @@ from the code (`python docs/make_reference.py`).
   there twice, or that nothing reads, is an error, and so is `010`.
 - [scenario.schema.json](scenario.schema.json) is the JSON schema: an editor that knows it (for
   instance by a first line `# yaml-language-server: $schema=scenario.schema.json`) completes and
-  checks the fields. Such an editor has to be told of tags like `!Touch`, which say what kind of
+  checks the fields. Configure such an editor for tags like `!Touch`, which say what kind of
   block follows: in VS Code `"yaml.customTags": ["!Touch mapping", ...]`.
 
 Frames: W is the world, z up; B the base of the master, E its end; S the wrist sensor, A its

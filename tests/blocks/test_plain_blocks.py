@@ -362,7 +362,9 @@ def test_network_delays_by_whole_periods():
     found = stepped(block, rows, "received")
     np.testing.assert_array_equal(found[:, 0], [0, 0, 1, 2, 3, 4, 5, 6])
     np.testing.assert_array_equal(found[:, 2], [0, 0, 1, 1, 1, 1, 1, 1])
-    with pytest.raises(DrakeTeleopError, match="silence: 'zero' needs packets"):
+    with pytest.raises(
+        DrakeTeleopError, match="silence: 'zero' requires packets of a passivity method"
+    ):
         blocks.NetworkChannel(2, T, NetworkConfig(silence="zero"))
 
 

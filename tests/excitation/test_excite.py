@@ -593,7 +593,10 @@ def test_file_without_robot_gives_one_error_line(tmp_path, capsys, name, text):
 def test_model_options_require_a_model(capsys, tmp_path):
     with pytest.raises(SystemExit) as stop:
         main(["excite", "--payload", "2", "--quiet", "--out", str(tmp_path)])
-    assert (stop.value.code, capsys.readouterr().err) == (2, "error: --payload: needs --model\n")
+    assert (stop.value.code, capsys.readouterr().err) == (
+        2,
+        "error: --payload: requires --model; add --model or remove it\n",
+    )
 
 
 @pytest.fixture(

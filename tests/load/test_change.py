@@ -289,10 +289,10 @@ def test_a_slower_log(bench, tool):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"period": 0.0}, "period: is not positive"),
-        ({"model_error": 1.0}, r"model_error: 1.0 is not within \[0, 1\)"),
-        ({"bound": -1.0}, "bound: is not positive"),
-        ({"wrench_std": np.zeros(6)}, "wrench_std: is not positive"),
+        ({"period": 0.0}, "period: has the value 0, which is not positive"),
+        ({"model_error": 1.0}, r"model_error: 1.0 is not at least 0 and below 1"),
+        ({"bound": -1.0}, "bound: has the value -1, which is not positive"),
+        ({"wrench_std": np.zeros(6)}, "wrench_std: has the value 0, which is not positive"),
         ({"motion_std": np.zeros(6)}, "motion_std: has shape"),
         ({"offset_drift": np.full(6, np.nan)}, "offset_drift: is not finite"),
     ],

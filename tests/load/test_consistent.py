@@ -128,7 +128,9 @@ def test_all_mass_in_the_ellipsoid():
 
 
 def test_bad_input_is_named():
-    with pytest.raises(DrakeTeleopError, match=r"^prior\.kind: 'guess' is not one of"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"^prior\.kind: 'guess' is unknown; choose entropic or geodesic"
+    ):
         Prior(TOOL, 1.0, "guess")
     with pytest.raises(DrakeTeleopError, match=r"^prior\.weight: 0.0 is not positive"):
         Prior(TOOL, 0.0)

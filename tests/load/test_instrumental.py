@@ -169,5 +169,5 @@ def test_bad_input_is_named_and_leaves_the_estimate():
     with pytest.raises(DrakeTeleopError, match=r"^instruments: is not finite"):
         estimator.learn(F, *motion, np.full((50, 9), np.inf))
     np.testing.assert_array_equal(theta(estimator), before)
-    with pytest.raises(DrakeTeleopError, match="there was no update yet"):
+    with pytest.raises(DrakeTeleopError, match="estimator: has not received a sample"):
         RecursiveInstrumentalVariables(NOISE).identification()

@@ -218,7 +218,7 @@ def test_quantiles():
     np.testing.assert_allclose((high + low) / 2, [*normal.offsets, *normal.phi], atol=1e-12)
     low, high = intervals(plain(degrees_of_freedom=np.full(16, 4.0)), level=0.99)
     np.testing.assert_allclose(high - low, 2 * 4.604095 * normal.standard_deviations, rtol=1e-5)
-    with pytest.raises(DrakeTeleopError, match=r"^level: 1\.0 is not within"):
+    with pytest.raises(DrakeTeleopError, match=r"^level: 1\.0 is not between 0 and 1"):
         intervals(normal, 1.0)
 
 
@@ -250,9 +250,13 @@ def test_prior_dominated_is_what_the_data_did_not_tell():
     assert prior_dominated([0.1, 0.5, 1.0, 1.0], [1.0, 1.0, 1.0, np.inf]).tolist() == [
         *(False, True, True, False)
     ]
-    with pytest.raises(DrakeTeleopError, match=r"^prior_std: needs positive numbers"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"^prior_std: has shape .*; give positive numbers of shape \(2,\)"
+    ):
         prior_dominated([1.0, 1.0], [1.0, 0.0])
-    with pytest.raises(DrakeTeleopError, match=r"^prior_std: needs positive numbers"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"^prior_std: has shape .*; give positive numbers of shape \(2,\)"
+    ):
         prior_dominated([1.0, 1.0], [1.0])
     prior = np.full(16, 10.0)
     estimator = RecursiveLeastSquares(NOISE, prior_std=prior)
@@ -286,7 +290,11 @@ def test_old_files_without_the_optional_fields_are_read(tmp_path):
     ("field", "value", "message"),
     [
         ("degrees_of_freedom", [1.0] * 15, r"json:degrees_of_freedom: has shape \(15,\)"),
-        ("degrees_of_freedom", [0.0] * 16, "json:degrees_of_freedom: is not positive"),
+        (
+            "degrees_of_freedom",
+            [0.0] * 16,
+            "json:degrees_of_freedom: has a value that is not positive",
+        ),
         ("degrees_of_freedom", 3.0, "json:degrees_of_freedom: is not a list of 16"),
         ("prior_dominated", [1.5] * 16, "json:prior_dominated: is not a list of 16"),
         ("verdicts", ["identified"] * 15, "json:verdicts: does not follow"),

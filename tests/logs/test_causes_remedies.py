@@ -352,7 +352,7 @@ def test_inspect_and_repeated_fits_accept_a_removed_weight(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
-        ({"wrench": {"force": {"scale": 0}}}, "must be at least 1e-12"),
+        ({"wrench": {"force": {"scale": 0}}}, "must have absolute values of at least 1e-12"),
         ({"wrench": {"force": {"scale": [1, 2]}}}, "scale"),
         ({"wrench": {"force": {"scale": ".inf"}}}, "scale"),
         ({"wrench": {"weight": "gone"}}, "must be removed, or four numbers"),

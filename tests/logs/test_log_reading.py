@@ -449,7 +449,7 @@ def test_axes_of_the_force_sensor_are_rotated_to_S(tmp_path: Path, kind: str) ->
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"wrench": np.zeros((4, 5))}, r"wrench: has shape \(4, 5\), needs \(4, 6\)"),
+        ({"wrench": np.zeros((4, 5))}, r"wrench: has shape \(4, 5\) instead of \(4, 6\)"),
         ({"t": np.array([0.0, 1, 1, 2])}, "t: does not increase"),
         ({"angular_velocity": np.full((4, 3), np.nan)}, "angular_velocity: holds NaN"),
     ],

@@ -25,7 +25,7 @@ from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.calibration import Evaluation, best_motion, calibrate, evaluate_record
 from drake_teleop.robots.recording import PartRecorder, Recorder
-from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Flag, Part, Reading
+from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Part, Reading, ReadingFlag
 
 DT = 0.005
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -194,11 +194,11 @@ def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: P
     for reading in (Reading(0, 0.0, rows[0]), DAMAGED, Reading(1, DT, broken),
                     Reading(2, 2 * DT, rows[5]), Reading(3, 3 * DT, rows[7]),
                     Reading(2, 2 * DT, rows[6])):  # fmt: skip
-        recorder.take(reading)
+        recorder.add(reading)
     assert recorder.left_out == 4 and recorder.seconds == pytest.approx(3 * DT)
     for k in range(50):
         assert recorder.began_anew == 0 and recorder.seconds == pytest.approx(3 * DT)
-        recorder.take(Reading(4 + k, 100.0 + DT * k, rows[8]))
+        recorder.add(Reading(4 + k, 100.0 + DT * k, rows[8]))
     assert recorder.began_anew == 1 and recorder.seconds == pytest.approx(49 * DT)
     assert recorder.left_out == 4
 
@@ -208,7 +208,7 @@ def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
     number = 0
     for start, count in clocks:
         for k in range(count):
-            recorder.take(Reading(number, start + DT * k, np.ones(15)))
+            recorder.add(Reading(number, start + DT * k, np.ones(15)))
             number += 1
     return recorder
 
@@ -236,12 +236,12 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
     recorder = PartRecorder(Parts(StreamStub(WRENCH), StreamStub(POSE)), None, X_FS)
     pose, wrench = np.eye(7)[0], np.ones(6)
     for k in range(1000):
-        recorder.take((Part(WRENCH, k, 1e7 if k == 400 else DT * k, wrench), DT * k))
-        recorder.take((Part(POSE, k, 1e4 + DT * k, pose), DT * k))
+        recorder.add((Part(WRENCH, k, 1e7 if k == 400 else DT * k, wrench), DT * k))
+        recorder.add((Part(POSE, k, 1e4 + DT * k, pose), DT * k))
     assert recorder.seconds == pytest.approx(999 * DT) and recorder.left_out == 1
     for k in range(100):  # both were set
-        recorder.take((Part(WRENCH, k, 70.0 + DT * k, wrench), DT * k))
-        recorder.take((Part(POSE, k, 90.0 + DT * k, pose), DT * k))
+        recorder.add((Part(WRENCH, k, 70.0 + DT * k, wrench), DT * k))
+        recorder.add((Part(POSE, k, 90.0 + DT * k, pose), DT * k))
     assert recorder.seconds == pytest.approx(999 * DT) and recorder.left_out == 1
     assert recorder.began_anew <= 2
 
@@ -276,11 +276,13 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
     recorder = PartRecorder(Parts(StreamStub(WRENCH), StreamStub(POSE)), np.full(6, 80.0), X_FS)
     late, clock = 0.004, 1e4
     for k, (t, wrench, pose) in enumerate(zip(*posed(2.0), strict=True)):
-        recorder.take((Part(WRENCH, k, t, wrench), t + 0.001))
-        recorder.take((Part(POSE, k, t + clock + late, pose), t + late + 0.001))
+        recorder.add((Part(WRENCH, k, t, wrench), t + 0.001))
+        recorder.add((Part(POSE, k, t + clock + late, pose), t + late + 0.001))
     bad = np.full(6, 80.0), np.full(7, np.nan), np.full(7, 0.9)
-    for stream, values, flags in zip((WRENCH, POSE, POSE), bad, (0, 0, Flag.DAMAGED), strict=True):
-        recorder.take((Part(stream, 0, 2.1, values, int(flags)), 2.1))
+    for stream, values, flags in zip(
+        (WRENCH, POSE, POSE), bad, (0, 0, ReadingFlag.DAMAGED), strict=True
+    ):
+        recorder.add((Part(stream, 0, 2.1, values, int(flags)), 2.1))
     assert recorder.left_out == 3 and recorder.began_anew == 0
     recorder.write(tmp_path / recorder.file)
     found = identify_log(tmp_path / recorder.file)

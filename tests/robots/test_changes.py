@@ -18,7 +18,7 @@ from drake_teleop.robots import changes
 from drake_teleop.robots.changes import Changes
 from drake_teleop.robots.compensate import compensate_command, run
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.streams import Compensated, Flag, Reading
+from drake_teleop.robots.streams import Compensated, Reading, ReadingFlag
 from drake_teleop.robots.watch import Watch
 
 OBJECT = phi_from_mass_com_inertia(0.4, [0.0, 0.01, 0.15], np.diag([1e-3, 1e-3, 5e-4]))
@@ -131,7 +131,7 @@ def test_change_is_reported_once_with_time_and_size(
     assert kind in messages[0]
     np.testing.assert_allclose(found[: len(numbers)], numbers, atol=0.02)
     if change is not tare:
-        assert out[-1].flags & Flag.OTHER_LOAD
+        assert out[-1].flags & ReadingFlag.OTHER_LOAD
 
 
 @pytest.mark.long
@@ -152,7 +152,7 @@ def test_push_at_rest_is_not_reported(push: list[float]) -> None:
     values = stream(rest_s=5.0)
     values[round(6.0 / DT) :, :6] += push
     out, messages = compensated(values)
-    assert messages == [] and out[-1].flags == Flag.IN_CONTACT
+    assert messages == [] and out[-1].flags == ReadingFlag.IN_CONTACT
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ def test_varying_contact_and_free_motion_are_not_reported() -> None:
     size = np.where(np.abs(t - 8.0) < 2.0, 8.0 * np.cos(5.0 * t), 0.0)
     values[:, :6] += size[:, None] * np.array([1.0, -0.5, 0.3, 0.05, 0.1, 0.0])
     out, messages = compensated(values)
-    assert messages == [] and any(row.flags & Flag.IN_CONTACT for row in out)
+    assert messages == [] and any(row.flags & ReadingFlag.IN_CONTACT for row in out)
 
 
 @pytest.mark.slow
@@ -204,7 +204,7 @@ def test_record_contains_the_last_20_s_after_a_clock_change() -> None:
     sought._next_attempt = np.inf
     row = np.zeros(15)
     for k, t in enumerate([0.0, *(50.0 + DT * np.arange(11_000))]):
-        sought.take(Reading(k, t, row + t), int(Flag.STALE if k == 500 else 0))
+        sought.take(Reading(k, t, row + t), int(ReadingFlag.STALE if k == 500 else 0))
     seen = sought._record()[:, 0]
     assert len(seen) == 10_000 and (np.diff(seen) > 0.0).all()
     assert seen[-1] == pytest.approx(50.0 + DT * 10_999)

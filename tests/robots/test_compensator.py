@@ -21,7 +21,7 @@ from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensate import run
 from drake_teleop.robots.compensator import JUMP_S, STALE_S, TARE_S, Compensator
 from drake_teleop.robots.replay_log import LogSource
-from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Reading
+from drake_teleop.robots.streams import DAMAGED, Compensated, Reading, ReadingFlag
 
 DT, DELAY = 0.002, 0.0051
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -140,18 +140,21 @@ def bad(reading: Reading, name: str) -> Reading:
     if name == "saturated":
         values[2] = -60.0
     late = {"reordered": reading.t - 3 * DT}.get(name, reading.t)
-    return Reading(reading.number, late, values, int(Flag.SATURATED) if name == "told" else 0)
+    return Reading(
+        reading.number, late, values, int(ReadingFlag.SATURATED) if name == "told" else 0
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "flag"),
     [
-        ("damaged", Flag.DAMAGED), ("not finite", Flag.NOT_FINITE), ("reordered", Flag.REORDERED),
-        ("out of range", Flag.OUT_OF_RANGE), ("saturated", Flag.SATURATED),
-        ("told", Flag.SATURATED),
+        ("damaged", ReadingFlag.DAMAGED), ("not finite", ReadingFlag.NOT_FINITE),
+        ("reordered", ReadingFlag.REORDERED),
+        ("out of range", ReadingFlag.OUT_OF_RANGE), ("saturated", ReadingFlag.SATURATED),
+        ("told", ReadingFlag.SATURATED),
     ],
 )  # fmt: skip
-def test_wrench_is_zero_for_a_bad_reading_only(name: str, flag: Flag) -> None:
+def test_wrench_is_zero_for_a_bad_reading_only(name: str, flag: ReadingFlag) -> None:
     compensator = Compensator(load(), DT, largest=np.full(6, 60.0))
     stream = readings(40, touched=5.0)
     for reading in stream[:20]:
@@ -169,7 +172,7 @@ def test_wrench_is_zero_for_a_bad_reading_only(name: str, flag: Flag) -> None:
 def test_wrench_is_zero_during_silence_and_the_filter_restarts() -> None:
     compensator = Compensator(load(), DT)
     first = compensator.stale_output(0.0)
-    assert first is not None and first.flags == Flag.STALE
+    assert first is not None and first.flags == ReadingFlag.STALE
     for reading in readings(20, touched=5.0):
         compensator.step(reading, reading.t)
     last = 19 * DT
@@ -177,7 +180,7 @@ def test_wrench_is_zero_during_silence_and_the_filter_restarts() -> None:
     assert compensator.time_to_stale(last + 0.9 * STALE_S) == pytest.approx(0.1 * STALE_S)
     assert compensator.time_to_stale(last + 1.1 * STALE_S) == 0.0
     stale = compensator.stale_output(last + 1.1 * STALE_S)
-    assert stale is not None and stale.flags == Flag.STALE and not stale.contact.any()
+    assert stale is not None and stale.flags == ReadingFlag.STALE and not stale.contact.any()
     again = readings(1200, touched=-4.0)[1000]  # two seconds later, another contact
     out = compensator.step(again, again.t)
     assert out.flags == 0
@@ -191,18 +194,19 @@ def test_late_readings_are_stale_until_the_clock_is_accepted() -> None:
         now = reading.t + (delay if reading.t > 0.2 else 0.0)
         flags.append(compensator.step(reading, now).flags)
     at = round(0.2 / DT) + 1
-    assert not any(flags[:at]) and flags[at] == Flag.STALE
-    here = flags.index(Flag.CLOCK_JUMP)
+    assert not any(flags[:at]) and flags[at] == ReadingFlag.STALE
+    here = flags.index(ReadingFlag.CLOCK_JUMP)
     assert here * DT == pytest.approx(0.2 + JUMP_S, abs=delay + 5 * DT)
     assert not any(flags[here + 1 :])
 
 
 @pytest.mark.parametrize(
     ("start", "number", "flag"),
-    [(50.0, 20, Flag.CLOCK_JUMP), (-50.0, 20, Flag.CLOCK_JUMP), (-50.0, 0, Flag.RESTART),
-     (20 * DT, 0, Flag.RESTART)],
+    [(50.0, 20, ReadingFlag.CLOCK_JUMP), (-50.0, 20, ReadingFlag.CLOCK_JUMP),
+     (-50.0, 0, ReadingFlag.RESTART),
+     (20 * DT, 0, ReadingFlag.RESTART)],
 )  # fmt: skip
-def test_clock_jumps_and_restarts_are_flagged(start: float, number: int, flag: Flag) -> None:
+def test_clock_jumps_and_restarts_are_flagged(start: float, number: int, flag: ReadingFlag) -> None:
     compensator = Compensator(load(), DT)
     for reading in readings(20):
         compensator.step(reading, reading.t)
@@ -215,8 +219,12 @@ def test_clock_jumps_and_restarts_are_flagged(start: float, number: int, flag: F
     np.testing.assert_allclose(after[-1].contact[0], 5.0, atol=1e-9)
 
 
-@pytest.mark.parametrize(("number", "flag"), [(0, Flag.RESTART), (60, Flag.CLOCK_JUMP)])
-def test_small_backward_clock_step_is_accepted_after_a_silence(number: int, flag: Flag) -> None:
+@pytest.mark.parametrize(
+    ("number", "flag"), [(0, ReadingFlag.RESTART), (60, ReadingFlag.CLOCK_JUMP)]
+)
+def test_small_backward_clock_step_is_accepted_after_a_silence(
+    number: int, flag: ReadingFlag
+) -> None:
     compensator = Compensator(load(), DT)
     for reading in readings(60):
         compensator.step(reading, reading.t)
@@ -226,7 +234,7 @@ def test_small_backward_clock_step_is_accepted_after_a_silence(number: int, flag
     ]
     at = flags.index(flag)
     assert at * DT == pytest.approx(STALE_S, abs=2 * DT)
-    assert flags == [Flag.REORDERED] * at + [flag] + [0] * (49 - at)
+    assert flags == [ReadingFlag.REORDERED] * at + [flag] + [0] * (49 - at)
 
 
 def test_wrong_rate_is_flagged() -> None:
@@ -234,13 +242,13 @@ def test_wrong_rate_is_flagged() -> None:
     for share in (1.0, 1.2):
         compensator = Compensator(load(), share * DT)
         flags[share] = [compensator.step(each, each.t).flags for each in readings(300)][-1]
-    assert flags == {1.0: 0, 1.2: Flag.WRONG_RATE}
+    assert flags == {1.0: 0, 1.2: ReadingFlag.WRONG_RATE}
 
 
 def test_wrench_is_limited_to_the_range_of_the_sensor() -> None:
     compensator = Compensator(load(), DT, gamma=30.0, largest=np.full(6, 60.0))
     out = [compensator.step(each, each.t) for each in readings(20, touched=5.0)][-1]
-    assert out.flags == Flag.CLIPPED and out.scaled[0] == 60.0
+    assert out.flags == ReadingFlag.CLIPPED and out.scaled[0] == 60.0
     np.testing.assert_allclose(out.contact[0], 5.0)
 
 
@@ -248,7 +256,7 @@ def test_delayed_wrenches_are_clipped() -> None:
     compensator = Compensator(load(), DT, wait=2, cutoff_hz=None, largest=np.full(6, 60.0))
     compensator.offsets = OFFSETS - 20.0 * (np.arange(6) == 0)
     out = [compensator.step(each, each.t) for each in readings(3, touched=45.0)]
-    assert all(row.flags == Flag.CLIPPED and row.contact[0] == 60.0 for row in out)
+    assert all(row.flags == ReadingFlag.CLIPPED and row.contact[0] == 60.0 for row in out)
 
 
 @pytest.mark.parametrize(

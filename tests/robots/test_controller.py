@@ -19,7 +19,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensation_step import TOO_FAR, VARIES
 from drake_teleop.robots.controller.c99 import CFLAGS, kernel_files
 from drake_teleop.robots.controller.translator import HELPERS, Translator
-from drake_teleop.robots.streams import Flag, Reading
+from drake_teleop.robots.streams import Reading, ReadingFlag
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import kernel
@@ -67,7 +67,13 @@ def test_the_vector_contains_each_flag(exported):
     text = (exported / "test_vector.h").read_text()
     flags = text[text.index("test_flags") :].partition("{")[2].partition("}")[0].split(", ")
     assert len(flags) == 1000
-    expected = {0, Flag.SATURATED, Flag.NOT_FINITE, Flag.OUT_OF_RANGE, Flag.CLIPPED}
+    expected = {
+        0,
+        ReadingFlag.SATURATED,
+        ReadingFlag.NOT_FINITE,
+        ReadingFlag.OUT_OF_RANGE,
+        ReadingFlag.CLIPPED,
+    }
     assert set(map(int, flags)) == expected
     header = (exported / "wrench_compensator.h").read_text()
     for flag in expected - {0}:

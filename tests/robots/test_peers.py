@@ -36,9 +36,9 @@ from drake_teleop.robots.streams import (
     POSE,
     WRENCH,
     Compensated,
-    Flag,
     Part,
     Reading,
+    ReadingFlag,
     Source,
 )
 from drake_teleop.robots.udp import UdpSource
@@ -66,7 +66,11 @@ class Seen(list[Compensated]):
     """Outputs of the loop of `compensate` for a source, with their times."""
 
     def __init__(
-        self, source: Source, last: int, end: Flag = Flag.RESTART, seconds: float = 5.0
+        self,
+        source: Source,
+        last: int,
+        end: ReadingFlag = ReadingFlag.RESTART,
+        seconds: float = 5.0,
     ) -> None:
         """Read until a good wrench with number `last` after the flag `end`, with a tool at rest."""
         self.at: list[float] = []
@@ -97,19 +101,21 @@ class Seen(list[Compensated]):
         self.at.append(time.monotonic())
         return out
 
-    def check(self, flags: Flag) -> None:
+    def check(self, flags: ReadingFlag) -> None:
         """The story of the peer: named, zero, and good again by itself."""
         assert np.isfinite([[*row.contact, *row.scaled, row.t] for row in self]).all()
         assert not any(row.contact.any() or row.scaled.any() for row in self if row.flags)
-        named = Flag(0)
+        named = ReadingFlag(0)
         for row in self:
-            named |= Flag(row.flags)
+            named |= ReadingFlag(row.flags)
         assert named & flags == flags
         good = [row for row in self if not row.flags]
         for row in good:
             wanted = [row.number % 500, 0.0, 0.0, 0.0, 0.0, 0.0]
             np.testing.assert_allclose(row.contact, wanted, atol=1e-9)
-        for flag in (each for each in Flag if each & flags):  # Python 3.10 cannot split flags
+        for flag in (
+            each for each in ReadingFlag if each & flags
+        ):  # Python 3.10 cannot split flags
             at = max(k for k, row in enumerate(self) if row.flags & flag)
             assert not all(row.flags for row in self[at:]), flag
         assert max(np.diff(self.at)) < 0.5  # and not silent: 0.05 s on an idle machine
@@ -124,10 +130,16 @@ def test_udp() -> None:
     source = UdpSource("udp://:0", 0.002)
     Compensator(load(), source.dt)  # loads what is compiled: the sender waits for nobody
     with peer("udp", str(source.port)):
-        seen = Seen(source, 510, Flag.CLOCK_JUMP)
+        seen = Seen(source, 510, ReadingFlag.CLOCK_JUMP)
     source.close()
-    flags = Flag.REORDERED | Flag.NOT_FINITE | Flag.DAMAGED | Flag.SATURATED | Flag.STALE
-    seen.check(flags | Flag.RESTART | Flag.CLOCK_JUMP)
+    flags = (
+        ReadingFlag.REORDERED
+        | ReadingFlag.NOT_FINITE
+        | ReadingFlag.DAMAGED
+        | ReadingFlag.SATURATED
+        | ReadingFlag.STALE
+    )
+    seen.check(flags | ReadingFlag.RESTART | ReadingFlag.CLOCK_JUMP)
     numbers = [row.number for row in seen]
     assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
 
@@ -137,7 +149,13 @@ def test_netft() -> None:
         source = NetFtSource(f"netft://127.0.0.1:{port}?counts=1000,1000&sign=1", 0.002)
         seen = Seen(source, 10)
         source.close()
-    flags = Flag.REORDERED | Flag.DAMAGED | Flag.SATURATED | Flag.STALE | Flag.RESTART
+    flags = (
+        ReadingFlag.REORDERED
+        | ReadingFlag.DAMAGED
+        | ReadingFlag.SATURATED
+        | ReadingFlag.STALE
+        | ReadingFlag.RESTART
+    )
     seen.check(flags)
     numbers = [row.number for row in seen]
     assert numbers[numbers.index(12) - 1] == 8  # and nothing instead of what was lost
@@ -151,7 +169,9 @@ def test_rtde() -> None:
         seen = Seen(source, 510)
         source.close()
     assert source.dt == 0.002
-    seen.check(Flag.REORDERED | Flag.NOT_FINITE | Flag.STALE | Flag.RESTART)
+    seen.check(
+        ReadingFlag.REORDERED | ReadingFlag.NOT_FINITE | ReadingFlag.STALE | ReadingFlag.RESTART
+    )
     assert not {50000 + number for number in LOST} & {row.number for row in seen}
     poses = [part.values for part in seen.parts if part.stream == POSE]
     np.testing.assert_allclose(poses[0], [np.cos(0.5), 0, 0, np.sin(0.5), 0.4, 0.1, 0.3])
@@ -165,10 +185,16 @@ def test_rtde() -> None:
 def test_ros_2() -> None:
     with peer("ros", free_port()) as (port, _):
         source = ZenohSource(f"zenoh://127.0.0.1:{port}/ft/wrench?domain=3&sign=1", 0.002)
-        seen = Seen(source, 510, Flag.CLOCK_JUMP)
+        seen = Seen(source, 510, ReadingFlag.CLOCK_JUMP)
         source.close()
-    flags = Flag.REORDERED | Flag.NOT_FINITE | Flag.DAMAGED | Flag.STALE | Flag.RESTART
-    seen.check(flags | Flag.CLOCK_JUMP)
+    flags = (
+        ReadingFlag.REORDERED
+        | ReadingFlag.NOT_FINITE
+        | ReadingFlag.DAMAGED
+        | ReadingFlag.STALE
+        | ReadingFlag.RESTART
+    )
+    seen.check(flags | ReadingFlag.CLOCK_JUMP)
 
 
 def test_ros_2_node_receives_the_wrench() -> None:
@@ -232,14 +258,15 @@ def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: 
         values = np.concatenate([part.values, AT_REST])
         flags.append(compensator.step(Reading(part.number, part.t, values, part.flags), now).flags)
     source.close()
-    assert set(flags[-200:]) == {Flag.WRONG_RATE if named else 0}
+    assert set(flags[-200:]) == {ReadingFlag.WRONG_RATE if named else 0}
 
 
 @pytest.mark.parametrize("still", [False, True])
 @pytest.mark.parametrize(
     ("status", "flag"),
-    [(0, 0), (1 << 30 | 1 << 18 | 1 << 16, 0), (1 << 31, Flag.DAMAGED), (1 << 31 | 1, Flag.DAMAGED),
-     (1 << 17, Flag.SATURATED), (1 << 31 | 1 << 17, Flag.SATURATED)],
+    [(0, 0), (1 << 30 | 1 << 18 | 1 << 16, 0), (1 << 31, ReadingFlag.DAMAGED),
+     (1 << 31 | 1, ReadingFlag.DAMAGED),
+     (1 << 17, ReadingFlag.SATURATED), (1 << 31 | 1 << 17, ReadingFlag.SATURATED)],
 )  # fmt: skip
 def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
     status: int, flag: int, still: bool
@@ -247,7 +274,7 @@ def test_status_of_netft_is_flagged_beside_a_measurement_that_stands_still(
     source = NetFtSource("netft://127.0.0.1?counts=2,4&rate=1000&sign=-1")
     counts = [2, -4, 6, 4, -8, 12]
     source.part(struct.pack(">III6i", 1, 7, 0, *counts), 0.0)
-    for after, stale in ((0.049, 0), (0.051, Flag.STALE)):
+    for after, stale in ((0.049, 0), (0.051, ReadingFlag.STALE)):
         record = struct.pack(">III6i", 2, 7 + (not still), status, *counts)
         part = source.part(record, after)
         assert part.flags == flag | (stale if still else 0)

@@ -15,7 +15,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.assembly import Assembly, Parts, pose_from_rpy
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_source
-from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
+from drake_teleop.robots.streams import IMU, POSE, WRENCH, Part, Reading, ReadingFlag
 
 DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])
 X_FS = np.array([math.cos(0.3), 0.0, math.sin(0.3), 0.0, 0.02, -0.03, 0.08])
@@ -126,7 +126,7 @@ def test_readings_are_stale_without_poses_and_recover() -> None:
     assembly = Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     found = played(assembly, 0.6, lost=lambda k: 200 <= k < 280)
     assert not any(0.2 <= each.t < 0.28 for each in found if not each.flags)
-    assert {each.flags for each in found} == {0, int(Flag.STALE)}
+    assert {each.flags for each in found} == {0, int(ReadingFlag.STALE)}
     assert [each.flags for each in found[-150:]] == [0] * 150
 
 
@@ -159,7 +159,7 @@ def test_assembly_accepts_a_clock_that_is_set_back() -> None:
             out += [compensator.step(each, now) for each in assembly.take(part, now)]
     left = [row.contact for row in out if not row.flags]
     assert len(left) > 50 and np.abs(left).max() < 0.03
-    assert any(row.flags & Flag.CLOCK_JUMP for row in out)
+    assert any(row.flags & ReadingFlag.CLOCK_JUMP for row in out)
 
 
 def test_imu_gives_the_motion() -> None:

@@ -27,7 +27,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2_messages import MessageConverter
-from drake_teleop.robots.streams import NONZERO_FLAGS, POSE, Compensated, Flag
+from drake_teleop.robots.streams import NONZERO_FLAGS, POSE, Compensated, ReadingFlag
 
 PEER = Path(__file__).with_name("ros2_peer.py")
 DOMAIN = str(os.getpid() % 100 + 1)
@@ -79,7 +79,7 @@ def test_node_receives_wrench_and_every_flag_and_the_hash() -> None:
 
         seen.wait(lambda: any("wrench" in row for row in seen), lambda: write(0))
         seen.wait(lambda: any(row.get("message") == "ok" for row in seen), lambda: write(0), 30)
-        for flag in (*Flag, Flag.WRONG_RATE | Flag.CLIPPED):
+        for flag in (*ReadingFlag, ReadingFlag.WRONG_RATE | ReadingFlag.CLIPPED):
             words = ", ".join(flag_names(flag))
             write(int(flag))
             seen.wait(lambda words=words: any(row.get("message") == words for row in seen))
@@ -89,8 +89,8 @@ def test_node_receives_wrench_and_every_flag_and_the_hash() -> None:
     assert first["wrench"] == wrench.tolist() and first["frame"] == "tool0"
     assert abs(first["t"] - time.time()) < 600.0
     levels = {row["message"]: row["level"] for row in seen if "message" in row}
-    for flag in Flag:
-        expected = 1 if flag & NONZERO_FLAGS else 3 if flag == Flag.STALE else 2
+    for flag in ReadingFlag:
+        expected = 1 if flag & NONZERO_FLAGS else 3 if flag == ReadingFlag.STALE else 2
         assert levels[flag_names(flag)[0]] == expected
     assert levels["ok"] == 0
     last = [row for row in seen if "message" in row][-1]
@@ -106,15 +106,22 @@ def test_faults_of_a_node_are_named_and_zero() -> None:
     with process(str(PEER), "faults", DOMAIN) as peer:
         assert peer.stdout is not None and peer.stdout.readline() == "ready\n"
         source = Ros2Source(f"ros2://ft/wrench?domain={DOMAIN}&sign=1", 0.002)
-        seen = Seen(source, 20, Flag.RESTART, 60.0)
+        seen = Seen(source, 20, ReadingFlag.RESTART, 60.0)
         source.close()
-    flags = Flag.REORDERED | Flag.NOT_FINITE | Flag.DAMAGED | Flag.OUT_OF_RANGE | Flag.STALE
-    named = Flag(0)
+    flags = (
+        ReadingFlag.REORDERED
+        | ReadingFlag.NOT_FINITE
+        | ReadingFlag.DAMAGED
+        | ReadingFlag.OUT_OF_RANGE
+        | ReadingFlag.STALE
+    )
+    named = ReadingFlag(0)
     for row in seen:
-        named |= Flag(row.flags)
+        named |= ReadingFlag(row.flags)
         assert not row.flags or not row.contact.any()
     assert (
-        named & (flags | Flag.CLOCK_JUMP | Flag.RESTART) == flags | Flag.CLOCK_JUMP | Flag.RESTART
+        named & (flags | ReadingFlag.CLOCK_JUMP | ReadingFlag.RESTART)
+        == flags | ReadingFlag.CLOCK_JUMP | ReadingFlag.RESTART
     )
 
 
@@ -152,8 +159,11 @@ def test_wrong_addresses_are_one_error_line() -> None:
         ("ros2://", "'' is not a topic"),
         ("ros2://ft wrench", "is not a topic"),
         ("ros2://ft/wrench?colour=1", "unknown parameter 'colour'"),
-        ("ros2://ft/wrench?domain=300", "is not 0 to 232"),
-        ("ros2://ft/wrench?tf=base", "tf is not PARENT,CHILD"),
+        (
+            "ros2://ft/wrench?domain=300",
+            "domain='300' is not a ROS domain; give a whole number from 0 to 232",
+        ),
+        ("ros2://ft/wrench?tf=base", "tf='base' does not name two frames; give tf=PARENT,CHILD"),
         ("ros2://ft/wrench?joints=/joint_states", "need the model of the arm"),
     ):
         with pytest.raises(DrakeTeleopError, match=words):

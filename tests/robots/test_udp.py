@@ -30,7 +30,15 @@ from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink, open_source
 from drake_teleop.robots.lines import LineSource, read_line, wrench_line
-from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
+from drake_teleop.robots.streams import (
+    DAMAGED,
+    POSE,
+    WRENCH,
+    Compensated,
+    Part,
+    Reading,
+    ReadingFlag,
+)
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
 
@@ -43,8 +51,8 @@ def line_of(reading) -> bytes:
 
 def test_packets_and_lines_are_read_back() -> None:
     reading = readings(3)[2]
-    back = udp.unpack_reading(udp.pack_reading(reading._replace(flags=int(Flag.SATURATED))))
-    assert back[:2] == reading[:2] and back.flags == Flag.SATURATED
+    back = udp.unpack_reading(udp.pack_reading(reading._replace(flags=int(ReadingFlag.SATURATED))))
+    assert back[:2] == reading[:2] and back.flags == ReadingFlag.SATURATED
     np.testing.assert_array_equal(back.values, reading.values)
     back = read_line(line_of(reading), 7)
     assert back.number == 7
@@ -53,7 +61,7 @@ def test_packets_and_lines_are_read_back() -> None:
     again = udp.unpack_wrench(udp.pack_wrench(out))
     assert again.flags == 34 and again.scaled.tolist() == out.scaled.tolist()
     assert json.loads(wrench_line(out))["flags"] == ["damaged", "stale"]
-    with pytest.raises(DrakeTeleopError, match="is not a wrench packet"):
+    with pytest.raises(DrakeTeleopError, match="bytes are not a compensated wrench; send"):
         udp.unpack_wrench(b"x")
 
 
@@ -68,7 +76,7 @@ def test_c_header_has_the_same_layout_and_flags() -> None:
         lengths.append(sum(sizes[kind] * n for (kind, _), n in zip(fields, counts, strict=True)))
     assert lengths == [udp.READING.size, udp.POSED.size, udp.WRENCH.size]
     bits = {name: int(value) for name, value in re.findall(r"DT_(\w+) = (\d+)", HEADER)}
-    assert bits == {str(flag.name): flag.value for flag in Flag}
+    assert bits == {str(flag.name): flag.value for flag in ReadingFlag}
 
 
 @pytest.mark.parametrize("kind", ["packet", "line"])
@@ -87,10 +95,10 @@ def test_damaged_input_raises_no_error_and_gives_finite_numbers(kind: str) -> No
         out = compensator.step(reading, k * DT)
         assert np.isfinite([out.t, *out.contact, *out.scaled]).all()
         flags |= out.flags
-    assert flags & Flag.DAMAGED
+    assert flags & ReadingFlag.DAMAGED
     for k, reading in enumerate(readings(1200, touched=5.0)):
         out = compensator.step(reading, (6000 + k) * DT)
-    assert out.flags & ~Flag.WRONG_RATE == 0
+    assert out.flags & ~ReadingFlag.WRONG_RATE == 0
     np.testing.assert_allclose(out.contact[0], 5.0, atol=1e-6)
 
 
@@ -126,7 +134,7 @@ def test_udp_round_trip_accepts_only_this_machine() -> None:
         for reading in found:
             sink.write(compensator.step(reading, reading.t))
         back = [udp.unpack_wrench(there.recv(1000)) for _ in range(4)]
-    assert [row.flags for row in back] == [0, 0, 0, Flag.DAMAGED]
+    assert [row.flags for row in back] == [0, 0, 0, ReadingFlag.DAMAGED]
     np.testing.assert_allclose(back[2].contact[0], 5.0, atol=1e-9)
     assert source.read(0.0) == []
     source.close()
@@ -134,7 +142,7 @@ def test_udp_round_trip_accepts_only_this_machine() -> None:
 
 
 def test_wrench_and_pose_in_a_packet() -> None:
-    wrench = Part(WRENCH, 4, 0.5, np.arange(6.0), int(Flag.SATURATED))
+    wrench = Part(WRENCH, 4, 0.5, np.arange(6.0), int(ReadingFlag.SATURATED))
     pose = Part(POSE, 4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]))
     source = udp.PosedSource("posed://:0", DT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -146,7 +154,12 @@ def test_wrench_and_pose_in_a_packet() -> None:
     assert found is not None and [part[:3] for part in found[:2]] == [wrench[:3], pose[:3]]
     np.testing.assert_array_equal(found[0].values, -wrench.values)
     np.testing.assert_array_equal(found[1].values, pose.values)
-    assert [part.flags for part in found] == [Flag.SATURATED, 0, Flag.DAMAGED, Flag.DAMAGED]
+    assert [part.flags for part in found] == [
+        ReadingFlag.SATURATED,
+        0,
+        ReadingFlag.DAMAGED,
+        ReadingFlag.DAMAGED,
+    ]
 
 
 def test_lines_from_a_pipe_are_written_to_a_table(tmp_path: Path) -> None:

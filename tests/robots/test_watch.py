@@ -13,7 +13,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.streams import Flag, Reading
+from drake_teleop.robots.streams import Reading, ReadingFlag
 from drake_teleop.robots.watch import Detector, Watch
 
 DT = 0.002
@@ -57,7 +57,7 @@ def test_push_is_flagged_while_it_lasts() -> None:
     values[1000:1250, 0] += 5.0
     flags = flagged(t, values)
     assert not flags[:1000].any() and not flags[1400:].any()
-    assert (flags[1025:1250] == Flag.IN_CONTACT).all()
+    assert (flags[1025:1250] == ReadingFlag.IN_CONTACT).all()
 
 
 @pytest.mark.long
@@ -82,7 +82,7 @@ def test_noise_floor_of_a_free_log_detects_small_contacts(tmp_path: Path) -> Non
         ]
         flags = np.array([row.flags for row in out])
         assert not flags[:1000].any() and not flags[1350:].any()
-        assert (flags[1030:1250] == (Flag.IN_CONTACT if push else 0)).all()
+        assert (flags[1030:1250] == (ReadingFlag.IN_CONTACT if push else 0)).all()
 
 
 def shaken(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +112,7 @@ def test_noise_floor_rises_with_acceleration(tmp_path: Path) -> None:
         compensator.step(Reading(k, float(t[k]), row), float(t[k])) for k, row in enumerate(values)
     ]
     flags = np.array([row.flags for row in out])
-    assert (flags[530:750] == Flag.IN_CONTACT).all()
+    assert (flags[530:750] == ReadingFlag.IN_CONTACT).all()
     assert not flags[:500].any() and not flags[850:].any()
     assert max(abs(row.contact[0]) for row in out[1200:]) > 0.6
 
@@ -132,7 +132,7 @@ def test_another_load_is_flagged_after_a_motion() -> None:
     motion = values[:, 6:9], values[:, 9:12], values[:, 12:]
     values[800:, :6] += non_contact_wrench(*motion, more)[800:]
     flags = flagged(t, values)
-    assert not flags[:800].any() and (flags[-200:] == Flag.OTHER_LOAD).all()
+    assert not flags[:800].any() and (flags[-200:] == ReadingFlag.OTHER_LOAD).all()
 
 
 def test_tare_resets_the_watch() -> None:
@@ -142,7 +142,7 @@ def test_tare_resets_the_watch() -> None:
     values[:6] += non_contact_wrench(values[6:9], values[9:12], values[12:], PHI)
     values[0] += 4.0
     flags = [compensator.step(Reading(k, DT * k, values), DT * k).flags for k in range(300)]
-    assert flags[-1] == Flag.IN_CONTACT
+    assert flags[-1] == ReadingFlag.IN_CONTACT
     assert compensator.tare().startswith("done")
     after = [compensator.step(Reading(k, DT * k, values), DT * k).flags for k in range(300, 400)]
     assert not any(after)

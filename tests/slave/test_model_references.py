@@ -176,7 +176,7 @@ INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
     ),
     "sdf by file": (lambda f: {"a_sdf": including(f"file://{f}/a.sdf")}, "names itself"),
     "sdf outside": (lambda _: {"a_sdf": including("../other.sdf")}, OUTSIDE),
-    "a fifo": (lambda _: {"a_sdf": including("fifo.sdf")}, "which is no file"),
+    "a fifo": (lambda _: {"a_sdf": including("fifo.sdf")}, "which does not exist"),
     "mjcf itself": (
         lambda _: include_cycle(lambda to: mjcf(f'<include file="{to}"/>'), "a.xml"),
         "names itself",

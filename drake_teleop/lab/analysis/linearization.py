@@ -482,7 +482,7 @@ class _Period:
         return np.concatenate(
             [
                 self._eval("operator", "hand_wrench_E"),
-                _displacement(pose, self._pose),
+                _pose_difference(pose, self._pose),
                 self._eval("force_scaling", "wrench_B"),
                 self._eval("master_device", "twist_master"),
                 J @ state[self._joints :],
@@ -575,7 +575,7 @@ def _displace(pose: Array, change: Array) -> Array:
     )
 
 
-def _displacement(pose: Array, other: Array) -> Array:
+def _pose_difference(pose: Array, other: Array) -> Array:
     turn = logarithm(multiply(tuple(pose[:4]), conjugate(tuple(other[:4]))))
     return np.concatenate([pose[4:] - other[4:], turn])
 

@@ -97,7 +97,7 @@ class Criterion:
             return float("inf")
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
-        log_value, _ = self._log_and_gradient(eigenvalues, vectors, 0.0)
+        log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
         return float(np.exp(log_value) / np.sqrt(RATE * duration))
 
     def smooth(self, s: Array, omega: Array, alpha: Array, sharpness: float) -> tuple[float, Array]:
@@ -109,7 +109,7 @@ class Criterion:
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
-        value, weights = self._log_and_gradient(eigenvalues, vectors, sharpness)
+        value, weights = self._log_criterion_and_gradient(eigenvalues, vectors, sharpness)
         g_gram = (vectors * weights) @ vectors.T
         if self.name == "A16":
             g_gram = weights
@@ -117,7 +117,7 @@ class Criterion:
         g_V = g_rows * self._rows[:, np.newaxis] * self._columns
         return value, np.ascontiguousarray(g_V[:, :, -10:])
 
-    def _log_and_gradient(
+    def _log_criterion_and_gradient(
         self, eigenvalues: Array, vectors: Array, sharpness: float
     ) -> tuple[float, Array]:
         """Return log criterion and gradient by eigenvalues (A16: by the Gram matrix)."""

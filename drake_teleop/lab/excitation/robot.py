@@ -152,6 +152,7 @@ def RobotFromModel(
             raise DrakeTeleopError(
                 f"{mass:g} kg is outside {_MIN_PAYLOAD_KG:g} to {_MAX_PAYLOAD_KG:g} kg",
                 where="--payload",
+                remedy="give the mass beyond the sensor in kg",
             )
         if payload is None:
             assumptions.append(f"a load of {mass:g} kg (--payload)")

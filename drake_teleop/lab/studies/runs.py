@@ -107,9 +107,7 @@ def run_study(
                     chunks = _chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
-            remedy = (
-                f"{out} keeps {counter.done} of {counter.total} runs; the same command continues"
-            )
+            remedy = f"{out} keeps {counter.done} of {counter.total} runs; repeat the command"
             if isinstance(error, CannotWrite):
                 raise DrakeTeleopError(str(error), remedy=remedy) from error
             raise KeyboardInterrupt(remedy) from error

@@ -63,7 +63,7 @@ _NORMAL_MAD = 1.4826
 _MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
 _NOTE_NOTHING_REJECTED = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
-    " cannot be told from errors of the motion (delay, scale, mounting): no sample was rejected"
+    " are indistinguishable from motion errors (delay, scale, mounting): no sample was rejected"
 )
 
 

@@ -101,16 +101,22 @@ class NoiseFloor:
         )
         if (np.abs(rho) >= 1.0).any():
             raise DrakeTeleopError(
-                "has a value that is not between -1 and 1", where="rho", remedy=_REFIT
+                "has a value that is not between -1 and 1",
+                where="rho",
+                remedy="call fit_noise_floor",
             )
         positive("widths", self.widths, LENGTHS)
         checked("reached", self.reached, 3)
         if not 0.0 <= self.fade < 1.0:
             raise DrakeTeleopError(
-                f"{self.fade} is not at least 0 and below 1", where="fade", remedy=_REFIT
+                f"{self.fade} is not at least 0 and below 1",
+                where="fade",
+                remedy="call fit_noise_floor",
             )
         if np.linalg.eigvalsh(correlation).min() <= 0.0:
-            raise DrakeTeleopError("is not positive definite", where="correlation", remedy=_REFIT)
+            raise DrakeTeleopError(
+                "is not positive definite", where="correlation", remedy="call fit_noise_floor"
+            )
 
     def threshold(self, statistic: str, margin: float = MARGIN) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""

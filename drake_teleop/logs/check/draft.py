@@ -55,8 +55,8 @@ _HOMOGENEOUS = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 _IN_BASE = r"tcp_force$|^o_f_ext"
 _ROBOT_NOTES = {
-    r"tcp_force$": "The payload that the controller was told is not in the TCP's force: tell it 0.",
-    r"f_ext": "An external wrench is estimated, and without the load that the robot was told.",
+    r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
+    r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
 _UNIT_NAMES = {
     **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*UNITS, "g")},

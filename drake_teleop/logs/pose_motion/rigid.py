@@ -13,7 +13,7 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.uncertainty import ARM, gain_effects
 from drake_teleop.load.moments import centripetal_matrix, coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
-from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH, Levels
+from drake_teleop.logs.pose_motion.spectra import FORCES, MOMENTS_SIZE, RATES, Levels
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
 
 PARAMETERS = 23
@@ -204,7 +204,7 @@ def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solut
 
 def _covariance(record: _Record, solution: _Solution, inflation: float, gain: float) -> Array:
     B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
-    middle = _normal(B, np.zeros((6, WIDTH)), record.Z, W @ solution.R @ W)[0]
+    middle = _normal(B, np.zeros((6, MOMENTS_SIZE)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
     covariance *= np.outer(*2 * [_weight_estimation_factors(record, solution)])
     larger = covariance * inflation**2
@@ -244,7 +244,7 @@ def _residual_map(state: State) -> Array:
 def _columns(state: State) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and the residual e (6, 38), in coefficients of y."""
     L, M = _residual_map(state), _map(state)
-    B = np.zeros((6, PARAMETERS, WIDTH))
+    B = np.zeros((6, PARAMETERS, MOMENTS_SIZE))
     B[:, LOAD] = coefficients() @ M
     B[:, DELAY, RATES] = -(L @ M)[:, None, :SIGNALS]
     for i, unit in enumerate(np.eye(3)):
@@ -259,8 +259,8 @@ def _columns(state: State) -> tuple[Array, Array]:
 
 
 def _normal(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
-    columns = B.reshape(-1, WIDTH)
-    BZ = (columns @ Z).reshape(len(Z), 6, PARAMETERS, WIDTH)
+    columns = B.reshape(-1, MOMENTS_SIZE)
+    BZ = (columns @ Z).reshape(len(Z), 6, PARAMETERS, MOMENTS_SIZE)
     WB = np.einsum("bcd,bcjk->dbjk", W, BZ, optimize=True)
     gram = np.einsum("dbjk,dik->ji", WB, B, optimize=True)
     return 0.5 * (gram + gram.T), np.einsum("dbjk,dk->j", WB, Le, optimize=True)
@@ -307,7 +307,7 @@ def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
 
 
 def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    BF = (B.reshape(-1, WIDTH) @ Z)[:, :, FORCES].reshape(len(Z), 6, PARAMETERS, 6)
+    BF = (B.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, FORCES].reshape(len(Z), 6, PARAMETERS, 6)
     return gain_effects(BF, W, inverse)
 
 
@@ -318,10 +318,10 @@ def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float
     effects = _gain_effects(B, record.Z, solution.W, solution.inverse)
     left = -np.einsum("cjk,ji->cik", B, effects)
     length = np.repeat([1.0, ARM], 3)
-    left = left.reshape(6, 6, 6, WIDTH)  # of channel c by gain d, k
+    left = left.reshape(6, 6, 6, MOMENTS_SIZE)  # of channel c by gain d, k
     for c in range(6):
         left[c, c, :, FORCES] += np.diag(length[c] / length)
-    left = left.reshape(6, 36, WIDTH)
+    left = left.reshape(6, 36, MOMENTS_SIZE)
     sums = gain**2 * np.einsum("cik,bkm,cim->bc", left, record.Z, left, optimize=True)
     more = levels.power(np.maximum(sums, 0.0)) / record.power
     return 2.0 * float(levels.costs(1.0 + more).sum())

@@ -29,7 +29,7 @@ _NARROW_BELOW_HZ, _MAX_BAND_RATIO = 3.0, 4.0 / 3.0
 FORCES = slice(SIGNALS, SIGNALS + 6)
 """Columns of the wrench and of the signals' derivatives in the moments."""
 RATES = slice(SIGNALS + 6, 2 * SIGNALS + 6)
-WIDTH = 2 * SIGNALS + 6
+MOMENTS_SIZE = 2 * SIGNALS + 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +289,7 @@ def noise_moments(
         (rotation_power * w2, first + second),
     ]
     parts.append((rotation_power * w2**2, third))
-    Q = np.zeros((of.count, WIDTH, WIDTH))
+    Q = np.zeros((of.count, MOMENTS_SIZE, MOMENTS_SIZE))
     for power, shape in parts:
         Q[:, :SIGNALS, :SIGNALS] += of.sums(power)[:, None, None] * shape
         Q[:, RATES, RATES] += of.sums(power * w2)[:, None, None] * shape

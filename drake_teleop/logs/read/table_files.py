@@ -91,7 +91,7 @@ def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
     rows = frame.select(pl.len()).collect().item()
     if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
         return _LazyColumns(frame, columns)
-    return _collected(frame, columns)
+    return _collect_columns(frame, columns)
 
 
 def expanded_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
@@ -107,7 +107,7 @@ def expanded_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
         if dtype.is_numeric() or isinstance(dtype, (pl.List, pl.Array))
     ]
     frame = frame.select(numeric).collect().lazy()
-    return _collected(frame, _column_expressions(frame))
+    return _collect_columns(frame, _column_expressions(frame))
 
 
 def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
@@ -120,7 +120,7 @@ def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
     return _with_canonical(columns)
 
 
-def _collected(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
+def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
     whole = frame.select(column.alias(name) for name, column in columns.items()).collect()
     return {series.name: _to_numpy(series) for series in whole.get_columns()}
 

@@ -118,7 +118,7 @@ class Table:
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(
-                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row instead of 1",
+                f"{str(name)!r} of {self.path.name} has {numbers.shape[1]} numbers per row, not 1",
                 where=where,
                 remedy="name a column that has one",
             )

@@ -62,7 +62,7 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         config = NetworkConfig() if config is None else config
         if config.silence != "hold" and size not in (LOAD.start, PACKET_SIZE):
             raise DrakeTeleopError(
-                f"'{config.silence}' requires packets of a passivity method; packets have {size} numbers",
+                f"'{config.silence}' requires packets of a passivity method, not of size {size}",
                 where="NetworkChannel.silence",
                 remedy="set silence: hold, or use a passivity method",
             )

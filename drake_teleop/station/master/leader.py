@@ -312,11 +312,11 @@ class LeaderArm(DeviceBlock):
     __slots__ = ()
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        constants = (*device.constants, _hand_weight(device))
+        constants = (*device.constants, _operator_hand_weight(device))
         super().__init__(period, device, q_initial, step_leader, constants)
 
 
-def _hand_weight(device: LeaderDevice) -> float:
+def _operator_hand_weight(device: LeaderDevice) -> float:
     gravity = np.linalg.norm(device.arm.table[-1, GRAVITY : GRAVITY + 3])
     return float(device.numbers[HAND_MASS] * gravity)
 

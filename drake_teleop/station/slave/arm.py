@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 # Columns of ArmModel.table.
 ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, FRICTION, SLIDES = 0, 9, 12, 22, 23, 24, 25
-WIDTH = 26
+TABLE_COLUMNS = 26
 # First of three columns with gravity, in the last row only.
 GRAVITY = 22
 

@@ -29,8 +29,8 @@ from drake_teleop.station.slave.arm import (
     ROTATION,
     ROTOR,
     SLIDES,
+    TABLE_COLUMNS,
     TRANSLATION,
-    WIDTH,
     ArmModel,
     Array,
 )
@@ -70,7 +70,7 @@ def ArmModelFromPlant(
     }
     joints = _joint_chain(inboard_joints, frame_S)
     n = len(joints)
-    table = np.zeros((n + 1, WIDTH))
+    table = np.zeros((n + 1, TABLE_COLUMNS))
     for row, joint in enumerate(joints):
         table[row, ROTOR] = _reflected_inertia(plant, joint)
         table[row, DAMPING] = joint.default_damping()

@@ -78,6 +78,7 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
         raise DrakeTeleopError(
             f"{arm.joint_names[k]} at {q[k]:g} is outside {arm.lower[k]:.4g} to {arm.upper[k]:.4g}",
             where="slave.home",
+            remedy="give a position within these limits",
         )
     return q
 

@@ -163,7 +163,7 @@ class ToolContact(LeafSystem):
 
 @njit(cache=True)
 def assemble_state(state, around, x):
-    """Write the plant's state to x, from the arm's [q; v] and `around` [deflection, rate, others]."""
+    """Write the plant's state x from the arm's [q; v] and `around` [deflection, rate, others]."""
     n = state.shape[0] // 2
     put(x, 0, state, 0, n)
     put(x, n + 1, state, n, n)

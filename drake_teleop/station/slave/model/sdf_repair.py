@@ -8,7 +8,12 @@ from xml.etree.ElementTree import Element, SubElement
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.model_tree import link_of_frame
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport
-from drake_teleop.station.slave.model.urdf_repair import Purpose, finish, repair_scope, repair_urdf
+from drake_teleop.station.slave.model.urdf_repair import (
+    Purpose,
+    finish_repair,
+    repair_scope,
+    repair_urdf,
+)
 
 _MODEL_CONFIG, _URDF, _SDF = "model.config", ".urdf", ".sdf"
 _URIS = ".//include/uri"
@@ -42,7 +47,7 @@ def repair_sdf(
         model.set("name", model.get("name") or file.stem)
     report.raise_causes(file)
     inner = [_repair_included(uri, file, files, purpose, folder) for uri in root.iterfind(_URIS)]
-    own = finish(root, file, files, report, folder if purpose.has_geometry else None)
+    own = finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
     for each in (each for each in inner if each is not None):
         own = RepairedModel(
             own.text,

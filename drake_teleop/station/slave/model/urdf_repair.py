@@ -75,7 +75,7 @@ def repair_urdf(
     repair_scope(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
         _remove_idle_parts(root, report)
-    return finish(root, file, files, report, folder if purpose.has_geometry else None)
+    return finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
 
 
 def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sdf: bool) -> None:
@@ -107,7 +107,7 @@ def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sd
                 report.state("no inertia of", name)
 
 
-def finish(
+def finish_repair(
     root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path | None
 ) -> RepairedModel:
     """Make the addresses of meshes absolute; return the text, or raise all faults at once.
