@@ -671,8 +671,8 @@ def study(study: Path, out: Path, **options: Any) -> None:
 def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
 
-    Runs the operator's tasks over sigma, gamma and eta, about 1000 times. After an interruption, repeat
-    the command to continue.
+    Runs the operator's tasks over sigma, gamma and eta, about 1000 times. After an interruption,
+    repeat the command to continue.
     """
     from drake_teleop.lab.studies.scaling_study import scaling_study_command
 

@@ -61,7 +61,7 @@ class NormalEquations(Moments):
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
             raise DrakeTeleopError(
-                "the mass cannot be identified: the wrench does not depend on the motion",
+                "the fitted mass is 0: the mass cannot be identified from this wrench",
                 where="wrench",
                 remedy="check that the sensor is connected and that its orientation changes",
             )

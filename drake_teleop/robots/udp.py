@@ -1,8 +1,8 @@
 """Sources and sink of UDP packets, with the layout of `drake_teleop_udp.h`.
 
 Little-endian, without padding. Input: "DTW1", flags (`ReadingFlag.SATURATED` only), number, time
-[s], wrench, s, omega, alpha; or "DTP1", the same head, wrench (6), pose (w x y z, position). Output: "DTC1", the
-same head, contact wrench (6), scaled wrench (6).
+[s], wrench (6), s, omega, alpha (3 each); or "DTP1", the same head, wrench (6), pose (w x y z,
+position). Output: "DTC1", the same head, contact wrench (6), scaled wrench (6).
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def _parameter_units(phi: Array) -> Array:
     m = abs(phi[0])
     if m == 0.0:
         raise DrakeTeleopError(
-            "the mass is 0, and cannot be identified",
+            "the fitted mass is 0: the mass cannot be identified from this wrench",
             where="wrench",
             remedy="check that the sensor is connected and its orientation changes",
         )

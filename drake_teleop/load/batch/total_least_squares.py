@@ -68,7 +68,7 @@ def total_least_squares(
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:
         raise DrakeTeleopError(
-            "the mass cannot be identified from this wrench",
+            "the wrench is 0 throughout: the mass cannot be identified",
             where="wrench",
             remedy="check that the sensor is connected and that its orientation changes",
         )
