@@ -189,7 +189,7 @@ def test_bad_input_is_named_and_leaves_the_estimate():
     F, motion = noisy_record(5)
     estimator = learnt(F, motion)
     before = estimator.phi
-    with pytest.raises(DrakeTeleopError, match=r"^sample: is not finite"):
+    with pytest.raises(DrakeTeleopError, match=r"^sample: contains NaN or infinity"):
         estimator.update(np.full(6, np.nan), REST, REST, REST)
     with pytest.raises(DrakeTeleopError, match=r"^sample: wrench, s, omega, alpha have shapes"):
         estimator.update(np.zeros(3), np.zeros(6), REST, REST)
