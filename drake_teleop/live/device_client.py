@@ -47,7 +47,7 @@ class Device(Protocol):
         """Limits of force, torque and their slew rates."""
 
     def read(self) -> DevicePose | None:
-        """Return the next pose; None if none comes for half a second."""
+        """Return the next pose; None if none is received for 0.5 s."""
 
     def set(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the base frame B [N, N m]."""

@@ -98,7 +98,7 @@ class DeviceLink:
         self._force_ages.append(state.behind)
 
     def silent(self, now: float) -> bool:
-        """Return whether no valid packet has come for 50 ms."""
+        """Return whether no valid packet was received for 50 ms."""
         return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send(self, wrench: np.ndarray) -> None:

@@ -147,7 +147,7 @@ class LiveDrive:
             raise self._failed
 
     def stop(self) -> None:
-        """End the session and complete its record."""
+        """End the session and complete its recording."""
         self._stop.set()
         for thread in self._threads:
             thread.join()

@@ -134,7 +134,9 @@ def test_bad_input_is_named():
         Prior(TOOL, 1.0, "guess")
     with pytest.raises(DrakeTeleopError, match=r"^prior\.weight: 0.0 is not positive"):
         Prior(TOOL, 0.0)
-    with pytest.raises(DrakeTeleopError, match=r"^prior\.phi: its body has no extent in some direction"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"^prior\.phi: its body has no extent in some direction"
+    ):
         Prior(POINT, 1.0)
     with pytest.raises(DrakeTeleopError, match=r"^ellipsoid\.matrix: is not positive definite"):
         Ellipsoid(np.zeros(3), -np.eye(3)).row()

@@ -123,7 +123,7 @@ class Procedure:
 
     @property
     def expected_force(self) -> float:
-        """Median contact force of the participant so far [N]."""
+        """Median of the participant's contact forces up to now [N]."""
         task = self.task
         if self._pressed:
             return float(np.median(self._pressed))
@@ -138,7 +138,7 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def go(self) -> None:
-        """Continue from a phase that shows text."""
+        """Leave a phase that shows text."""
         if self.phase == CONSENT:
             self.phase = END if self.number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):

@@ -34,7 +34,7 @@ _SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
-    """Row of the result table: a quantity with its 95 % interval; participant 0 stands for all."""
+    """Row of the result table: a quantity with its 95 % interval; participant 0: all."""
 
     task: str
     condition: str

@@ -89,7 +89,7 @@ class Model:
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Positions of the parameters of each extension."""
+        """Indices of the parameters of each extension."""
         out, at = {}, DELAY + 1
         sizes = [(name, _SIZES[name]) for name in self.parts]
         sizes += [(f"gain {c}", 1) for c in self.gains]
@@ -126,7 +126,7 @@ class Model:
 
     @property
     def times(self) -> tuple[float, ...]:
-        """Times of the steps [s]."""
+        """Times of the steps of offsets or load [s]."""
         return tuple(step.time for step in self.steps)
 
     def start(self, x: Array, of: Model) -> Array:

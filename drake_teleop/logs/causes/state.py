@@ -33,7 +33,7 @@ class Rows:
 
     @cached_property
     def y(self) -> Array:
-        """Signals (M, W), 0 in unused rows."""
+        """Signals (M, W) of the model, 0 in unused rows."""
         return self.data.only(self.used).with_steps(self.times)[:, self.columns]
 
     @cached_property

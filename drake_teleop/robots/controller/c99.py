@@ -130,7 +130,7 @@ def kernel_files(target: Target) -> Files:
 
 
 def template(name: str) -> str:
-    """Return a shipped file."""
+    """Return the text of a shipped template."""
     return resources.files(PACKAGE).joinpath(f"templates/{name}").read_text(encoding="utf-8")
 
 

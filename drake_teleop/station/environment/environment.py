@@ -84,7 +84,7 @@ class Environment(ABC):
 
 
 class Several(Environment):
-    """Composite environment of several objects."""
+    """Environment of several objects."""
 
     def __init__(self, parts: Iterable[Environment]) -> None:
         self._parts = tuple(parts)

@@ -179,7 +179,7 @@ class Master:
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError if a leader arm commands joints; `what` names the caller."""
+        """Raise a DrakeTeleopError if a leader arm commands joints; `what`: name of the caller."""
         if self.leads_joints:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",

@@ -120,7 +120,7 @@ class PostureShapes:
 
     @property
     def X_WS(self) -> RigidTransform:
-        """Pose of the sensor."""
+        """Pose X_WS of the sensor frame S."""
         return self._parsed.sensor_frame.CalcPoseInWorld(self.context)
 
     @property

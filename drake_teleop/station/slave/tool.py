@@ -31,7 +31,7 @@ _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 @settings
 @dataclass
 class Ball:
-    """A ball that can make contact."""
+    """Ball of the tool that can make contact."""
 
     radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
@@ -50,7 +50,7 @@ class Ball:
 @settings
 @dataclass
 class Block:
-    """A box that can make contact."""
+    """Box of the tool that can make contact."""
 
     edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")

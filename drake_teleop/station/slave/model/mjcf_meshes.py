@@ -41,7 +41,7 @@ class Mesh:
 
     @property
     def is_plain(self) -> bool:
-        """Whether Drake can read the file itself."""
+        """Whether Drake reads the file without conversion."""
         unmoved = self._X_FM.IsExactlyIdentity() and bool((self._scale == 1.0).all())
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
 
@@ -69,7 +69,7 @@ class Mesh:
         return self._write(self.triangles(), folder)
 
     def hull(self, folder: Path) -> Path:
-        """Return an .obj file in `folder` with the convex hull, which is what touches."""
+        """Return an .obj file in `folder` with the convex hull (collision shape)."""
         return self._write(convex_hull(self.triangles().vertices), folder)
 
     def _write(self, triangles: Triangles, folder: Path) -> Path:

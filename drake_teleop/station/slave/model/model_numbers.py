@@ -57,7 +57,7 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
 
 
 def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_chain: bool) -> None:
-    """Correct limits and damping of a joint; refuse what cannot be corrected."""
+    """Correct limits and damping of a joint; report other faults."""
     name = joint.get("name", "")
     where = f"joint {name}"
     for end in ("parent", "child"):
