@@ -119,7 +119,7 @@ def test_inconsistent_signals_are_rejected(arrays, message):
 
 
 def test_a_signal_needs_a_unit_for_every_component():
-    with pytest.raises(ValueError, match="3 components, 2 units"):
+    with pytest.raises(ValueError, match="3 components, but 2 units"):
         Signal("force", XYZ, ("N", "N"))
 
 

@@ -301,7 +301,7 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
         (HEADER + row(5, Inputs()), "5 ms is not a valid time"),
         (HEADER + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is not a valid time"),
         (HEADER + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":4.*x = 1000000 is outside"),
-        (HEADER + "0,1\n", "has 2 values, not 23"),
+        (HEADER + "0,1\n", "has 2 values, must have 23"),
         (HEADER + row(0, Inputs()).replace("0,", "a,", 1), "a value that is not a whole number"),
         (
             HEADER + row(0, Inputs()).replace("none", "share"),

@@ -289,5 +289,5 @@ def test_netft_page_contains_counts_units_and_rate() -> None:
     for bad in (b"", b"<a/>", page.encode().replace(b"500", b"0"), page.encode()[:60]):
         with pytest.raises((ValueError, KeyError, SyntaxError)):
             parse_page(bad)
-    with pytest.raises(DrakeTeleopError, match="page .*; check the host, or give netft://HOST"):
+    with pytest.raises(DrakeTeleopError, match=r"page .*; check the host, or give netft://HOST"):
         NetFtSource("netft://127.0.0.9")

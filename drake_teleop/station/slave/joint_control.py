@@ -84,7 +84,7 @@ class JointControlConfig:
             interface.check(f"{where}.interface", rate)
 
     def check_computed_torque(self, what: str) -> None:
-        """Raise DrakeTeleopError unless the servo is computed torque; `what`: name of the caller."""
+        """Raise DrakeTeleopError unless the servo is computed torque; `what`: the caller."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
                 f"{what} does not support the servo {self.servo}",
