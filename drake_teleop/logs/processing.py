@@ -521,12 +521,13 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return the load phi (10,), and names of unidentified inertias.
+    """Return the load phi (10,), and names of undetermined inertias.
 
-    They are replaced by those of a point mass.
+    They are replaced by those of a point mass. Weakly identified inertias are nearer to the truth
+    than those.
     """
     phi = identification.phi.copy()
-    replaced = np.flatnonzero(~identification.identifiable[10:])
+    replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
     return phi, tuple(PARAMETERS[10 + i] for i in replaced)
