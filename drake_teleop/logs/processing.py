@@ -255,8 +255,8 @@ def _identified(
 
 
 def _can_be_explained(log: Log, by_splines: bool) -> bool:
-    largest = np.abs(log.wrench).max(axis=0)
-    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * largest).any():
+    low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
+    if log.static or (high - low <= _CONSTANT_SHARE * np.maximum(high, -low)).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree

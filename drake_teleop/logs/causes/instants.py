@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.signal import savgol_filter
 
 from drake_teleop.common.numeric import Array, parabola_minimum
 
@@ -154,7 +153,8 @@ def instants(
     if lost is not None:
         used &= ~lost[: rows * size].reshape(rows, size).any(axis=1)
     white = _white_noise(wrench)
-    spread = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
+    variance = np.array([column.var() for column in wrench.T])
+    spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
     white = np.maximum(white, _SMALLEST_NOISE * spread)
     share = _smooth_alpha(y, used) if gravity_W is None else 0.0
     out = Instants(
@@ -164,6 +164,8 @@ def instants(
 
 
 def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
+    from scipy.signal import savgol_filter  # a slow import for a rare case
+
     alpha = y[used][:, ALPHA]
     share = _noise_share(alpha)
     for width in _SMOOTHING_WIDTHS:
@@ -175,7 +177,9 @@ def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
 
 
 def _white_noise(x: Array) -> Array:
-    return np.asarray(np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0))
+    # Column by column, to save memory.
+    medians = [np.median(np.abs(np.diff(column, 3))) for column in x.T]
+    return np.array(medians) / 0.6745 / np.sqrt(20.0)
 
 
 def _noise_share(x: Array) -> float:

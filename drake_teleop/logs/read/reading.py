@@ -149,8 +149,8 @@ class _Reader:
             self._replace_auto(describe_mounting)
         table = self._table(self._description.wrench)
         clock = self._clock("wrench", self._description.wrench, table)
-        forces = self._forces("wrench", self._description.wrench, table, clock.total)
-        wrench_t, wrench = clock.t, clock.select(forces)
+        wrench_t = clock.t
+        wrench = clock.select(self._forces("wrench", self._description.wrench, table, clock.total))
         pose = imu = None
         if self._description.pose is not None:
             pose = self._pose(self._description.pose, differentiate=differentiate)
@@ -158,7 +158,8 @@ class _Reader:
             imu = self._imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = common_time(wrench_t, streams, self._source)
-        log = self._assemble(t, resample(t, wrench_t, wrench), imu, pose)
+        wrench = resample(t, wrench_t, wrench)
+        log = self._assemble(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
         log = replace(log, gain_std=gain_std, free=free, described=self._description)
         if pose is not None and pose.raw is not None:
@@ -252,7 +253,7 @@ class _Reader:
         orientations = Orientations(
             self._description, stream.orientation, table, clock.total, where
         )
-        quaternion = np.empty((len(clock.rows), 4))
+        quaternion = orientations.output(len(clock.rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK_ROWS):
             part = slice(start, start + _CHUNK_ROWS)
