@@ -152,7 +152,7 @@ def instants(
     used[[0, -1]] = False
     if lost is not None:
         used &= ~lost[: rows * size].reshape(rows, size).any(axis=1)
-    white = _white_noise(wrench)
+    white = white_noise(wrench)
     variance = np.array([column.var() for column in wrench.T])
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
     white = np.maximum(white, _SMALLEST_NOISE * spread)
@@ -176,14 +176,15 @@ def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
     return share
 
 
-def _white_noise(x: Array) -> Array:
+def white_noise(x: Array) -> Array:
+    """Return the standard deviation (k,) of white noise in smooth signals x (N, k)."""
     # Column by column, to save memory.
     medians = [np.median(np.abs(np.diff(column, 3))) for column in x.T]
     return np.array(medians) / 0.6745 / np.sqrt(20.0)
 
 
 def _noise_share(x: Array) -> float:
-    noise = _white_noise(x)
+    noise = white_noise(x)
     return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
