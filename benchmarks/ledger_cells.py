@@ -268,7 +268,7 @@ def simulated(scenario: Scenario, times: Times) -> SimulationResult:
     advance(simulator, 1e-3 * round(1e3 * (SETTLE + times.let_go)))
     master = station.GetSubsystemByName("master_side")
     master.GetSubsystemByName("operator")._impedance[:] = 0.0
-    master.GetSubsystemByName("master_device")._numbers[HAND_MASS] = 0.0
+    master.GetSubsystemByName("master_device")._constants[0][HAND_MASS] = 0.0
     advance(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
     return read_log(simulator, SETTLE)
 

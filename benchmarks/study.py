@@ -4,9 +4,10 @@
 (a contact transition over sigma, gamma and seeds: 1 s simulated, the loads identified first) by
 one process, by two, and on a local Dask cluster, each from an empty folder, and once more by two
 processes with SIGKILL at random moments. Baseline of the efficiency is the one process, by the
-clock: it wants an idle machine. Parts are compared byte by byte. `--shards 8` runs only shards in
-random order, kills three of them, submits these again and merges; the overhead is their CPU time
-beyond that of one process.
+clock: it wants an idle machine. Parts are compared byte by byte. `--shards 8` runs only one process
+and, by turns with it, shards in random order: three are killed at random runs, submitted again and
+merged. The overhead is their CPU time beyond that of one process, with and without the repeated
+work of the kills: one more start each, and the CPU time since the last stored part.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pathlib import Path
 
 import polars as pl
 
+_STARTS = 5  # repetitions of a finished shard
 _STUDY = """
 scenario: contact_transition
 factors:
@@ -47,11 +49,14 @@ def main() -> None:
     parser.add_argument(
         "--shards", type=int, default=0, help="compare only shards with one process"
     )
+    parser.add_argument("--shards-in", type=Path, help="of `--shards`: its folder")
     parser.add_argument("--no-cluster", action="store_true", help="without Dask")
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         measure = sharded if arguments.shards else measured
+        if arguments.shards_in:
+            measure, folder = shards, arguments.shards_in
         figures = measure(Path(folder), arguments)
     for name, figure in figures.items():
         print(f"{name:30s} {figure:10.4g}")
@@ -70,7 +75,7 @@ def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
     warm.write_text(_STUDY.format(sigmas=2, gammas=2, repeats=1))
     run(warm, folder / "warm", "--jobs", "1")
     halves = [command(half, folder / name, "--jobs", "1") for name in ("left", "right")]
-    serial, joblib, apart = by_turns(
+    (serial, _), (joblib, _), (apart, _) = by_turns(
         (command(study, folder / "serial", "--jobs", "1"), 10.0),
         (command(study, folder / "joblib", "--jobs", "2"), 5.0),
         (["sh", "-c", " & ".join(map(shlex.join, halves)) + " & wait"], 5.0),
@@ -102,46 +107,69 @@ def measured(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def sharded(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
-    """One process, and shards one after another: three are killed and submitted again."""
-    study, warm, out = folder / "study.yaml", folder / "warm.yaml", folder / "out"
+    """One process and, by turns, shards one after another: three are killed and submitted again."""
+    study, warm, found = folder / "study.yaml", folder / "warm.yaml", folder / "shards.json"
     study.write_text(_STUDY.format(sigmas=arguments.runs // 4, gammas=2, repeats=2))
     warm.write_text(_STUDY.format(sigmas=2, gammas=2, repeats=2))
     run(warm, folder / "warm", "--jobs", "1")
+    words = [sys.executable, __file__, "--runs", str(arguments.runs)]
+    words += ["--shards", str(arguments.shards), "--shards-in", str(folder)]
+    (_, whole), _ = by_turns(
+        (command(study, folder / "serial", "--jobs", "1"), 5.0),
+        ([*words, "--json", str(found)], 5.0),
+    )
+    figures: dict[str, float] = json.loads(found.read_text())
     before = cpu_s()
-    run(study, folder / "serial", "--jobs", "1")
-    whole, count, draw = cpu_s() - before, arguments.shards, random.Random(1)
-    spent, lost = 0.0, 0.0
-    killed = draw.sample(range(1, count + 1), 3)
-    for number in draw.sample(range(1, count + 1), count):
+    for _ in range(_STARTS):
+        run(study, folder / "out", "--jobs", "1", "--shard", f"1/{arguments.shards}")
+    start = (cpu_s() - before) / _STARTS
+    repeated = 3.0 * start + figures["cpu_s_of_killed_runs"]
+    total = figures["shards_cpu_s"]
+    table = pl.read_parquet(folder / "out" / "runs.parquet")
+    return figures | {
+        "runs": float(table.height),
+        "one_process_cpu_s": whole,
+        "finished_shard_cpu_s": start,
+        "repeated_by_kills_cpu_s": repeated,
+        "overhead": (total - repeated) / whole - 1.0,
+        "overhead_with_kills": total / whole - 1.0,
+        "cost_of_a_start_cpu_s": (total - repeated - whole) / arguments.shards,
+        "the_same": float(parts(folder / "serial") == parts(folder / "out")),
+    }
+
+
+def shards(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
+    """All shards of the study in `folder`, then the merge; CPU times without this process."""
+    study, out, count = folder / "study.yaml", folder / "out", arguments.shards
+    draw, lost, begin = random.Random(53), 0.0, cpu_s()
+    chosen = draw.sample(range(1, count + 1), 3)
+    for number in (*draw.sample(range(1, count + 1), count), *chosen):
         words = command(study, out, "--jobs", "1", "--shard", f"{number}/{count}")
-        before, rows = cpu_s(), out / f"shards/{number}-of-{count}/runs.parquet"
+        rows = out / f"shards/{number}-of-{count}/runs.parquet"
         process = subprocess.Popen(words)
-        stop = draw.randint(1, arguments.runs // count - 1) if number in killed else 0
-        while stop and process.poll() is None and len(list(rows.glob("*.parquet"))) < stop:
-            time.sleep(0.01)
-        if stop:
+        if number in chosen and not rows.exists():
+            stored, last, stop = -1, 0.0, draw.randint(1, arguments.runs // count - 1)
+            while stored < stop:
+                if (now := len(list(rows.glob("run_*.parquet")))) != stored:
+                    stored, last = now, cpu_s_of(process.pid)
+                time.sleep(0.01)
+            time.sleep(draw.uniform(0.0, 0.5))  # in the middle of a run
+            lost += cpu_s_of(process.pid) - last
             process.send_signal(signal.SIGKILL)
         process.wait()
-        spent += cpu_s() - before
-    again = cpu_s()
-    for number in killed:
-        run(study, out, "--jobs", "1", "--shard", f"{number}/{count}")
-    lost = cpu_s() - again
     before = cpu_s()
     run(study, out, "--merge")
-    merge = cpu_s() - before
-    total = spent + lost + merge
-    starts = count + len(killed) + 1
     return {
-        "runs": float(pl.read_parquet(out / "runs.parquet").height),
-        "one_process_cpu_s": whole,
-        "shards_cpu_s": total,
-        "overhead": total / whole - 1.0,
-        "cost_of_a_start_cpu_s": (total - whole) / (starts - 1),
-        "merge_cpu_s": merge,
-        "the_same": float(parts(folder / "serial") == parts(out)),
-        "cpu_s_for_2_percent": (total - whole) / 0.02,
+        "shards_cpu_s": cpu_s() - begin,
+        "merge_cpu_s": cpu_s() - before,
+        "cpu_s_of_killed_runs": lost,
     }
+
+
+def cpu_s_of(pid: int) -> float:
+    """CPU time of a running process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def cpu_s() -> float:
@@ -172,26 +200,27 @@ def run(study: Path, out: Path, *options: str) -> float:
     return time.perf_counter() - start
 
 
-def by_turns(*studies: tuple[list[str], float]) -> list[float]:
-    """Seconds by the clock that each command has run for, a turn of so many seconds each time."""
+def by_turns(*studies: tuple[list[str], float]) -> list[tuple[float, float]]:
+    """Seconds by the clock, and CPU time, of commands that run by turns of so many seconds."""
     started = [subprocess.Popen(words, start_new_session=True) for words, _ in studies]
     for process in started:
         os.killpg(process.pid, signal.SIGSTOP)
-    spent = [0.0] * len(studies)
+    spent, used = [0.0] * len(studies), [0.0] * len(studies)
     while any(process.returncode is None for process in started):
         for index, (process, (_, turn)) in enumerate(zip(started, studies, strict=True)):
             if process.returncode is not None:
                 continue
-            start = time.perf_counter()
+            start, before = time.perf_counter(), cpu_s()
             os.killpg(process.pid, signal.SIGCONT)
             try:
                 process.wait(turn)
+                used[index] = cpu_s() - before
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGSTOP)
             spent[index] += time.perf_counter() - start
     if any(process.returncode for process in started):
         raise SystemExit("a study has failed")
-    return spent
+    return list(zip(spent, used, strict=True))
 
 
 def killed(study: Path, out: Path, times: int, whole: float) -> int:

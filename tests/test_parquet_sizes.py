@@ -129,7 +129,6 @@ for place in range(len(good)):
     ("bits", "options"),
     [
         (1, {}),
-        (0x80, {}),
         (0xFF, {}),
         (1, {"row_group_size": 8, "compression": "uncompressed"}),
     ],

@@ -310,7 +310,8 @@ def test_example_controllers_press_a_wall_without_creating_energy():
     assert max(len(text.splitlines()) for text in blocks if text.startswith("class ")) <= 40
     exec(compile("\n".join(blocks), "controllers.md", "exec"), names)
     assert len(names["results"]) == 4
-    for result, scenario in names["results"].values():
+    for (_, method), (result, scenario) in names["results"].items():
         assert result["true_contact_wrench_W"][:, 2].max() > 10.0
         assert result["true_contact_wrench_W"][-1, 2] > 5.0  # it presses to the end
-        assert energy_between(result, scenario).min() >= -2e-6  # with the initial energy E0
+        # With the initial energy E0. `tdpa` has none and dissipates one hand period late.
+        assert energy_between(result, scenario).min() >= (-1e-6 if method == "tdpa" else 0.0)

@@ -186,7 +186,7 @@ def start_and(kill: signal.Signals, folder: Path) -> tuple[str, int]:
 
 @pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM])
 def test_a_killed_run_leaves_rows_without_gaps(tmp_path, kill):
     said, status = start_and(kill, tmp_path)
     log = tmp_path / "out" / "log.parquet"

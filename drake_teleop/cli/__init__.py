@@ -1,1 +1,16 @@
 """Command line: commands and their tables on the terminal."""
+
+import sys
+
+from drake_teleop.common.interruption import install_handlers
+
+
+def start() -> None:
+    """Run the command line; handle signals first, because imports can lose a KeyboardInterrupt."""
+    install_handlers()
+    try:
+        from drake_teleop.cli.main import main
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    main()

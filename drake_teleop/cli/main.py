@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import gc
 import os
-import signal
 import sys
 import warnings
 from pathlib import Path
@@ -15,6 +14,7 @@ import click
 
 from drake_teleop.cli import options as option
 from drake_teleop.common.errors import DrakeTeleopError, one_line
+from drake_teleop.common.interruption import INTERRUPTED, install_handlers
 from drake_teleop.common.version import __version__
 
 
@@ -780,14 +780,17 @@ def main(arguments: list[str] | None = None) -> None:
     A live session that the user ends has status 0. Status 1: `reproduce` finds an unaccepted
     number, or `calibrate` ends before all tolerances are reached.
     """
-    signal.signal(signal.SIGTERM, _terminate)
+    install_handlers()
     atexit.register(gc.freeze)  # the last collection takes 1 s with Drake's objects
     with warnings.catch_warnings():
         # Warnings are for programmers; those for users are in the summary and printed from there.
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
             os.environ["PYTHONWARNINGS"] = "ignore"  # for the processes of a study
-        status = _run(arguments)
+        try:
+            status = _run(arguments)
+        finally:
+            INTERRUPTED.clear()
     sys.exit(status if isinstance(status, int) else 0)
 
 
@@ -807,10 +810,6 @@ def _run(arguments: list[str] | None) -> Any:
         return 130
     except OSError as error:
         return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
-
-
-def _terminate(number: int, frame: Any) -> None:
-    raise KeyboardInterrupt("SIGTERM")
 
 
 def _fail(message: str) -> int:

@@ -1,4 +1,4 @@
-"""Lifetime and fault codes of Drake systems.
+"""Lifetime, scalar types and fault codes of Drake systems.
 
 A Python `LeafSystem` and its Diagram are never freed if C++ holds a bound method, or, in Python
 3.11, if a subclass has no empty `__slots__`.
@@ -9,9 +9,10 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any
+from typing import Any, NoReturn
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
 
 ONE_DICT: tuple[str, ...] = ()
 """`__slots__` of a system; its attributes are in the `__dict__` of the bound class."""
@@ -25,6 +26,21 @@ def weak_callback(method: Any) -> Callable[..., None]:
         function(system(), context, output)
 
     return call
+
+
+class DoubleOnly:
+    """Base class of systems for double only; a scalar conversion raises one clear error."""
+
+    __slots__ = ONE_DICT
+
+    def _refuse(self, *_: Any) -> NoReturn:
+        raise DrakeTeleopError(
+            "computes with compiled code for double only",
+            where=type(self).__name__,
+            remedy="use NonContactWrench or WrenchScaling, or linearize numerically",
+        )
+
+    ToAutoDiffXd = ToSymbolic = _refuse
 
 
 #: Maximum magnitude of any force, torque, length, angle or speed of a station, in SI units.

@@ -118,6 +118,12 @@ def runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
 
 
+def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
+    """Return the time spans (start, stop) in which `contact` (N,) is true; `t` (N,): times."""
+    times = np.asarray(t, float)
+    return [(float(times[a]), float(times[b - 1])) for a, b in runs(np.asarray(contact, bool))]
+
+
 def narrowest_half(x: Array) -> tuple[Array, Array]:
     """Return the widths (k,) of the narrowest half of samples x (N, k), and its centres (k,)."""
     ordered = np.sort(x, axis=0)

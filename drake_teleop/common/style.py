@@ -7,11 +7,12 @@ from io import BytesIO
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
+
+from drake_teleop.common.numeric import contact_spans
 
 # Okabe and Ito (2008): distinguishable with common colour deficiencies, and in grey.
 BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
@@ -65,11 +66,3 @@ def shade_contact(axes: Axes, t: ArrayLike, contact: ArrayLike) -> None:
     """Shade the time spans in which `contact` (N,) is true; `t` (N,) are the times [s]."""
     for start, stop in contact_spans(t, contact):
         axes.axvspan(start, stop, color=ORANGE, alpha=0.18, linewidth=0)
-
-
-def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
-    """Return the time spans (start, stop) in which `contact` (N,) is true; `t` (N,): times."""
-    times = np.asarray(t, float)
-    edges = np.diff(np.concatenate([[False], np.asarray(contact, bool), [False]]).astype(int))
-    starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(times[a]), float(times[b])) for a, b in zip(starts, stops, strict=True)]

@@ -20,7 +20,6 @@ from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.lab.identification import identify_load, simulate_with_timing
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.run_summary import ScenarioRun, overview, summarise
-from drake_teleop.station.replay import write_replay
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
@@ -87,6 +86,8 @@ def run_command(
         raise DrakeTeleopError(
             "is the folder of the drive", where=str(out), remedy="give another --out"
         )
+    from drake_teleop.station.replay import write_replay  # needs Matplotlib
+
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)

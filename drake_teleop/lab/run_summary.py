@@ -22,15 +22,13 @@ warnings                    faults and their times, see `drake_teleop.station.ru
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.numeric import Array, check_identified
-from drake_teleop.common.style import contact_spans
+from drake_teleop.common.numeric import Array, check_identified, contact_spans
 from drake_teleop.common.vectors import conjugate, logarithm, multiply
 from drake_teleop.lab.identification import sensor_samples, slave_arm
 from drake_teleop.load.compensation import contact_wrench
@@ -41,6 +39,9 @@ from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.signals import POSE_OF
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.task_measures import task_failure, task_measures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Settling time of the sensor's filter after a contact [s].
 FILTER_TAIL_S = 0.01

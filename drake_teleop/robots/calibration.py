@@ -15,6 +15,7 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import set_aside
+from drake_teleop.common.interruption import INTERRUPTED
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
@@ -247,7 +248,9 @@ def calibrate(
     done = False
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
-            while not done and (samples := source.read(_IDLE_S)) is not None:
+            while not (done or INTERRUPTED.is_set()):
+                if (samples := source.read(_IDLE_S)) is None:
+                    break
                 for sample in samples:
                     recorder.take(sample)
                     if pending is None and recorder.seconds >= next_length_s:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.files import set_aside
+from drake_teleop.common.interruption import INTERRUPTED, handled_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import Changes
@@ -86,8 +85,8 @@ def run(
         left = compensator.time_to_stale(time.monotonic())
         return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
 
-    with suppress(KeyboardInterrupt), _ctrl_c() as stopped:
-        while not stopped.is_set() and (readings := source.read(timeout_s())) is not None:
+    with suppress(KeyboardInterrupt), handled_sigint():
+        while not INTERRUPTED.is_set() and (readings := source.read(timeout_s())) is not None:
             if (
                 source.live
                 and (stale := compensator.stale_output(time.monotonic()))
@@ -105,26 +104,6 @@ def run(
             if control is not None:
                 control.answer(compensator.tare)
     return counts
-
-
-@contextmanager
-def _ctrl_c() -> Iterator[threading.Event]:
-    """Set an event at Ctrl-C as well, because a callback of a library can lose the exception."""
-    stopped, before = threading.Event(), signal.getsignal(signal.SIGINT)
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if before is not signal.default_int_handler or not in_main_thread:
-        yield stopped
-        return
-
-    def stop(*_: Any) -> None:
-        stopped.set()
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, stop)
-    try:
-        yield stopped
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def compensate_command(

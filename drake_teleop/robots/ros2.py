@@ -15,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError, require_library
+from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2_messages import (
@@ -38,6 +39,7 @@ _SPIN_S = 0.05  # longest time between two waits for services [s]
 class RosNode:
     """Node of this process in a ROS domain; `spin` executes its callbacks in the calling thread."""
 
+    @delayed_signals()
     def __init__(self, domain: int) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
@@ -54,6 +56,7 @@ class RosNode:
         """Wait for one event and execute its callback."""
         self._executor.spin_once(timeout_sec=timeout_s)
 
+    @delayed_signals()
     def close(self) -> None:
         """Leave the network; a second call does nothing."""
         if self._context.ok():
@@ -104,6 +107,7 @@ class Ros2Source:
     TOPIC is a WrenchStamped. `/tf` and `/tf_static` contain all frames between PARENT and CHILD.
     """
 
+    @delayed_signals()
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
         parsed = parse_address(address, SOURCE_PARAMETERS)
         self.dt, sign, domain = dt, parsed.sign(), domain_of(parsed)
@@ -117,6 +121,7 @@ class Ros2Source:
             self._subscribe(name, classes[name], topic) for name, topic in topics.items()
         ]
 
+    @delayed_signals()
     def read(self, timeout_s: float) -> list[Part] | None:
         """See `PartSource`."""
         self._take_all()
@@ -176,6 +181,7 @@ class Ros2Sink:
     The messages have the time stamps of sending, because stale zeros have no other.
     """
 
+    @delayed_signals()
     def __init__(self, address: str) -> None:
         parsed = parse_address(address, ("frame", "wrench", "domain"))
         from rclpy.qos import qos_profile_sensor_data
@@ -198,6 +204,7 @@ class Ros2Sink:
         )
         self._diagnostics = node.create_publisher(self._kinds.DiagnosticArray, "/diagnostics", 100)
 
+    @delayed_signals()
     def write(self, out: Compensated) -> None:
         """See `Sink`."""
         message, ns = self._message, time.time_ns()

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE
 from drake_teleop.robots.compensate import compensate_command
@@ -32,6 +33,7 @@ from drake_teleop.robots.ros2 import parse_address, shared_node
 from drake_teleop.robots.ros2_messages import SOURCE_PARAMETERS, domain_of
 
 _SCALES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
+_CALIBRATION_END_S = 3.0  # longest time for the last evaluation of a calibration [s]
 _CALIBRATE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
 
 
@@ -47,6 +49,7 @@ class ServedCompensator:
         scales: sigma and gamma.
     """
 
+    @delayed_signals()
     def __init__(
         self,
         node: Any,
@@ -77,9 +80,13 @@ class ServedCompensator:
         return getattr(self._current, name)
 
     def close(self) -> None:
-        """End a calibration that runs."""
-        if self._process is not None:
-            self._process.terminate()
+        """End a calibration that runs; its record is kept."""
+        if (process := self._process) is not None:
+            process.terminate()
+            try:
+                process.wait(_CALIBRATION_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
         self._pool.shutdown()
 
     def _value(self, name: str) -> Any:
@@ -129,7 +136,11 @@ class ServedCompensator:
         words = [sys.executable, "-c", _CALIBRATE]
         words += self._calibrate(self._value("until"), self._value("seconds"))
         process = self._process = subprocess.Popen(
-            words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            words,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # one signal, from `close`, also at Ctrl-C in a terminal
         )
         ended: Any = Future(executor=self._node.executor)
         self._pool.submit(lambda: ended.set_result(process.communicate()[1]))
@@ -158,7 +169,7 @@ def ros2_command(
     calibrate: Callable[[str, float], list[str]],
     **options: Any,
 ) -> None:
-    """Run the command `ros2` until Ctrl-C; `options` are those of `compensate_command`.
+    """Run the command `ros2` until SIGINT or SIGTERM; `options` are those of `compensate_command`.
 
     Args:
         out: folder of the calibrations.

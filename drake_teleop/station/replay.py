@@ -21,7 +21,8 @@ from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBo
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir, output_folder, write_json
-from drake_teleop.common.style import BLUE, VERMILION, contact_spans
+from drake_teleop.common.numeric import contact_spans
+from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.film import (
     Arrow,
     Canvas,

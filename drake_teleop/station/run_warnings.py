@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from drake_teleop.common.blocks import MEANINGS, Fault
-from drake_teleop.common.style import contact_spans
+from drake_teleop.common.numeric import contact_spans
 from drake_teleop.load.regressor import LOST
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale

@@ -35,9 +35,7 @@ def judged(kind: str, motion: str, sensor: str, seed: int) -> dict[str, Any]:
         (("gravity direction", "pick", "poses", 2), {"gravity direction"}),
         (("no load", "fourier", "imu", 3), {"no load"}),
         (("wrist only", "pick", "poses", 9), set()),
-        (("wrist only", "pick", "poses", 21), set()),
         (("none", "slow", "imu", 18), set()),
-        (("none", "slow", "imu", 56), set()),
         (("none", "pick", "poses", 51), set()),
     ],
 )
@@ -55,10 +53,8 @@ def test_the_right_causes_are_named_and_no_number_is_certain_and_wrong(
     [
         ("gain matrix", "fourier", "poses", 3),
         ("gain matrix", "pick", "poses", 0),
-        ("gain matrix", "pick", "poses", 2),
         ("hysteresis", "pick", "poses", 1),
         ("contact", "fourier", "imu", 0),
-        ("contact", "fourier", "imu", 2),
         ("gain", "pick", "poses", 2),
         ("torque factor", "fourier", "imu", 8),
         ("none", "slow", "imu", 91),

@@ -173,10 +173,10 @@ def test_friction_force_along_the_contact_is_removed(turns):
     assert abs(felt[1]) < 0.05
 
 
-def test_stick_slip_does_not_drive_the_hand():
-    """Three times a second to and fro on what is touched, as before a stiff leaf over `internet`.
+def test_stick_slip_is_rendered_in_part():
+    """Friction of +-0.6 N and +-0.12 N m that reverses three times a second, at a resting hand.
 
-    What is felt of that comes a round trip late, and would keep it going.
+    Rendered in full and a round trip late, it would sustain the stick-slip of the slave.
     """
     hand, felt = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0), []
     hand.rest(1000)
@@ -184,7 +184,7 @@ def test_stick_slip_does_not_drive_the_hand():
         hand.packet[WRENCH][1] = rubs = np.clip(np.sin(2 * np.pi * k / 350), -0.6, 0.6)
         hand.packet[WRENCH][3] = -0.2 * rubs
         felt.append(hand.step())
-    assert (np.ptp(felt[700:], axis=0)[1:4] < [0.5, 0.07, 0.2]).all()
+    assert (np.ptp(felt[700:], axis=0)[1:4] < [0.4, 0.07, 0.16]).all()
 
 
 @pytest.mark.parametrize("turning", [False, True])
@@ -234,7 +234,7 @@ def test_released_hand_receives_at_most_its_ledger():
         hand.packet[POSE][6] += way
         hand.step([0.0, 0.0, way, 0.0, 0.0, 0.0])
         got += held * way
-    assert 0.05 < got <= 0.02 + 0.7 * 0.1
+    assert 0.06 < got <= 0.02 + 0.7 * 0.1
 
 
 def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
@@ -328,7 +328,7 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
         felt.append(hand.step()[2])
     assert felt[1999] == pytest.approx(4.0, abs=0.05)
     assert np.ptp(felt[1990:2500]) < 0.06
-    assert felt[2505] == pytest.approx(3.0, abs=0.2)
+    assert felt[2505] == pytest.approx(3.0, abs=0.15)
 
 
 def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -175,8 +175,13 @@ NODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
 @ros
 @pytest.mark.long
 @pytest.mark.slow
-def test_services_and_parameters_of_the_node(tmp_path: Path) -> None:
-    """Tare, scales, another load, a refused value, and a calibration that is too short."""
+@pytest.mark.parametrize(
+    ("stop", "during_calibration"), [(signal.SIGINT, False), (signal.SIGTERM, True)]
+)
+def test_services_and_parameters_of_the_node(
+    tmp_path: Path, stop: signal.Signals, during_calibration: bool
+) -> None:
+    """Tare, scales, another load, a refused value, a calibration that is too short, and the end."""
     file, other = tmp_path / "load.json", tmp_path / "other.json"
     load().save(file)
     load().save(other)
@@ -187,7 +192,7 @@ def test_services_and_parameters_of_the_node(tmp_path: Path) -> None:
     words += ["--rate", "200", "--sigma", "0", "--out", str(tmp_path / "out")]
     with (
         process(str(PEER), "moving", DOMAIN, str(tmp_path / "rows.npy"), "200"),
-        process("-c", NODE, *words) as node,
+        process("-c", NODE, *words, stderr=subprocess.PIPE) as node,
         process(str(PEER), "echo", DOMAIN, "/contact") as peer,
         process(str(PEER), "calls", DOMAIN, stdin=subprocess.PIPE) as calls,
     ):
@@ -225,9 +230,12 @@ def test_services_and_parameters_of_the_node(tmp_path: Path) -> None:
         assert call("set seconds 2.0")[0]
         done, said = call("calibrate")
         assert not done and "the wrench is the same in all samples" in said
-        for _ in range(4):  # the DDS threads of a busy machine can delay the end
-            node.send_signal(signal.SIGINT)
-            with suppress(subprocess.TimeoutExpired):
-                node.wait(15)
-                break
-        assert node.poll() is not None
+        if during_calibration:
+            assert call("set seconds 60.0")[0]
+            assert calls.stdin is not None
+            calls.stdin.write("calibrate\n")
+            calls.stdin.flush()
+            time.sleep(2.0)
+        node.send_signal(stop)
+        assert node.wait(5) == 0
+        assert node.stderr is not None and "damaged" not in node.stderr.read()

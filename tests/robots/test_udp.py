@@ -6,20 +6,25 @@ import json
 import os
 import random
 import re
+import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 from full_disk import small_disk
+from shown import hearing_ctrl_c
 from test_compensator import DT, load, readings
 
 import drake_teleop.robots.udp as udp
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
+from drake_teleop.common.interruption import INTERRUPTED, delayed_signals, install_handlers
 from drake_teleop.robots import lines
 from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
@@ -280,6 +285,58 @@ class Interrupted:
 def test_ctrl_c_returns_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(Interrupted(), Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
     assert json.loads(capsys.readouterr().out)["number"] == 0
+
+
+class SignalLost(Interrupted):
+    """Source of which C code loses the KeyboardInterrupt of a signal."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        super().__init__()
+        self._number = number
+
+    def read(self, timeout_s: float) -> list[Reading]:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(self._number)
+        return [self._left.pop()]
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    install_handlers()
+    yield
+    INTERRUPTED.clear()
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handlers")
+def test_loop_ends_at_a_signal_whose_exception_is_lost() -> None:
+    source = SignalLost(signal.SIGTERM)
+    assert run(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+
+
+def test_loop_of_a_program_ends_at_ctrl_c_whose_exception_is_lost() -> None:
+    with hearing_ctrl_c():
+        for _ in range(2):
+            source = SignalLost(signal.SIGINT)
+            assert run(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_delayed_signals_are_handled_at_the_end(number: signal.Signals) -> None:
+    finished = []
+
+    @delayed_signals()
+    def call() -> None:
+        signal.raise_signal(number)
+        finished.append(True)
+
+    with pytest.raises(KeyboardInterrupt, match="^SIGTERM$" if number == signal.SIGTERM else "^$"):
+        call()
+    assert finished and INTERRUPTED.is_set()
 
 
 def test_control_port_answers_tare_requests() -> None:

@@ -277,6 +277,13 @@ def test_specific_force_has_no_gravity_if_the_tool_has_none(off):
     np.testing.assert_allclose(load_wrench(run), wrench, rtol=0, atol=1e-11)
 
 
+def test_a_conversion_to_other_scalars_is_one_line():
+    sensor = moving().sensor
+    for convert in (sensor.ToAutoDiffXd, sensor.ToSymbolic):
+        with pytest.raises(DrakeTeleopError, match=r"^PlantWristSensor: .* for double only; .*$"):
+            convert()
+
+
 def test_outputs_before_the_first_sample_are_flagged():
     run = moving(time_step=1e-3)
     assert reading(run, "status") == [LOST]

@@ -10,6 +10,7 @@ import pytest
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison.delayed_contact import thickness_of
+from drake_teleop.lab.tuning import search
 from drake_teleop.lab.tuning.press_trial import (
     MAX_REST_FORCE_N,
     Settings,
@@ -153,7 +154,9 @@ def test_settings_change_method_scales_and_filter_alone():
 
 
 @pytest.mark.long
-def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path):
+def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path, monkeypatch):
+    monkeypatch.setattr(search, "METHODS", ("ledger", "wave"))
+    monkeypatch.setattr(search, "_LOW_PASSES", ())
     arguments = {"hands": ["medium"], "walls": [1.0], "network": "lan", "jobs": 1}
     summary = tune("touch", tmp_path, progress=False, **arguments)
     tuned = LoadScenario(tmp_path / "tuned.yaml")

@@ -28,7 +28,6 @@ from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.studies.design import Factor, Study, Values
 from drake_teleop.lab.studies.effects import effects
 from drake_teleop.lab.studies.measures import measured
-from drake_teleop.lab.studies.pictures import write_pictures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
 from drake_teleop.lab.studies.shards import parse_shard
 from drake_teleop.station.scenario import (
@@ -130,6 +129,8 @@ def study_command(
     out = parse_shard(shard).folder(out) if shard else out
     with output_folder(out, kept=["runs.parquet"]):
         if not shard:
+            from drake_teleop.lab.studies.pictures import write_pictures
+
             write_table(out / "effects.csv", effects(study, rows))
             write_pictures(study, rows, out)
         write_json(out / "summary.json", summary)

@@ -16,9 +16,8 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from drake_teleop.common.blocks import weak_callback
+from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import checked
-from drake_teleop.station.blocks.double_only import DoubleOnly
 from drake_teleop.station.channel.channel import (
     PORTS,
     SHORTEST_TIMEOUT,

@@ -13,9 +13,8 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from drake_teleop.common.blocks import weak_callback
+from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import Array, checked
-from drake_teleop.station.blocks.double_only import DoubleOnly
 from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import DISPLAYED, display_into, initial_display
 

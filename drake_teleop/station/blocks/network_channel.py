@@ -13,10 +13,9 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from drake_teleop.common.blocks import weak_callback
+from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.blocks.double_only import DoubleOnly
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.packet import LOAD, PACKET_SIZE

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, LeafSystem
 
+from drake_teleop.common.blocks import DoubleOnly
 from drake_teleop.common.numeric import Array, checked
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.regressor import BEFORE_JOINTS, SPECIFIC_FORCE, sample_parts
-from drake_teleop.station.blocks.double_only import DoubleOnly
 from drake_teleop.station.estimation import contact_detection, load_estimator
 
 

@@ -77,6 +77,9 @@ _LEAD_STEPS = 2.0
 _OFFSET_FADE_S = 0.3
 _FRICTION_MEMORY_S = 1.0
 _FRICTION_LAG_S, _SLIP_SPEED = 0.1, 1e-3
+_TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS = 0.6, 30.0
+_TORQUE_STIFFNESS_FACTOR, _MAX_CONE = 4.0, 1.0
+_LEAST_METRIC = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
 _MAX_PREDICTION_N = 3.0
 _MAX_REMEMBERED_N = 10.0
 _SAME_WALL_M, _SAME_WALL_COSINE = 5e-3, 0.7
@@ -282,8 +285,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     memory[_RETREAT] = retreat
     force *= min(max(3.0 * (1.0 - retreat / _RELEASE_M), 0.0), 1.0)
     _find_slave_step(received, memory)
-    for g in range(2):
-        _add_friction(g, T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
+    _add_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
     if k > _MIN_STIFFNESS:
@@ -301,33 +303,55 @@ def _find_slave_step(received, memory):
 
 
 @njit(cache=True)
-def _add_friction(g, T, size, force, received, dx, p, memory, wrench):
-    """Write the friction of group `g` into `wrench`: model of the hand plus the model's error."""
-    normal, contact, z = memory[NORMAL], received[WRENCH], memory[_SLAVE_STEP]
+def _add_friction(T, size, force, received, dx, p, memory, wrench):
+    """Write the friction (6,) into `wrench`: model of the hand plus the model's error (T68)."""
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
-    # A torque's weight in the metric is 0 where rotation is not transmitted.
-    metric, cone = max(p[METRIC][g], 1e-12), memory[_FRICTION_CONE]
-    spring, step, slave_step = (
-        _MAX_STIFFNESS / metric,
-        work_along(normal, dx),
-        work_along(normal, z),
-    )
-    lag = cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED)
-    share, total = T / max(lag, _FRICTION_LAG_S), 0.0
-    for i in range(3 * g, 3 * g + 3):
-        across = contact[i] - size * normal[i]
-        total += across * across
-        inward = metric * normal[i]
-        far[i] -= spring * (z[i] - slave_step * inward) + share * far[i]
-        rest[i] += share * (across - far[i] - rest[i])
-        near[i] -= spring * (dx[i] - step * inward) + share * near[i]
+    slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
+    normal = memory[NORMAL]
+    step, far_step = work_along(normal, dx), work_along(normal, slave_step)
+    put(wrench, 0, received, WRENCH.start, 6)
+    _remove_normal(wrench, p, memory)
     decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
-    cone[g] = max(cone[g] * (1.0 - decay), math.sqrt(total) / size)
-    limit(far, g, cone[g] * size)
-    limit(near, g, cone[g] * force)
-    for i in range(3 * g, 3 * g + 3):
-        wrench[i] = near[i] + rest[i] - spring * (dx[i] - step * metric * normal[i])
-    limit(wrench, g, cone[g] * force)
+    for g in range(2):
+        metric = max(p[METRIC][g], _LEAST_METRIC)
+        spring, largest = _friction_stiffness(g, p), _MAX_CONE / math.sqrt(metric)
+        cone[g] = max(cone[g] * (1.0 - decay), min(length(wrench, g) / size, largest))
+        lag = max(cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED), _FRICTION_LAG_S)
+        if g == 1:
+            lag = max(_TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS * received[ROUND_TRIP])
+        share = T / lag
+        for i in range(3 * g, 3 * g + 3):
+            inward = metric * normal[i]
+            far[i] -= spring * (slave_step[i] - far_step * inward) + share * far[i]
+            near[i] -= spring * (dx[i] - step * inward) + share * near[i]
+            rest[i] += share * (wrench[i] - far[i] - rest[i])
+    for friction in (near, far, rest):
+        _remove_normal(friction, p, memory)
+    for g in range(2):
+        limit(far, g, cone[g] * size)
+        limit(near, g, cone[g] * force)
+        for i in range(3 * g, 3 * g + 3):
+            across = dx[i] - step * max(p[METRIC][g], _LEAST_METRIC) * normal[i]
+            wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
+    _remove_normal(wrench, p, memory)
+    for g in range(2):
+        limit(wrench, g, cone[g] * force)
+
+
+@njit(cache=True)
+def _friction_stiffness(g, p):
+    """Return k_h of (T68) for translation [N/m] or rotation [N m/rad]."""
+    factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
+    return factor * _MAX_STIFFNESS / max(p[METRIC][g], _LEAST_METRIC)
+
+
+@njit(cache=True)
+def _remove_normal(wrench, p, memory):
+    """Remove the component of `wrench` (6,) along the direction of the contact."""
+    normal = memory[NORMAL]
+    component = component_along(wrench, normal, p)
+    for i in range(6):
+        wrench[i] -= component * normal[i]
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, DoubleOnly, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import (
@@ -80,7 +80,7 @@ def _command_into(pose, references, alignment, translation_scale, rotation_scale
         put(out, 0, references, 0, 7)
 
 
-class KinematicScaling(LeafSystem):
+class KinematicScaling(DoubleOnly, LeafSystem):
     """Scaling of the master's motion into the slave's commanded pose, with a clutch.
 
     While the clutch is open the command is constant. When it closes, the master's present pose is

@@ -27,7 +27,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import RandomSource
 
-from drake_teleop.common.blocks import ONE_DICT
+from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.vectors import (
@@ -136,7 +136,7 @@ def AddWristSensor(
     return sensor
 
 
-class PlantWristSensor(LeafSystem):
+class PlantWristSensor(DoubleOnly, LeafSystem):
     """Sensor of force, torque and motion of S at a weld of a plant, see `AddWristSensor`.
 
     The outputs hold the last sample, which belongs to the instant `sample_time`. The angular

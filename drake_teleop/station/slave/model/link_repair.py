@@ -133,7 +133,7 @@ def nearest_possible_inertia(
     largest = float(np.abs(given).max())
     if given[0] >= 0.0 and deficit <= 0.0:
         return inertia, 0.0
-    if deficit > 0.0:
-        moments += (deficit + _MARGIN * largest) / 3.0 * np.array([1.0, 1.0, -1.0])
+    moments += max(deficit, 0.0) / 3.0 * np.array([1.0, 1.0, -1.0])
+    moments[0] += _MARGIN * largest
     distance = float(np.abs(moments - given).max()) / largest
     return (axes * moments) @ axes.T, distance

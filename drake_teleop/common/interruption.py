@@ -1,0 +1,67 @@
+"""Handling of SIGINT and SIGTERM where C code would lose the KeyboardInterrupt.
+
+C code that calls Python can drop an exception, e.g. llvmlite in a callback of the compiler and
+imports in that of a weak reference, or replace it, e.g. rclpy in the constructor of a message.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import ContextDecorator, contextmanager
+from typing import Any
+
+INTERRUPTED = threading.Event()
+"""Set from the first signal on, until the command ends; an endless loop checks it."""
+
+
+class _Delays(threading.local):
+    depth, received = 0, 0  # open contexts, and the last signal in them
+
+
+_DELAYS = _Delays()
+
+
+def install_handlers() -> None:
+    """Handle SIGINT, unless it is ignored, and SIGTERM by a KeyboardInterrupt and `INTERRUPTED`."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+@contextmanager
+def handled_sigint() -> Iterator[None]:
+    """Install the handler of SIGINT for a context, if Python's own is installed."""
+    before = signal.getsignal(signal.SIGINT)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if before is not signal.default_int_handler or not in_main_thread:
+        yield
+        return
+    signal.signal(signal.SIGINT, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        INTERRUPTED.clear()
+
+
+def _interrupt(number: int, _frame: Any) -> None:
+    INTERRUPTED.set()
+    if _DELAYS.depth:
+        _DELAYS.received = number
+        return
+    raise KeyboardInterrupt(*["SIGTERM"] * (number == signal.SIGTERM))
+
+
+class delayed_signals(ContextDecorator):
+    """Delay the KeyboardInterrupt of these handlers to the end of the context; also a decorator."""
+
+    def __enter__(self) -> None:
+        _DELAYS.depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        _DELAYS.depth -= 1
+        if _DELAYS.received and not _DELAYS.depth:
+            number, _DELAYS.received = _DELAYS.received, 0
+            _interrupt(number, None)
