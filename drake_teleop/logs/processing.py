@@ -255,8 +255,8 @@ def _identified(
 
 
 def _can_be_explained(log: Log, by_splines: bool) -> bool:
-    largest = np.abs(log.wrench).max(axis=0)
-    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * largest).any():
+    low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
+    if log.static or (high - low <= _CONSTANT_SHARE * np.maximum(high, -low)).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
@@ -521,12 +521,13 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return the load phi (10,), and names of unidentified inertias.
+    """Return the load phi (10,), and names of undetermined inertias.
 
-    They are replaced by those of a point mass.
+    They are replaced by those of a point mass. Weakly identified inertias are nearer to the truth
+    than those.
     """
     phi = identification.phi.copy()
-    replaced = np.flatnonzero(~identification.identifiable[10:])
+    replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
     return phi, tuple(PARAMETERS[10 + i] for i in replaced)
