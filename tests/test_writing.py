@@ -30,6 +30,7 @@ from drake_teleop.common.files import (
 from drake_teleop.lab import run as runs
 from drake_teleop.lab.studies import study as studies
 from drake_teleop.logs import sample
+from drake_teleop.station import replay
 from drake_teleop.station.film import Film
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario
@@ -170,7 +171,7 @@ def little_work(monkeypatch):
     monkeypatch.setattr(runs, "run_scenario", a_run)
     monkeypatch.setattr(runs, "summarise", lambda run: {"x": float("nan")})
     monkeypatch.setattr(runs, "overview", lambda result: Figure())
-    monkeypatch.setattr(runs, "write_replay", lambda path, *_: write_text(path, "film"))
+    monkeypatch.setattr(replay, "write_replay", lambda path, *_: write_text(path, "film"))
     monkeypatch.setattr(
         studies.StationWork, "__call__", lambda self, values, seed: {"hand_work_J": 1.0}
     )

@@ -57,7 +57,9 @@ def _load_rows(load: dict[str, Any]) -> list[_Row]:
 
 def _add_rows(table: Any, rows: list[_Row], identifiable: list[str]) -> None:
     for label, value, std, scale, unit, name in rows:
-        if name in identifiable:
+        # The centre of mass is the moment over the mass.
+        needed = {"m", name} if name.startswith("m c") else {name}
+        if needed <= set(identifiable):
             table.add_row(label, f"{value * scale:.4f}", f"{std * scale:.4f}", unit)
         else:
             table.add_row(f"[dim]{label}", "[dim]not identifiable", "", "")

@@ -17,6 +17,7 @@ from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
+from drake_teleop.logs.causes.intervals import attenuation
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
@@ -273,8 +274,9 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
     load = _explained_load(load, why)
     if why.state.data.gravity_W is not None:
         return load
-    extra = np.zeros(16)
-    extra[10:] = why.state.data.alpha_noise_share * np.abs(load.phi[[4, 7, 9]]).max()
+    extra = attenuation(why.state)
+    share = why.state.data.alpha_noise_share
+    extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
     covariance = load.covariance + np.diag(extra**2)
     known = load.identifiable & worth_stating(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)

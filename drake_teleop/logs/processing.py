@@ -107,7 +107,7 @@ class EliminatedLog:
     Attributes:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
-        point_mass: unidentified inertial parameters, set to those of a point mass.
+        point_mass: undetermined inertias, set to those of a point mass.
         offsets: (6,) sensor offsets of this record [N, N m].
         tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
@@ -255,8 +255,8 @@ def _identified(
 
 
 def _can_be_explained(log: Log, by_splines: bool) -> bool:
-    largest = np.abs(log.wrench).max(axis=0)
-    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * largest).any():
+    low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
+    if log.static or (high - low <= _CONSTANT_SHARE * np.maximum(high, -low)).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
@@ -527,9 +527,12 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with unidentified inertias set to a point mass's, and their names."""
+    """Return phi (10,) with undetermined inertias set to a point mass's, and their names.
+
+    Weakly identified inertias are kept: they are nearer to the truth than a point mass's.
+    """
     phi = identification.phi.copy()
-    replaced = np.flatnonzero(~identification.identifiable[10:])
+    replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
     return phi, tuple(PARAMETERS[10 + i] for i in replaced)

@@ -138,7 +138,7 @@ def _tiles(load: Identification) -> list[tuple[str, str, str]]:
     mass = f"{load.mass:.4g}" if load.identifiable[6] else "–"
     com = ", ".join(
         f"{1e3 * c:.1f}" if known else "–"
-        for c, known in zip(load.com, load.identifiable[7:10], strict=True)
+        for c, known in zip(load.com, load.identifiable[7:10] & load.identifiable[6], strict=True)
     )
     count = int(load.identifiable[6:].sum())
     force, torque = (np.linalg.norm(part) for part in np.split(load.residual_rms, 2))

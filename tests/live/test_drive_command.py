@@ -30,8 +30,8 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
     monkeypatch.chdir(tmp_path)
     for module in ("live.server", "live.experiment.apparatus"):
         monkeypatch.setattr(f"drake_teleop.{module}.identified_load", lambda *_: load)
-    for name in ("write_replay", "write_picture", "overview"):
-        monkeypatch.setattr(f"drake_teleop.lab.run.{name}", lambda *_: None)
+    for name in ("station.replay.write_replay", "lab.run.write_picture", "lab.run.overview"):
+        monkeypatch.setattr(f"drake_teleop.{name}", lambda *_: None)
 
     def open_page(
         first_message: str = '{"set": {"z": -3000}}',

@@ -28,13 +28,15 @@ pytestmark = [
 ]
 
 
-def described(folder: Path, name: str, scale: tuple[float, float] = (1.0, 1.0)) -> Path:
+def described(
+    folder: Path, name: str, scale: tuple[float, float] = (1.0, 1.0), sign: int = -1
+) -> Path:
     file = str(CASES / f"{name}.csv")
     time = {"column": "time"}
     wrench = {
         "force": {"columns": ["Fx", "Fy", "Fz"], "scale": scale[0]},
         "torque": {"columns": ["Tx", "Ty", "Tz"], "scale": scale[1]},
-        "sign": -1,
+        "sign": sign,
     }
     pose = {
         "orientation": {"columns": ["qw", "qx", "qy", "qz"], "form": "quaternion_wxyz"},
@@ -111,6 +113,14 @@ def test_contact_in_most_of_the_record(tmp_path: Path) -> None:
     assert names(found) == ["contact"] and is_right(found)
     assert found.causes[0].start_s == pytest.approx(2.5, abs=0.1)
     assert found.causes[0].stop_s == pytest.approx(37.5, abs=0.1)
+
+
+@pytest.mark.long
+def test_contact_in_most_of_a_record_of_the_opposite_sign(tmp_path: Path) -> None:
+    found = identify_log(described(tmp_path, "11_wiping", sign=1))
+    assert names(found) == ["axes", "contact"]
+    assert found.causes[0].fields == {"wrench.sign": -1}
+    assert found.identification.phi[:4] == pytest.approx(PHI[:4], rel=0.02)
 
 
 @pytest.mark.long

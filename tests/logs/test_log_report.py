@@ -11,6 +11,7 @@ import pytest
 from known_motion import motion_at
 
 from drake_teleop.cli.logs import identify_command
+from drake_teleop.cli.printing import print_identification
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import PARAMETERS
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -54,6 +55,17 @@ def test_the_page_stands_alone_and_has_the_numbers_of_the_summary(tmp_path: Path
     low, high = np.array(summary["phi_interval"]).T
     assert ((low < summary["phi"]) & (summary["phi"] < high)).all()
     assert ((low - PHI) < (high - low)).all() and ((PHI - high) < (high - low)).all()
+
+
+@pytest.mark.slow
+def test_the_centre_of_mass_is_not_identifiable_without_the_mass(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    summary = identify_command(record(tmp_path / "log.parquet"), tmp_path, delay=0.0, quiet=True)
+    for known, count in ((PARAMETERS, 0), ([x for x in PARAMETERS if x != "m"], 4)):
+        print_identification(summary | {"identifiable": list(known)}, tmp_path)
+        lines = [x for x in capsys.readouterr().out.splitlines() if "not identifiable" in x]
+        assert len(lines) == count and all("mass" in x or "com" in x for x in lines)
 
 
 def test_what_is_not_identified_has_no_value_in_the_table() -> None:

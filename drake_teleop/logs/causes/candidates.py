@@ -119,11 +119,15 @@ def _fit_part(
         yield _candidate(name, state, best)
 
 
+def has_negative_mass(state: State) -> bool:
+    """Return whether the mass is significantly negative."""
+    return bool(state.x[6] < -4.0 * np.sqrt(state.fit.covariance[6, 6]))
+
+
 def has_negative_inertia(state: State) -> bool:
     """Return whether mass or inertia is significantly negative."""
-    mass, deviation = float(state.x[6]), float(np.sqrt(state.fit.covariance[6, 6]))
-    if mass < _SIGNIFICANT * deviation:
-        return mass < -4.0 * deviation
+    if state.x[6] < _SIGNIFICANT * np.sqrt(state.fit.covariance[6, 6]):
+        return has_negative_mass(state)
     i, j = np.triu_indices(3)
     inertia = np.zeros((3, 3))
     inertia[i, j] = inertia[j, i] = state.x[10:16]

@@ -13,6 +13,7 @@ from drake_teleop.logs.causes.candidates import (
     Candidate,
     candidates,
     has_negative_inertia,
+    has_negative_mass,
     is_plausible,
     tilt_start,
 )
@@ -78,13 +79,19 @@ def search(
     `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
     model.
     """
-    found = _search(_initial_state(data, given), 0.0, with_delay)
+    plain = Model(parts=given)
+    found = _search(_initial_state(data, plain), 0.0, with_delay)
+    if has_negative_mass(found[0]):
+        # Without a positive mass no candidate is plausible, whatever else is in the record.
+        opposite = _search(_initial_state(data, replace(plain, axes=-np.eye(3))), 0.0, with_delay)
+        if opposite[0].residual_ratio < _FIFTH * found[0].residual_ratio:
+            found = opposite
     if with_delay is None or may_be_coloured_noise(found[0]) or is_noise(found[0]):
         return found
     delay_s = free_delay(data)
     if abs(delay_s - found[1]) < _SAME_DELAY_S:
         return found
-    repeated = _search(_initial_state(with_delay(delay_s), given), delay_s, with_delay)
+    repeated = _search(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
     better = is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
     better = better or (repeated[0].residual_ratio < _FIFTH * found[0].residual_ratio)
     return repeated if better else found
@@ -102,9 +109,9 @@ def is_clear_misfit(state: State) -> bool:
     return state.smooth_misfit > MAX_SMOOTH_MISFIT or state.residual_ratio > _COLOURED_NOISE_RATIO
 
 
-def _initial_state(data: Instants, given: tuple[str, ...]) -> State:
-    state = State.of(data, Model(parts=given))
-    start = tilt_start(state) if "gravity" in given else None
+def _initial_state(data: Instants, model: Model) -> State:
+    state = State.of(data, model)
+    start = tilt_start(state) if "gravity" in model.parts else None
     return state if start is None else State.of(data, state.model, start)
 
 

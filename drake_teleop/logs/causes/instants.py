@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.signal import savgol_filter
 
 from drake_teleop.common.numeric import Array, parabola_minimum
 
@@ -153,8 +152,9 @@ def instants(
     used[[0, -1]] = False
     if lost is not None:
         used &= ~lost[: rows * size].reshape(rows, size).any(axis=1)
-    white = _white_noise(wrench)
-    spread = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
+    white = white_noise(wrench)
+    variance = np.array([column.var() for column in wrench.T])
+    spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
     white = np.maximum(white, _SMALLEST_NOISE * spread)
     share = _smooth_alpha(y, used) if gravity_W is None else 0.0
     out = Instants(
@@ -164,6 +164,8 @@ def instants(
 
 
 def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
+    from scipy.signal import savgol_filter  # a slow import for a rare case
+
     alpha = y[used][:, ALPHA]
     share = _noise_share(alpha)
     for width in _SMOOTHING_WIDTHS:
@@ -174,12 +176,15 @@ def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
     return share
 
 
-def _white_noise(x: Array) -> Array:
-    return np.asarray(np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0))
+def white_noise(x: Array) -> Array:
+    """Return the standard deviation (k,) of white noise in smooth signals x (N, k)."""
+    # Column by column, to save memory.
+    medians = [np.median(np.abs(np.diff(column, 3))) for column in x.T]
+    return np.array(medians) / 0.6745 / np.sqrt(20.0)
 
 
 def _noise_share(x: Array) -> float:
-    noise = _white_noise(x)
+    noise = white_noise(x)
     return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 

@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import ARM
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.candidates import Candidate, similar_factors
-from drake_teleop.logs.causes.instants import FORCES
+from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
 from drake_teleop.logs.causes.model import LOAD
 from drake_teleop.logs.causes.state import Rows, State, regularized_inverse
 
@@ -121,6 +121,17 @@ def factor_covariance(state: State) -> Array:
         distance = other.x[LOAD] - state.x[LOAD]
         out += np.outer(distance, distance)
     return out
+
+
+def attenuation(state: State) -> Array:
+    """Return the bias (16,) of [offsets; phi] by white noise of the angular acceleration."""
+    fit, data = state.fit, state.data
+    at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
+    variance = white_noise(data.y[data.used][:, ALPHA]) ** 2
+    weights = state.rows.used.sum() * (fit.filters**2).sum(axis=1) / fit.power
+    J = state.model.derivative(state.x)[:, :, at]
+    right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)
+    return np.asarray((fit.covariance @ right)[LOAD])
 
 
 def misfit_factor(state: State, blocks: Array) -> float:

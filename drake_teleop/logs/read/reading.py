@@ -149,22 +149,22 @@ class _Reader:
             self._replace_auto(describe_mounting)
         table = self._table(self._description.wrench)
         clock = self._clock("wrench", self._description.wrench, table)
-        forces = self._forces("wrench", self._description.wrench, table, clock.total)
-        wrench_t, wrench = clock.t, clock.select(forces)
+        wrench = clock.select(self._forces("wrench", self._description.wrench, table, clock.total))
         pose = imu = None
         if self._description.pose is not None:
             pose = self._pose(self._description.pose, differentiate=differentiate)
         if self._description.imu is not None:
             imu = self._imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
-        t = common_time(wrench_t, streams, self._source)
-        log = self._assemble(t, resample(t, wrench_t, wrench), imu, pose)
+        t = common_time(clock.t, streams, self._source)
+        wrench = resample(t, clock.t, wrench)
+        log = self._assemble(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
         log = replace(log, gain_std=gain_std, free=free, described=self._description)
         if pose is not None and pose.raw is not None:
             inertial = None if imu is None else imu.inertial
             log = replace(log, posed=self._description.posed(pose.raw, inertial))
-        log = log if keep_origin else log.earlier(float(wrench_t[0]))
+        log = log if keep_origin else log.earlier(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
@@ -252,7 +252,7 @@ class _Reader:
         orientations = Orientations(
             self._description, stream.orientation, table, clock.total, where
         )
-        quaternion = np.empty((len(clock.rows), 4))
+        quaternion = orientations.output(len(clock.rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK_ROWS):
             part = slice(start, start + _CHUNK_ROWS)

@@ -113,6 +113,13 @@ class Orientations:
         if orientation.form in ("rotation_vector", "euler"):
             self._columns *= description.scale(orientation.unit)
 
+    def output(self, count: int) -> Array:
+        """Return memory (count, 4) for the quaternions of increasing rows, written in their order.
+
+        It is that of the columns, if these are quaternions: each row is read before.
+        """
+        return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
+
     def rotations(self, rows: NDArray[np.intp]) -> Array:
         """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
         orientation = self._orientation

@@ -73,16 +73,22 @@ class Table:
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
         """Return the numbers (N, width) of the named columns, side by side."""
-        columns = [self._column(str(name), where) for name in names]
-        self._check_rows(names, columns, where, rows)
-        found = sum(column.shape[1] for column in columns)
+        out, found = np.empty((0, width)), 0
+        for name in names:  # one after the other, to save memory
+            column = self._column(str(name), where)
+            rows = len(column) if rows is None else rows
+            self._check_rows([name], [column], where, rows)
+            out = out if found else np.empty((rows, width))
+            found += column.shape[1]
+            if found <= width:
+                out[:, found - column.shape[1] : found] = column
         if found != width:
             raise DrakeTeleopError(
                 f"{found} columns where {width} are needed",
                 where=where,
                 remedy=f"list {width} columns of {self.path.name}",
             )
-        return np.hstack(columns)
+        return out
 
     def _check_rows(
         self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
