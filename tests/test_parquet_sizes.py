@@ -128,7 +128,6 @@ for place in range(len(good)):
 @pytest.mark.parametrize(
     ("bits", "options"),
     [
-        (1, {}),
         (0xFF, {}),
         (1, {"row_group_size": 8, "compression": "uncompressed"}),
     ],

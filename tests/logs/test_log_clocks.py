@@ -173,7 +173,7 @@ def frame(t: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> pl.DataF
 
 @pytest.mark.long
 @pytest.mark.slow
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     offset=st.floats(-50, 50),
     jitter=st.floats(0, 0.3),

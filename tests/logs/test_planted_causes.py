@@ -52,13 +52,11 @@ def test_the_right_causes_are_named_and_no_number_is_certain_and_wrong(
     "case",
     [
         ("gain matrix", "fourier", "poses", 3),
-        ("gain matrix", "pick", "poses", 0),
         ("hysteresis", "pick", "poses", 1),
         ("contact", "fourier", "imu", 0),
         ("gain", "pick", "poses", 2),
         ("torque factor", "fourier", "imu", 8),
         ("none", "slow", "imu", 91),
-        ("zero change + load change", "pick", "poses", 2),
     ],
 )
 def test_no_number_is_certain_and_wrong_where_the_cause_has_no_name(

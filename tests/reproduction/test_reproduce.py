@@ -15,14 +15,13 @@ from shown import type_in
 
 from drake_teleop.cli.main import main
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.lab.reproduction import experiments
+from drake_teleop.lab.reproduction import experiments, reproduce
 from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
     contact_values,
     free_motion,
     free_values,
-    ideal_motion,
     ideal_values,
     raw_excess,
 )
@@ -39,11 +38,30 @@ pytestmark = pytest.mark.long
 FORCE_SCALE = 1 / 17.5
 
 
+EXPERIMENTS = ("identify_load", "free_motion", "ideal_motion", "contact_motion", "_speed")
+
+
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def results():
+    """Return a list for each experiment, to which `run` appends its results."""
+    return {name: [] for name in EXPERIMENTS}
+
+
+def recorded(function, results):
+    def call(*arguments):
+        results.append(function(*arguments))
+        return results[-1]
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, results):
     folder = tmp_path_factory.mktemp("reproduce")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        for name in EXPERIMENTS:
+            patch.setattr(reproduce, name, recorded(getattr(reproduce, name), results[name]))
         type_in("docs/start.md", ".venv/bin/drake-teleop reproduce")
     out = folder / "out" / "r"
     written = (json.loads((out / f"{name}.json").read_text()) for name in ("summary", "session"))
@@ -287,8 +305,8 @@ def eliminate(mutated, wrench, offsets, s, omega, alpha, phi):
 
 
 @pytest.fixture(scope="module")
-def ideal_run():
-    return ideal_motion(lambda done: None)
+def ideal_run(run, results):
+    return results["ideal_motion"][0]
 
 
 def ideal_rows(values):
@@ -320,7 +338,13 @@ def test_ideal_run_rejects_each_wrong_sign_of_the_regressor(ideal_run, monkeypat
             assert False in ideal_rows(ideal_values(run)), place
 
 
-def test_reproduce_exits_with_status_1_for_a_wrong_sign(tmp_path, monkeypatch, capsys):
+def test_reproduce_exits_with_status_1_for_a_wrong_sign(
+    run, results, tmp_path, monkeypatch, capsys
+):
+    """The sign is wrong in the evaluation of the same experiments."""
+    for name in EXPERIMENTS:
+        found = iter(results[name])
+        monkeypatch.setattr(reproduce, name, lambda *_, found=found: next(found))
     mutant = next(iter(mutants_of_regressor().values()))
     monkeypatch.setattr(experiments, "regressor", per_sample(mutant))
     with pytest.raises(SystemExit, match="1"):
