@@ -350,7 +350,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 
     PATH is a LeRobot folder, a robomimic file (.hdf5), a .zarr, or a folder with a table for each
     episode. Needs --load or --identify. Writes a copy with contact wrench and contact flags, and a
-    verdict for each episode. After an interruption, repeat the command to continue.
+    verdict for each episode. After an interruption, repeat the command.
     """
     from drake_teleop.logs.dataset.dataset import dataset_command
 
@@ -630,7 +630,7 @@ def tune(
 
     SCENARIO is a shipped name or a YAML file. Finds the settings with the smallest detectable
     contact force that are stable for these grips and walls. Writes tuned.yaml and report.html.
-    After an interruption, repeat the command to continue.
+    After an interruption, repeat the command.
     """
     from drake_teleop.lab.tuning.tune import tune as tune_station
 
@@ -651,8 +651,7 @@ def study(study: Path, out: Path, **options: Any) -> None:
     """Run a scenario over a design of its fields.
 
     STUDY is a YAML file with factors, design, repeats and measures, or a shipped name. Writes one
-    table with a row for each run, and pictures. After an interruption, repeat the command to
-    continue.
+    table with a row for each run, and pictures. After an interruption, repeat the command.
     """
     from drake_teleop.lab.studies.study import study_command
 
@@ -672,7 +671,7 @@ def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
 
     Runs the operator's tasks over sigma, gamma and eta, about 1000 times. After an interruption,
-    repeat the command to continue.
+    repeat the command.
     """
     from drake_teleop.lab.studies.scaling_study import scaling_study_command
 

@@ -529,7 +529,7 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     """Return phi (10,) with undetermined inertias set to a point mass's, and their names.
 
-    Weakly identified inertias are kept: they are nearer to the truth than a point mass's.
+    Weakly identified inertias are kept: they are nearer to the truth.
     """
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))

@@ -23,8 +23,8 @@ class LogSource(Source[Reading]):
     `wait`: removed delay of the motion, in readings.
 
     Args:
-        load: load for the estimate of the delay; None: no alignment. If the robot has removed the
-            load's weight from the wrench, s is the acceleration.
+        load: load for the estimate of the delay; None: no alignment. If the robot removed its
+            weight, s is the acceleration.
         cutoff_hz, delay: see `eliminate_log`.
         real_time: replay in real time; else as fast as possible.
         chunk: maximum number of readings per call.

@@ -90,7 +90,7 @@ def dataset_command(
 ) -> dict[str, Any]:
     """Write a copy of a dataset with contact wrenches, summary.json and report.html.
 
-    After an interruption, repeat the command to continue. The dataset stays unchanged.
+    After an interruption, repeat the command. The dataset stays unchanged.
 
     Args:
         load: identification.json of the load.

@@ -165,7 +165,7 @@ def _test_vector(target: Target) -> str:
 def _simulated_readings(target: Target) -> tuple[Array, Array]:
     """Return rows [wrench, s, omega, alpha, gravity] (N, 18) in S and a sensor range (6,).
 
-    The load moves and is in contact; some rows exceed the range or are invalid.
+    Some rows are in contact, exceed the range or are invalid.
     """
     phase = 2.0 * np.pi * np.arange(_VECTOR_READINGS)[:, None] / _VECTOR_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])

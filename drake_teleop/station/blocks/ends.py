@@ -31,7 +31,7 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 
 class _End(DoubleOnly, LeafSystem):
-    """Base class: one step of one end of the channel in a cache entry, read by the outputs.
+    """Base class: one step of one channel end in a cache entry, read by the outputs.
 
     Args:
         passivity: the method and its parameters, equal at both ends.

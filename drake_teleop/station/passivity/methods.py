@@ -77,7 +77,7 @@ class PassivityMethod(NamedTuple):
     Attributes:
         master_step, slave_step, command_sent: compiled functions with the arguments of those of
             this module except `steps`.
-        initialize: `initialize(p, memory)` of an end before its first step.
+        initialize: `initialize(p, memory)` of one channel end before its first step.
         config: settings dataclass of a registered method with `pack_into(p)`, or None.
         balance_at_motors: the energy balance is at the slave's motors, not at its command.
         needs_arm_mass: `slave_mass` and servo are by default those of the arm at the start.

@@ -74,7 +74,7 @@ class PspmConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Write the initial stored energy of one end of the channel into its memory."""
+    """Write the initial energy of one channel end into its memory."""
     memory[LEDGER] = p[_INITIAL]
 
 

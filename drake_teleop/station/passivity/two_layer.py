@@ -91,7 +91,7 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Write the tank's initial energy into the memory of one end of the channel."""
+    """Write the tank's initial energy into the memory of one channel end."""
     memory[LEDGER] = p[_INITIAL]
 
 

@@ -96,7 +96,7 @@ def _generate(command, interface, limits, memory, reference):
 
     Args:
         interface: (6,) period [s], gain [1/s^2], lookahead [s], w [rad/s], periods per command,
-            length of the queue.
+            queue length.
         limits: (2, n) speed and acceleration limits.
         memory: see `_COUNT`; updated.
         reference: (3, n) output: r and its two derivatives.
