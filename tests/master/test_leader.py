@@ -213,7 +213,10 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
     [
         (None, "master.leader: a leader arm and `model: leader` belong together"),
         (Leader(hand_frame="hand"), "master.leader.file: is required for a leader arm"),
-        (dataclasses.replace(LEADER, friction=[-1.0]), "master.leader.friction: has to be"),
+        (
+            dataclasses.replace(LEADER, friction=[-1.0]),
+            "master.leader.friction: contains a number that is negative",
+        ),
         (dataclasses.replace(LEADER, home=[0.0]), "master.leader.home: has 1 numbers"),
         (dataclasses.replace(LEADER, hand_frame="elbow"), "no frames are named 'elbow'"),
         (dataclasses.replace(LEADER, home=[9.0, *HOME[1:]]), "joint yaw would be at 9"),

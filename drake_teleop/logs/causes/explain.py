@@ -84,7 +84,9 @@ def search(
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
         opposite = _search(_initial_state(data, replace(plain, axes=-np.eye(3))), 0.0, with_delay)
-        if opposite[0].residual_ratio < _FIFTH * found[0].residual_ratio:
+        # With a negative torque factor it is a reversed specific force, seen from the wrench.
+        is_wrench = opposite[0].model.factor > 0.0
+        if is_wrench and opposite[0].residual_ratio < _FIFTH * found[0].residual_ratio:
             found = opposite
     if with_delay is None or may_be_coloured_noise(found[0]) or is_noise(found[0]):
         return found

@@ -86,11 +86,11 @@ class Leader:
         for name in ("home", "friction", "damping", "torque_limit"):
             values = getattr(self, name)
             if not np.isfinite(values).all() or (name != "home" and min(values, default=0.0) < 0.0):
+                least, fault = ("", "") if name == "home" else (" of 0 or more", "negative or ")
                 raise DrakeTeleopError(
-                    "contains a number that is not finite"
-                    + ("" if name == "home" else ", or is negative"),
+                    f"contains a number that is {fault}not finite",
                     where=f"{where}.{name}",
-                    remedy="give finite numbers" + ("" if name == "home" else " of 0 or more"),
+                    remedy=f"give finite numbers{least}",
                 )
 
     def found_from(self, folder: Path) -> "Leader":
