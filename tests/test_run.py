@@ -40,6 +40,7 @@ def typed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         type_in("README.md", ".venv/bin/drake-teleop run contact_transition")
+        patch.setattr("drake_teleop.lab.run.overview", lambda result: Figure())
         type_in("docs/start.md", ".venv/bin/drake-teleop run mine.yaml")
     return folder / "out"
 

@@ -49,7 +49,13 @@ MAPS = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=MAPS)
+LONG = "sigma and delay, contact"
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.long] * (name == LONG)) for name in MAPS],
+)
 def drawn(request: pytest.FixtureRequest) -> tuple[OneAxis, Sampling, StabilityMap]:
     axis, sampling, *parameters = MAPS[request.param]
     return axis, sampling, stability_map(axis, sampling, *parameters)

@@ -257,7 +257,7 @@ def test_count_agrees_with_roots_also_at_both_ends_of_the_circle(
 @pytest.mark.parametrize(
     ("axis", "sampling"),
     [
-        (held("light", sigma=1.0, wall_stiffness=0.0), STATION),
+        pytest.param(held("light", sigma=1.0, wall_stiffness=0.0), STATION, marks=pytest.mark.long),
         (held("medium"), JR3),
         (held("medium", sigma=1.0), STATION),
         (held("medium", sigma=1.0), JR3),
@@ -305,7 +305,11 @@ def test_delay_margin_is_0_if_unstable_and_infinite_without_limit() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "axis", [held("medium", wall_stiffness=2.5e3), held("firm", wall_stiffness=2e4)]
+    "axis",
+    [
+        pytest.param(held("medium", wall_stiffness=2.5e3), marks=pytest.mark.long),
+        held("firm", wall_stiffness=2e4),
+    ],
 )
 def test_a_simulation_becomes_unstable_at_the_margin(bench: ModuleType, axis: OneAxis) -> None:
     simulated = bench.simulated_margin(axis, JR3)

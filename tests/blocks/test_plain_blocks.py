@@ -488,7 +488,7 @@ def test_a_saved_context_continues_in_another_block(name):
         np.testing.assert_array_equal(advance(second, k), advance(first, k))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_plain_and_joined_ports_give_the_same_scaled_wrench_over_many_samples():
     """10^4 random samples: `WrenchScaling` against the `ForceScaling` of the station."""
     rng = np.random.default_rng(6)

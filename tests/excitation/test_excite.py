@@ -600,7 +600,11 @@ def test_model_options_require_a_model(capsys, tmp_path):
 
 
 @pytest.fixture(
-    scope="module", params=[(write_urdf, "l6", 6), (write_sdf, "wrist", 7)], ids=["urdf", "sdf"]
+    scope="module",
+    params=[
+        pytest.param((write_urdf, "l6", 6), id="urdf"),
+        pytest.param((write_sdf, "wrist", 7), id="sdf", marks=pytest.mark.long),
+    ],
 )
 def foreign(request, tmp_path_factory):
     """Return an arm, its trajectory from the command line, and its execution with 1.2 kg."""
