@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 import tempfile
 import threading
@@ -23,6 +24,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # even if the surroundings forbid to keep it: importing lab.run takes 2.6 s then, not 7.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# A shell ignores SIGINT for what it starts in the background, and processes inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Cyclic garbage is looked for seldom: with Python's thresholds that took 11 % of the tests' time
 # and a quarter of that of their collection.

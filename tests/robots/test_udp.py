@@ -316,7 +316,6 @@ class SignalLost(Interrupted):
 @pytest.fixture
 def handlers() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     install_handlers()
     yield
     INTERRUPTED.clear()
