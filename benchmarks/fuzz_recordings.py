@@ -234,7 +234,7 @@ def recorded(path: Path) -> None:
         start = start if isinstance(start, (int, float)) else float("nan")
         count = min(abs(count), 2000) if isinstance(count, int) else 1
         for t in start + step * np.arange(count):
-            recorder.take(Reading(k, float(t), np.ones(15)))
+            recorder.add(Reading(k, float(t), np.ones(15)))
         if count >= 50 and abs(start) < 1e9:
             longest = max(longest, (count - 1) * step)
     if recorder.seconds < longest - 1.0 - 50 * step:
