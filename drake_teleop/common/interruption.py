@@ -51,7 +51,9 @@ def _interrupt(number: int, _frame: Any) -> None:
     if _DELAYS.depth:
         _DELAYS.received = number
         return
-    raise KeyboardInterrupt(*["SIGTERM"] * (number == signal.SIGTERM))
+    if number == signal.SIGTERM:
+        raise KeyboardInterrupt("SIGTERM")
+    raise KeyboardInterrupt
 
 
 class delayed_signals(ContextDecorator):

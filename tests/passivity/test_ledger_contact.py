@@ -8,7 +8,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.station.passivity.ledger import LedgerConfig
+from drake_teleop.station.passivity.ledger import (
+    _FRICTION_AT_HAND,
+    _FRICTION_AT_SLAVE,
+    _FRICTION_REST,
+    LedgerConfig,
+)
 from drake_teleop.station.passivity.ledger_slave import (
     _CONTACT_DAMPING,
     _CONTACT_STIFFNESS,
@@ -171,6 +176,65 @@ def test_friction_force_along_the_contact_is_removed(turns):
     felt = hand.rest(9000)
     assert felt[2] == pytest.approx(3.0, abs=0.05)  # but for what the direction still has to turn
     assert abs(felt[1]) < 0.05
+
+
+def test_friction_opposes_a_hand_that_reverses_before_the_slave_does():
+    """The slave slides 100 ms behind the hand, and meets the friction of its own motion."""
+    hand, delay, speed = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0), 100, 5e-5
+    hand.rest(1500)
+    ways = np.repeat([speed, -speed], [400, 60])  # short: the direction turns to the friction
+    for k, way in enumerate(ways):
+        late = ways[k - delay] if k >= delay else 0.0
+        hand.packet[POSE][5] += late
+        hand.packet[WRENCH][1] = -0.6 * np.sign(late)
+        felt = hand.step([0.0, way, 0.0, 0.0, 0.0, 0.0])
+        if k == 399:
+            assert felt[1] == pytest.approx(-0.6, rel=0.15)
+    assert felt[1] > 0.4
+
+
+def test_noise_of_a_light_contact_is_no_large_friction():
+    """0.5 N across 0.2 N is no coefficient of friction of 2.5."""
+    hand = Hand(np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]), 200.0)
+    hand.rest(1500)
+    for k in range(20):
+        hand.packet[WRENCH][1] = 0.5 * (-1) ** k
+        hand.step()
+    hand.packet[WRENCH][:3] = 0.0, 0.0, 3.0
+    felt = [hand.step([0.0, 1e-4, 0.0, 0.0, 0.0, 0.0]) for _ in range(40)]
+    assert 2.0 < np.abs(np.array(felt)[:, 1]).max() <= 3.0
+
+
+def test_friction_stays_across_the_direction_as_it_turns():
+    """Of a contact beside So, on which the hand moves in all axes; no limit is reached."""
+    rng = np.random.default_rng(4)
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.2, 0.0, 0.0]), 0.0)
+    hand.rest(100)
+    hand.packet[WRENCH] += [1.0, -0.5, 0.0, 0.0, 0.1, 0.05]
+    for _ in range(200):
+        hand.packet[POSE][4:] += 1e-6 * rng.normal(size=3)
+        felt = hand.step(rng.normal(size=6) * np.repeat([1e-6, 1e-5], 3))
+        normal = hand.memory[NORMAL]
+        for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
+            assert abs(component_along(hand.memory[friction], normal, hand.p)) < 1e-12
+        pressed = component_along(hand.packet[WRENCH], normal, hand.p)
+        assert component_along(felt, normal, hand.p) == pytest.approx(pressed, abs=1e-9)
+    assert np.linalg.norm(felt[:2]) > 0.4
+
+
+@pytest.mark.parametrize(("round_trip", "lag"), [(0.01, 0.6), (0.1, 3.0), (0.3, 9.0)])
+def test_torque_across_the_contact_is_a_stiffer_spring_with_a_longer_lag(round_trip, lag):
+    """A tip 0.2 m from So: 2500 N/m there are 100 N m/rad. The direction turns within 3 s."""
+    hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
+    hand.packet[ROUND_TRIP] = round_trip
+    hand.rest(1500)
+    hand.packet[WRENCH][5] = 0.05
+    rendered = hand.rest(300)[5]
+    expected = sum(1.0 - np.exp(-0.3 / each) for each in (3.0, lag))
+    assert rendered / 0.05 == pytest.approx(expected, rel=0.08)
+    for _ in range(10):
+        hand.step([0.0, 0.0, 0.0, 0.0, 0.0, 2e-5])
+    assert hand.step()[5] - rendered == pytest.approx(-100.0 * 2e-4, rel=0.1)
 
 
 def test_stick_slip_is_rendered_in_part():
