@@ -56,6 +56,7 @@ def test_the_right_causes_are_named_and_no_number_is_certain_and_wrong(
         ("contact", "fourier", "imu", 0),
         ("gain", "pick", "poses", 2),
         ("torque factor", "fourier", "imu", 8),
+        ("torque factor", "fourier", "imu", 14),
         ("none", "slow", "imu", 91),
     ],
 )
