@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -80,3 +81,15 @@ def test_a_factor_that_slow_motion_does_not_determine_leaves_the_load_uncertain(
     assert [name for name, *_ in found["named"]] == ["torque factor"]
     assert "or 0.112985" in found["messages"][0]  # the true one: pound-force inches
     assert found["false"] == []
+
+
+@pytest.mark.parametrize(("motion", "seed"), [("pick", 0), ("fourier", 1)])
+def test_contact_and_the_opposite_sign_are_named_together(
+    tmp_path: Path, motion: str, seed: int
+) -> None:
+    record = make_record("contact", motion, "poses", seed)
+    path = write(replace(record, sign=-record.sign), tmp_path)
+    found = identify_log(path)
+    assert {cause.name for cause in found.causes} == {"axes", "contact"}
+    assert found.causes[0].fields == {"wrench.sign": record.sign}
+    assert found.identification.mass == pytest.approx(record.truth.loads[0][0][0], rel=0.005)
