@@ -1,8 +1,9 @@
 """Files that a robot model references, and access rules for them.
 
 Models may be untrusted. Only files inside the model's folder and its packages are read, after
-resolving symbolic links. Packages are `package_paths` and ROS packages (package.xml) around the
-model. Include cycles are errors; number and size of files are limited.
+resolving symbolic links. Packages are `package_paths`, ROS packages (package.xml) around the model
+and the installed Python package around it. Include cycles are errors; number and size of files are
+limited.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class ModelFiles:
             for folder in (*(each / name for each in inside), *named, *(e / name for e in beside)):
                 if folder.resolve() == folder:  # neither a link nor ".."
                     self.packages.setdefault(name, folder)
+        own += filter(_is_installed_package, around)
         self._roots = {self._folder, *own, *(folder.resolve() for folder in package_paths)}
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._bases = {""}
@@ -172,6 +174,15 @@ class ModelFiles:
             for line in (_OBJ if kind == ".obj" else _MTL).findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
+
+
+def _is_installed_package(folder: Path) -> bool:
+    """Return whether a folder is a Python package beside its `.dist-info`, and no home folder."""
+    return (
+        os.path.isfile(folder / "__init__.py")
+        and any(each.is_dir() for each in folder.parent.glob("*.dist-info"))
+        and not Path(os.path.expanduser("~")).resolve().is_relative_to(folder)
+    )
 
 
 def _existing_paths(path: Path | None) -> list[Path]:
