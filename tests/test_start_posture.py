@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.new_station.place import _strong_ones, find_place
+from drake_teleop.lab.new_station.place import _strong_rows, find_place
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
@@ -111,7 +111,7 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     # The base link has a plate on the plane; everything that moves is above it.
     assert plan.plane == pytest.approx(0.0, abs=1e-9)
     assert plan.shapes.points(plan.shapes.moving())[:, 2].min() > 0.02
-    assert start_overlaps(slave_of(plan, path), wall_of(plan)) == ()
+    assert start_overlaps(slave_of(plan, path), wall_of(plan))[0] == ()
     assert wall_of(plan).position[2] < plan.lowest[2] - 0.01
 
 
@@ -134,10 +134,10 @@ def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
 def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
     path, plan = plain
     slave = slave_of(plan, path)
-    assert start_overlaps(slave, wall_of(plan)) == ()
+    assert start_overlaps(slave, wall_of(plan))[0] == ()
     elbow = postures_at(plan.shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
     (said,) = [
-        text for text in start_overlaps(slave, Wall(position=list(elbow))) if "link3" in text
+        text for text in start_overlaps(slave, Wall(position=list(elbow)))[0] if "link3" in text
     ]
     assert said.startswith("link3 and wall overlap by ") and " mm at the start" in said
     assert said.endswith("move the object in environment, or give another start in slave.home")
@@ -225,7 +225,7 @@ def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None
     torque = np.abs([holding_torque(arm, each) for each in q])
     limit = np.quantile(torque, 0.8, axis=0) if share < 1.0 else 0.1 * torque.min(axis=0)
     weak = replace(arm, effort_limit=limit)
-    kept = _strong_ones(weak, postures_at(arm, q)).q
+    kept = q[_strong_rows(weak, q)]
     if share > 1.0:
         assert len(kept) == len(q)
     else:

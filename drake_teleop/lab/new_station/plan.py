@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.place import (
+    LEAST_LOAD,
+    MAX_TORQUE_USE,
     OPPOSITE,
     TOOL_AXES,
     Place,
@@ -61,6 +63,7 @@ class Plan:
         axis_note: advice on unusual axes of the sensor frame.
         overlaps: sentences about overlaps of shapes at the start.
         plane: height of the base plane [m].
+        weak_joints: joints whose torque limits in the model cannot hold the arm.
         shapes: shapes of arm and tool, at the start.
     """
 
@@ -78,6 +81,7 @@ class Plan:
     axis_note: str
     overlaps: tuple[str, ...]
     plane: float
+    weak_joints: tuple[str, ...]
     shapes: PostureShapes
 
 
@@ -108,7 +112,9 @@ def plan_station(
         shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     plane = base_plane(shapes)
     place, axis, shapes = _find_start(slave, shapes, plane, axis)
-    model, on_sensor = shapes.arm, None if tool is not None else slave.tool
+    on_sensor = None if tool is not None else slave.tool
+    share = 1.0 if own_tool else LEAST_LOAD if tool is None else 0.0
+    model, weak_joints, assumed = _without_weak_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
         on_sensor.mass = _mass_to_hold(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
@@ -136,10 +142,11 @@ def plan_station(
         swing=_round_down(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
         lowest=lowest,
         tip=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
-        assumptions=tuple(shapes.assumptions),
+        assumptions=(*shapes.assumptions, *assumed),
         axis_note=tool_frame_advice(model, arm, sensor_frame, axis),
         overlaps=tuple(overlap_texts(shapes, of_arm=True)),
         plane=plane,
+        weak_joints=weak_joints,
         shapes=shapes,
     )
 
@@ -209,6 +216,25 @@ def _rod_length(shapes: PostureShapes, axis: str) -> float:
     """Return the length of a rod that ends beyond the other shapes on the sensor's link [m]."""
     end = extent(shapes, shapes.sensor_link() - {shapes.tool_body}, axis)
     return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
+
+
+def _without_weak_limits(
+    arm: ArmModel, q: Array, share: float
+) -> tuple[ArmModel, tuple[str, ...], list[str]]:
+    """Return the arm without limits that cannot hold it at q, these joints, and a text for each.
+
+    Args:
+        share: share of the load that the arm must hold; 0 for a tool of the user.
+    """
+    torque = np.abs(holding_torque(arm.with_load(share * arm.phi_load), q))
+    use = torque / arm.effort_limit
+    weak = (use > MAX_TORQUE_USE) & (use.max() > 1.0)
+    names = tuple(np.array(arm.joint_names)[weak].tolist())
+    texts = [
+        f"no torque limit for {name}, as holding the arm takes {needed:.3g} of its {limit:.3g}"
+        for name, limit, needed in zip(names, arm.effort_limit[weak], torque[weak], strict=True)
+    ]
+    return replace(arm, effort_limit=np.where(weak, np.inf, arm.effort_limit)), names, texts
 
 
 def _mass_to_hold(arm: ArmModel, q: Array) -> float:

@@ -213,6 +213,22 @@ def actuate(
         actuator.set_default_gear_ratio(gear)
 
 
+def set_torque_limits(
+    plant: MultibodyPlant, arm: ModelInstanceIndex, limits: dict[str, float]
+) -> None:
+    """Replace the effort limits of the named joints; raise DrakeTeleopError for an unknown one."""
+    motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    known = {each.joint().name(): each for each in motors if each.model_instance() == arm}
+    for name, limit in limits.items():
+        if name not in known:
+            raise DrakeTeleopError(
+                f"the arm has no joint {name!r}",
+                where="slave.torque_limits",
+                remedy=f"name one of {', '.join(known)}",
+            )
+        known[name].set_effort_limit(limit)
+
+
 def assume_rotor_inertias(
     plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
 ) -> list[str]:
