@@ -166,8 +166,8 @@ def find_place(
     postures, region = suitable(random_postures(pointed), plane, length)
     postures = postures[_strong_rows(pointed, postures.q)]
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
-    order, found = np.argsort(scores(pointed, postures, region))[::-1], list[Place]()
-    for rows in _rows_to_solve(shapes, postures, order):
+    found = list[Place]()
+    for rows in _rows_to_solve(pointed, postures, region, shapes):
         solved = _candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
         found += [_examined(shapes, place, region) for place in solved]
         if not all(place.overlaps for place in found):
@@ -210,9 +210,12 @@ def _removals(region: Region, left: int) -> str:
 
 
 def _rows_to_solve(
-    shapes: PostureShapes | None, postures: Postures, order: NDArray[np.intp]
+    arm: ArmModel, postures: Postures, region: Region, shapes: PostureShapes | None
 ) -> Iterator[NDArray[np.intp]]:
-    """Yield the rows in their order; then some rows of all ranks whose shapes do not overlap."""
+    """Yield the rows, the best first; then some rows of all ranks whose shapes do not overlap."""
+    if not len(postures.q):
+        return
+    order = np.argsort(scores(arm, postures, region))[::-1]
     yield order
     if shapes is None:
         return
