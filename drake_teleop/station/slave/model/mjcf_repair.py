@@ -22,12 +22,14 @@ from drake_teleop.station.slave.model.mjcf_chain import (
     read_arm,
     report_couplings,
 )
-from drake_teleop.station.slave.model.mjcf_elements import Mjcf
+from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_masses import NO_MASS
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, listed
 from drake_teleop.station.slave.model.urdf_repair import Purpose
+
+_GRAVITY, _GRAVITY_TOLERANCE = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 
 
 def repair_mjcf(
@@ -45,6 +47,10 @@ def repair_mjcf(
     reader = BodyReader(mjcf)
     if not root.get("model"):
         report.state("the model is named after its file:", path.stem)
+    for option in root.findall("option"):
+        gravity = Attributes(option.attrib, "option", report).vector("gravity", _GRAVITY)
+        if np.abs(np.subtract(gravity, _GRAVITY)).max() > _GRAVITY_TOLERANCE:
+            report.state("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.in_directives
     if is_complete or not purpose.sensor:
         world = read_all(reader)
