@@ -64,8 +64,9 @@ _NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES, _NUM_CHECKED = 40, 12, 60, 500
 _SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
-#: Largest torque at rest, over its limit; share of the load that weak arms have to hold.
-MAX_TORQUE_USE, LEAST_LOAD = 0.9, 0.05
+#: Largest torque at rest, over its limit: the identification before a run uses 80 %.
+MAX_TORQUE_USE = 0.7
+LEAST_LOAD = 0.05  #: Share of the load that weak arms have to hold.
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
