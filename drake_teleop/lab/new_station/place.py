@@ -157,9 +157,6 @@ def find_place(
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
         plane: height of the base plane, below which the arm has no joints [m].
         axis: axis of S along the tool, one of `TOOL_AXES`.
-
-    Raises:
-        DrakeTeleopError: if no such start is found.
     """
     R_SA = TOOL_AXES[axis]
     pointed = with_tool_axis(arm, R_SA.matrix())
@@ -334,12 +331,7 @@ def _merit(place: Place) -> tuple[float, float, bool, float]:
 
 
 def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
-    """Return the place with the half edge of its largest reachable cube, or 0.
-
-    Args:
-        is_free: False for an arm with less than six degrees of freedom, whose cube is a guess.
-        vertical: True examines displacements up and down only.
-    """
+    """Return the place with the half edge of its largest reachable cube, or 0."""
     moves = _meets if is_free else _reaches
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
@@ -361,7 +353,6 @@ def _meets(arm: ArmModel, place: Place, displacement: Array) -> bool:
 
 
 def _reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
-    """Return whether an arm with few joints follows a displacement approximately."""
     target = place.pose + np.append(np.zeros(4), displacement)
     q, _ = find_posture(arm, target, place.q)
     error = np.linalg.norm(_pose(arm, q)[4:] - target[4:])

@@ -93,11 +93,7 @@ def plan_station(
     tool: Path | None = None,
     device: str = PHANTOM,
 ) -> Plan:
-    """Choose start, scales and motions for an arm and a device.
-
-    Raises:
-        DrakeTeleopError: for an unusable model, or an arm that cannot point its tool down.
-    """
+    """Choose start, scales and motions for an arm and a device."""
     stand_in = _stand_in("z", _LENGTH_M)
     slave = Slave(
         model=str(arm),
@@ -181,18 +177,13 @@ def _find_start(
 
 
 def _tool_axis(shapes: PostureShapes, load: Array) -> str:
-    """Return the axis of S towards the model's own load, or else along the last joint; else z.
-
-    Args:
-        load: (4,) mass [kg] and first moments of the load [kg m] without a stand-in.
-    """
+    """Return the axis of S towards the model's own load, or else along the last joint; else z."""
     if load[0] > _MIN_MASS_KG and (axis := nearest_axis(load[1:] / load[0])):
         return axis
     return last_joint_axis(shapes.arm) or "z"
 
 
 def _reaches_beyond_link(shapes: PostureShapes, axis: str) -> bool:
-    """Return whether bodies beyond the sensor, without the stand-in, reach beyond its link."""
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
     link_end = extent(shapes, shapes.sensor_link() - shapes.tool_bodies, axis)
     return extent(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
@@ -238,7 +229,6 @@ def _without_weak_limits(
 
 
 def _mass_to_hold(arm: ArmModel, q: Array) -> float:
-    """Return the mass of a stand-in that the motors can hold [kg]."""
     phi = arm.phi_load
     for mass in _STAND_IN_MASSES_KG:
         torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)

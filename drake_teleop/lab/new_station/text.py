@@ -86,7 +86,6 @@ def wall_of(plan: Plan) -> Wall:
 
 
 def _device_rates(device: str) -> dict[str, Any]:
-    """Return the rates of a slow device for the scenario, as `analyze` requires."""
     own = Master(model=device).own_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 

@@ -38,9 +38,6 @@ def repair_mjcf(
     """Return the text of an MJCF file that Drake reads, with meshes converted in `folder`.
 
     A scene, or a file that directives add, keeps all bodies and joints.
-
-    Raises:
-        DrakeTeleopError: with all faults that cannot be repaired.
     """
     report = RepairReport(strict=purpose.is_scene)
     mjcf = Mjcf(root, path, files, report)
@@ -131,14 +128,12 @@ def _set_mass(
 
 
 def _file_mass(mjcf: Mjcf) -> float:
-    """Return the mass of all bodies of the file, also of those that are left out."""
     reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
     mass = sum(reader.mass(body).mass for body in reader.read_world().all()[1:])
     return mass if mass > 0.0 else np.inf
 
 
 def _state_lost_shapes(reader: BodyReader, report: RepairReport) -> None:
-    """State lost shapes: visuals only of bodies without shapes."""
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if touches(shape) or not body.geoms:

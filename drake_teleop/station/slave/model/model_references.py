@@ -92,12 +92,7 @@ class ModelFiles:
         return any(path.resolve().is_relative_to(root) for root in roots)
 
     def check(self, path: Path) -> None:
-        """Check a file and all files that it references, except meshes of the model's own links.
-
-        Raises:
-            DrakeTeleopError: for a file outside the allowed folders, a cycle, or too many or too
-                large files.
-        """
+        """Check a file and all files that it references, except meshes of the model's own links."""
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
@@ -135,7 +130,6 @@ class ModelFiles:
         return self._sizes[real]
 
     def _referenced_files(self, path: Path) -> Iterator[Path]:
-        """Yield the existing files and folders that a file references."""
         tops = [path.parent, self._folder]
         if path.suffix.lower() == ".sdf" and path != self._model.resolve():
             tops.append(Path.cwd())  # Drake resolves nested includes from here
