@@ -64,8 +64,9 @@ _NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES, _NUM_CHECKED = 40, 12, 60, 500
 _SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
-#: Largest torque at rest, over its limit: the identification before a run uses 80 %.
-MAX_TORQUE_USE = 0.7
+# Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
+# identification before a run uses 80 % of both.
+_MIN_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
 LEAST_LOAD = 0.05  #: Share of the load that weak arms have to hold.
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
@@ -162,7 +163,7 @@ def find_place(
     pointed = with_tool_axis(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
     postures, region = suitable(random_postures(pointed), plane, length)
-    postures = postures[_strong_rows(pointed, postures.q)]
+    postures = postures[_usable_rows(pointed, postures.q)]
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = list[Place]()
     for rows in _rows_to_solve(pointed, postures, region, shapes):
@@ -191,15 +192,19 @@ def find_place(
     return best._replace(pose=pose, by_position=best.by_position and axis == "z")
 
 
-def _strong_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
-    """Return the rows of q (k, n) that the motors can hold, with less load if necessary, or all."""
+def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
+    """Return the rows of q (k, n) with room for motion, and that the motors can hold if possible.
+
+    If necessary with less load, and then without any condition.
+    """
+    roomy = joint_margins(arm, q) > _MIN_MARGIN
     for share in (1.0, LEAST_LOAD):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
-        strong = np.flatnonzero((np.abs(torques) < MAX_TORQUE_USE * arm.effort_limit).all(axis=1))
-        if len(strong):
-            return strong
-    return np.arange(len(q))
+        strong = (np.abs(torques) < MAX_TORQUE_USE * arm.effort_limit).all(axis=1)
+        if (roomy & strong).any():
+            return np.flatnonzero(roomy & strong)
+    return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
 
 
 def _removals(region: Region, left: int) -> str:
@@ -239,7 +244,7 @@ def _candidates(
         ]
     if not solved:
         return
-    solved = [solved[k] for k in _strong_rows(arm, np.array([q for q, _, _ in solved]))]
+    solved = [solved[k] for k in _usable_rows(arm, np.array([q for q, _, _ in solved]))]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = scores(arm, exact, region), joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):

@@ -36,7 +36,6 @@ _PHANTOM_HALF_M = 0.08
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
 _STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
-_WEAK_USE = 0.8  # torque at rest, over its limit, at which no identification is possible
 _MIN_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _COM_M, _LENGTH_M, _RADIUS_M, _FREE_LENGTH_M = 0.05, 0.1, 0.012, 0.05
 _STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _COM_M])
@@ -219,7 +218,7 @@ def _without_weak_limits(
         share: share of the load that the arm must hold; 0 for a tool of the user.
     """
     torque = np.abs(holding_torque(arm.with_load(share * arm.phi_load), q))
-    weak = torque > _WEAK_USE * arm.effort_limit
+    weak = torque > MAX_TORQUE_USE * arm.effort_limit
     names = tuple(np.array(arm.joint_names)[weak].tolist())
     texts = [
         f"no torque limit for {name}, as holding the arm takes {needed:.3g} of its {limit:.3g}"
