@@ -172,14 +172,18 @@ def _elbow(origins: np.ndarray, plane: float) -> dict[str, float]:
 def _least_singular_value(
     plant: MultibodyPlant, context: Any, parsed: ParsedSlave, arm: ArmModel, origins: np.ndarray
 ) -> float:
-    """Return the least singular value of the Jacobian, rotations times L, over L = reach / 5."""
+    """Return the least singular value of the Jacobian, rotations times L, over L = reach / 5.
+
+    Directions in which no joint moves the sensor do not count.
+    """
     L = _ORIENTATION_SHARE * float(np.linalg.norm(np.diff(origins, axis=0), axis=1).sum())
     world = plant.world_frame()
     J = plant.CalcJacobianSpatialVelocity(
         context, JacobianWrtVariable.kV, parsed.sensor_frame, np.zeros(3), world, world
     )[:, arm.velocity_index]
     J[:3] *= L
-    return float(np.linalg.svd(J, compute_uv=False)[-1]) / L
+    values = np.linalg.svd(J, compute_uv=False)
+    return float(values[values > 1e-9 * values[0]][-1]) / L
 
 
 def _limit_margin(arm: ArmModel, q: np.ndarray) -> float:
