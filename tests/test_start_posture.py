@@ -202,6 +202,8 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     )
     (said,) = [text for text in shapes.assumptions if "overlaps left out" in text]
     assert "link3 and link5" in said and "link1" not in said
+    slave = Slave(model=str(path), sensor_frame="ft", tool=plain[1].tool, home=[0.3] * 6)
+    assert said in start_overlaps(slave, None)[1]
 
 
 def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
