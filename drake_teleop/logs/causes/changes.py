@@ -385,11 +385,12 @@ def _contact_span(state: State, span: tuple[float, float]) -> tuple[float, float
     inside = np.flatnonzero(data.used & in_spans(data, (span,)))
     y = data.with_steps(state.model.times)[:, state.model.columns]
     usual = np.maximum(np.maximum(data.white, state.rows.rms(state.fit.residual)), 1e-12)
-    contact_blocks = np.abs(y[inside] @ state.fit.residual.T) > _CALM_RATIO * usual
-    at = inside[contact_blocks.any(axis=1)]
-    if not len(at):
+    large = (np.abs(y[inside] @ state.fit.residual.T) > _CALM_RATIO * usual).any(axis=1)
+    first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
+    if not len(first):
         return span
-    return float(data.t[at[0]]) - 0.5 * data.dt, float(data.t[at[-1]]) + 0.5 * data.dt
+    start, stop = data.t[inside[[first[0], first[-1] + 1]]]
+    return float(start) - 0.5 * data.dt, float(stop) + 0.5 * data.dt
 
 
 def _median_residual_ratio(state: State, span: tuple[float, float]) -> float:
