@@ -228,15 +228,16 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
 def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
     shapes = plain[1].shapes
     postures, region = suitable(random_postures(shapes.arm), 0.0, 0.1)
-    ranked, clear = _rows_to_solve(shapes.arm, postures, region, shapes)
-    assert sorted(ranked) == list(range(len(postures.q)))
-    step = len(ranked) // 500 + 1
-    assert 10 < len(clear) < len(ranked[::step])
-    for row in ranked[::step]:
+    usable, clear, clear_of_all = _rows_to_solve(shapes.arm, postures, region, shapes)
+    expected = _usable_rows(shapes.arm, postures.q)
+    np.testing.assert_array_equal(np.sort(usable), np.sort(expected))
+    assert 10 < len(clear) < len(usable) < len(postures.q)
+    assert set(clear) <= set(usable) and not set(clear_of_all) <= set(usable)
+    for row in usable[:: len(usable) // 500 + 1]:
         shapes.move_to(postures.q[row])
         assert (row in clear) != bool(overlap_texts(shapes, of_arm=True))
     (only,) = _rows_to_solve(shapes.arm, postures, region, None)
-    np.testing.assert_array_equal(only, ranked)
+    np.testing.assert_array_equal(only, usable)
 
 
 def test_links_of_a_telescope_may_overlap_and_a_gantry_may_not(tmp_path):

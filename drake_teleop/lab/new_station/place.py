@@ -163,7 +163,6 @@ def find_place(
     pointed = with_tool_axis(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
     postures, region = suitable(random_postures(pointed), plane, length)
-    postures = postures[_usable_rows(pointed, postures.q)]
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = list[Place]()
     for rows in _rows_to_solve(pointed, postures, region, shapes):
@@ -215,19 +214,21 @@ def _removals(region: Region, left: int) -> str:
 def _rows_to_solve(
     arm: ArmModel, postures: Postures, region: Region, shapes: PostureShapes | None
 ) -> Iterator[NDArray[np.intp]]:
-    """Yield the rows, the best first; then some rows of all ranks whose shapes do not overlap."""
+    """Yield the usable rows, the best first; then rows of all ranks whose shapes do not overlap."""
     if not len(postures.q):
         return
     order = np.argsort(scores(arm, postures, region))[::-1]
-    yield order
+    usable = order[np.isin(order, _usable_rows(arm, postures.q))]
+    yield usable
     if shapes is None:
         return
-    few = order[:: len(order) // _NUM_CHECKED + 1]
-    clear = np.ones(len(few), dtype=bool)
-    for k, row in enumerate(few):
-        shapes.move_to(postures.q[row])
-        clear[k] = not overlap_texts(shapes, of_arm=True)
-    yield few[clear]
+    for rows in (usable, order):
+        few = rows[:: len(rows) // _NUM_CHECKED + 1]
+        clear = np.ones(len(few), dtype=bool)
+        for k, row in enumerate(few):
+            shapes.move_to(postures.q[row])
+            clear[k] = not overlap_texts(shapes, of_arm=True)
+        yield few[clear]
 
 
 def _candidates(
