@@ -55,13 +55,8 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    Args:
-        source, stream_options: see `open_source`.
-        until: tolerance, see `read_tolerance`.
-        largest: range of the sensor: force [N], torque [N m].
-
-    Raises:
-        DrakeTeleopError: if an argument is invalid, or the record contains no load.
+    `largest` is the range of the sensor: force [N], torque [N m]; `stream_options` see
+    `open_source`.
     """
     tolerance = read_tolerance(until)
     make_folder(out)
@@ -146,7 +141,6 @@ def _verdict(at: Evaluation, k: int) -> str:
 
 
 def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
-    """Draw the half-widths of the 95 % intervals over the tolerances, with the advice."""
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()

@@ -73,19 +73,15 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Design, check and write an excitation trajectory.
+    """Design, check and write an excitation trajectory; return the content of both JSON files.
 
     Args:
-        scenario: name or file of the scenario with slave and wrist sensor.
         model: model file of another arm, with the scenario's sensor.
         sensor_frame: name of the sensor's frame, required with `model`.
         until: tolerance, see `read_tolerance`; replaces criterion, period and seconds.
         package_paths, acceleration, payload: see `RobotFromModel`.
         criterion, period, harmonics, seconds, seed: see `excite`.
         quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The content of summary.json and session.json.
 
     Raises:
         DrakeTeleopError: for unusable input, or if no trajectory respects all limits.

@@ -24,16 +24,12 @@ def experiment_command(
     simulated: int = 0,
     **page: Any,
 ) -> pl.DataFrame:
-    """Continue an experiment and return the table of `write_results`.
+    """Continue an experiment and return its result table.
 
     Args:
         participant: its number; default: the first with trials left, or a new one.
         simulated: total number of simulated participants; 0 for people.
         page: options of the page, see `drive`.
-
-    Raises:
-        DrakeTeleopError: for an invalid file, or a folder with other contents.
-        KeyboardInterrupt: after the results have been written.
     """
     experiment, scenarios = LoadExperiment(study)
     with open_results(out, experiment) as store:
@@ -54,7 +50,7 @@ def experiment_command(
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
     """Return a participant's number: the requested one, the first with trials left, or a new one.
 
-    `trials`: number of trials of each participant.
+    `trials` is the number of trials of each participant.
     """
     if wanted is not None:
         return wanted

@@ -1,8 +1,7 @@
 """`njit` with a disk cache that processes can share and that detects changed callees in any file.
 
-Each signature has a file, named by a hash of the code of the function and its callees: a pickle
-with machine code. It is loaded only if it belongs to the user, to root or to the owner of this
-package, and is not world-writable.
+A cached file is loaded only if it belongs to the user, to root or to the owner of this package,
+and is not world-writable.
 """
 
 from __future__ import annotations
@@ -34,9 +33,8 @@ _PLAIN_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), n
 def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code.
 
-    Args:
-        borrows: omit reference counting. The function must create no arrays and receive none from
-            callees; its caller owns the arguments.
+    `borrows` omits reference counting: the function must create no arrays and receive none from
+    callees, and its caller owns the arguments.
     """
     # Set in either case, because callees inherit unset options.
     options["_nrt"] = not borrows
@@ -56,7 +54,6 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
     """Return a compiled function (address, arguments) that calls the function at an address.
 
     That function has the given argument types, returns nothing and is compiled once, not inlined.
-    Exceptions propagate.
     """
 
     @intrinsic

@@ -27,10 +27,7 @@ _checks_assignments = ContextVar("checks_assignments", default=True)
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
     """Return a dataclass field for a number or, with a list as default, a vector.
 
-    Args:
-        unit: SI unit, "1" if dimensionless.
-        low, high: plausible range, limits included.
-        doc: meaning, with frame and source.
+    `unit` is an SI unit, "1" if dimensionless; `low` and `high` limit the plausible range.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc}
     if isinstance(default, list):
@@ -71,13 +68,8 @@ def in_short(value: Any) -> str:
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
     """Check field names and types of parsed YAML against a dataclass.
 
-    Args:
-        data: mappings, sequences, scalars; the key "_tag" contains a mapping's tag.
-        where: `file` or `file:field`.
-        tagged: whether a tag may select one of several dataclasses.
-
-    Raises:
-        DrakeTeleopError: for an unknown field, or a value of the wrong type.
+    The key "_tag" contains a mapping's tag; `tagged` allows a tag to select one of several
+    dataclasses.
     """
     if not isinstance(data, dict):
         raise DrakeTeleopError(
@@ -114,11 +106,7 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
 
 
 def check_ranges(config: Any, where: str) -> None:
-    """Check all values of a dataclass, recursively.
-
-    Raises:
-        DrakeTeleopError: for a wrong type or length, or a value outside its range or choices.
-    """
+    """Check types, lengths, ranges and choices of all values of a dataclass, recursively."""
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_place(where, field.name)
@@ -369,7 +357,7 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 
 @contextmanager
 def unchecked_assignments() -> Iterator[None]:
-    """Leave values unchecked, for a reader that checks the whole with the places in its file."""
+    """Disable the checks of assigned values, for a reader that checks the whole later."""
     token = _checks_assignments.set(False)
     try:
         yield

@@ -1,7 +1,4 @@
-"""Output files, each complete or absent, and folders of shipped files.
-
-A file is written under another name and then renamed; after a failure the previous one remains.
-"""
+"""Output files, each complete or absent, and folders of shipped files."""
 
 from __future__ import annotations
 
@@ -37,13 +34,9 @@ class CannotWrite(DrakeTeleopError):
 def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -> Iterator[Path]:
     """Yield a temporary name to write under; then rename the file to `path`.
 
-    Args:
-        aside: the temporary file is beside this path, for a `path` in a folder that is read as one
-            table.
-        shared: the temporary name is unique, because other processes may write the same file now.
-
-    Raises:
-        CannotWrite: if writing fails; `path` is then unchanged.
+    After a failure `path` is unchanged. The temporary file is beside `aside`, for a `path` in a
+    folder that is read as one table; with `shared` its name is unique, so that several processes
+    may write.
     """
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -67,7 +60,6 @@ def wrap_write_errors(path: Path) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text in UTF-8."""
     with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -104,12 +96,7 @@ def output_folder(
 ) -> Iterator[None]:
     """Create a command's output folder; the output is complete when the file `last` exists.
 
-    Args:
-        last: final file; one of an earlier command is removed first.
-        kept: earlier files that remain, for the error message.
-
-    Raises:
-        CannotWrite: if writing fails; the message lists the files written before.
+    `kept` are earlier files that remain, for the error message.
     """
     make_folder(out)
     with wrap_write_errors(out / last):
@@ -124,7 +111,6 @@ def output_folder(
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder with its parents; raise CannotWrite if it is not writable."""
     remedy = "give another folder"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -138,11 +124,7 @@ def make_folder(folder: Path) -> None:
 def set_aside(*paths: Path) -> Path | None:
     """Move existing recordings into a new folder `earlier-1`, `earlier-2`, ... beside them.
 
-    Returns:
-        The new folder; None if no recording exists.
-
-    Raises:
-        CannotWrite: if they cannot be moved.
+    Return this folder, or None if no recording exists.
     """
     existing = [path for path in paths if path.exists()]
     if not existing:
@@ -211,16 +193,13 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def models_dir() -> Path:
-    """Return the folder of the shipped models."""
     packaged = _PACKAGE / "models"
     return packaged if packaged.is_dir() else _PACKAGE.parent / "models"
 
 
 def scenarios_dir() -> Path:
-    """Return the folder of the shipped scenarios."""
     return _PACKAGE / "station" / "scenarios"
 
 
 def studies_dir() -> Path:
-    """Return the folder of the shipped studies."""
     return _PACKAGE / "lab" / "studies"

@@ -23,9 +23,8 @@ def silent(name: str) -> Progress:
 def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Stage]:
     """Yield a `Stage` that shows progress within the context.
 
-    Args:
-        progress: whether to show it, or the `Stage` of the caller.
-        after: time until a bar or line appears [s].
+    `progress` is whether to show it, or the `Stage` of the caller; `after` the time until a bar or
+    line appears [s].
     """
     if callable(progress):
         yield progress

@@ -74,14 +74,7 @@ for _kind, _, _first in _CORE_SCHEMA:
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
-    """Return the data of a YAML file.
-
-    Args:
-        tagged: allow tags of mappings, such as `!Touch`, returned under the key "_tag".
-
-    Raises:
-        DrakeTeleopError: for invalid YAML; with file, field and line.
-    """
+    """Return the data of a YAML file; `tagged` returns tags such as `!Touch` under the key "_tag"."""
     return yaml_data(read_text(path), str(path), tagged=tagged)
 
 
@@ -106,11 +99,9 @@ def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
 def yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """Return YAML that `read_yaml` reads as the same data; raise DrakeTeleopError if impossible.
+    """Return YAML that `read_yaml` reads as the same data.
 
-    Args:
-        head: comment lines at the top.
-        comments: comments at line ends, by field, "block.field".
+    `head` are comment lines at the top, `comments` those at line ends, by field or "block.field".
     """
     lines, place, left = [f"# {one_line(text)}" for text in head], list[str](), comments or {}
     for line in yaml_scalar(data, flow=None).splitlines():
@@ -170,7 +161,6 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_text(path: str | Path) -> str:
-    """Return the text of a file; raise DrakeTeleopError if unreadable or not UTF-8."""
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

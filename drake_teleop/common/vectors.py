@@ -35,7 +35,6 @@ def rows(R):
 
 @register_jitable
 def transposed(R):
-    """Return the transpose of a matrix of 9 numbers."""
     return R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]
 
 
@@ -56,31 +55,26 @@ def put(x, i, a, j, n):
 
 @register_jitable
 def plus(a, b):
-    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @register_jitable
 def minus(a, b):
-    """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @register_jitable
 def times(k, a):
-    """Return the product k a of a number and a vector."""
     return k * a[0], k * a[1], k * a[2]
 
 
 @register_jitable
 def dot(a, b):
-    """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @register_jitable
 def cross(a, b):
-    """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -191,7 +185,6 @@ def logarithm(a):
 
 @njit(cache=True)
 def normalized(a):
-    """Return the unit quaternion a / |a|."""
     scale = 1.0 / math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     return (scale * a[0], scale * a[1], scale * a[2], scale * a[3])
 

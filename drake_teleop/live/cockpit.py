@@ -86,9 +86,8 @@ class Cockpit:
     def frame(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
         """Return the page's values for at least one new row, finite and ready for JSON.
 
-        "t" [s]; "f": range of measured, contact and rendered force at the hand [N]; "energy": from
-        the hand into the device, from the tool into the environment [J]; "tool", "stylus":
-        positions [m]; "contact": bool; "words": warnings.
+        "f" is the range of measured, contact and rendered force at the hand [N]; "energy" [J]
+        flows from the hand into the device, and from the tool into the environment.
         """
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)

@@ -211,9 +211,8 @@ class LiveHand(Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return `MakeMasterSide` with a `LiveHand`.
-
-    `cross_fade` adds a `CrossFade` block at the wrench input.
+    """Return `MakeMasterSide` with a `LiveHand`; `cross_fade` adds a `CrossFade` at the wrench
+    input.
     """
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])

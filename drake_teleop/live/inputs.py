@@ -1,7 +1,7 @@
 """Inputs of a live session as integers, so that the record is exactly the simulated input.
 
-`inputs.csv` has a row for each change: time [ms], numbers, and choices by name; the last row is the
-end. A comment contains versions.
+`inputs.csv` has a row for each change: time [ms], numbers, and choices by name; the last row is
+the end.
 """
 
 from __future__ import annotations
@@ -104,7 +104,6 @@ class Inputs:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Inputs:
-        """Return the initial inputs of a scenario."""
         sigma, sigma_object, gamma = (
             round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()[:3]
         )
@@ -149,7 +148,7 @@ class Inputs:
     def pose(self, start: Array) -> Array | None:
         """Return the intended pose X_BE (7,); None if released.
 
-        `start` (3,): position of the stylus at zero displacement, in B [m].
+        `start` (3,) is the position of the stylus at zero displacement, in B [m].
         """
         if not self.held:
             return None
@@ -157,7 +156,7 @@ class Inputs:
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def holding(self, pose: Array, start: Array) -> Inputs:
-        """Return the inputs that hold the stylus at the pose X_BE (7,); `start`: see `pose`."""
+        """Return the inputs that hold the stylus at the pose X_BE (7,); `start` as for `pose`."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)

@@ -1,8 +1,4 @@
-"""Live session with one driving page and spectators, independent of web server and clock.
-
-Without a driver the hand releases the stylus. After 0.25 s the simulation stops with a complete
-record.
-"""
+"""Live session with one driving page and spectators, independent of web server and clock."""
 
 from __future__ import annotations
 
@@ -62,12 +58,12 @@ MAX_SLOWDOWN = 20.0
 class Live:
     """Event handler of a live session: messages of pages and ticks of a clock; times `now` in s.
 
+    Without a driver the hand releases the stylus, and after 0.25 s the simulation waits.
+
     Attributes:
         refused: number of invalid messages.
         stopped: failure that stops the simulation, or "".
         requested_scene: scene requested by a page, or ""; the simulation waits for `change_scene`.
-        scene: present scene.
-        pace: timing of the simulation slices.
         recorded: folders of completed records.
 
     Args:
@@ -290,7 +286,7 @@ class Live:
         return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """Return a frame: the values that pages show now."""
+        """Return the values that pages show now."""
         rows = self._session.new_rows()
         if len(rows["t"]):
             self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(
@@ -330,11 +326,6 @@ class Live:
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
     def end(self) -> None:
-        """Complete the record.
-
-        Raises:
-            CannotWrite: if writing fails.
-        """
         try:
             self._session.close()
         except DrakeTeleopError as error:
@@ -345,11 +336,6 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        """End the session and close the device link.
-
-        Raises:
-            CannotWrite: if any record is incomplete.
-        """
         self._try(self.end)
         if self._link is not None:
             self._link.close()
@@ -366,10 +352,7 @@ def _free_folder(folder: Path) -> Path:
 
 
 def parse(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message, or None.
-
-    Kinds: "set", "rates" (numbers by input), "pause", "slow", "scene", "reset" and "drive".
-    """
+    """Return the valid requests in a page's message, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:

@@ -52,9 +52,7 @@ class RateInputs:
 class MotionLimiter:
     """Limiter of the target's speed, and for a device also of its acceleration.
 
-    Args:
-        slice_s: period [s].
-        scales: slave over master motion, for translation and rotation.
+    `scales` are slave over master motion, for translation and rotation.
     """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:

@@ -52,9 +52,8 @@ class PageScene:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
-        """Return the 3D scene's part of a frame, at the last row.
-
-        "moves": {"poses": {path: 4x4 matrix by columns}, "sizes": {path: [x, y, z]}}.
+        """Return the poses (4x4 matrices by columns) and sizes of the objects at the last row, by
+        path.
         """
         moves = {} if self.failure else self._moves(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}

@@ -42,11 +42,7 @@ def made_by(scenario: Scenario) -> dict[str, str]:
 
 
 class Record:
-    """Writer of scenario, load and inputs of a live session into a folder.
-
-    Raises:
-        CannotWrite: if the folder contains a record, or the disk is full.
-    """
+    """Writer of scenario, load and inputs of a live session into a folder."""
 
     def __init__(
         self,
@@ -117,11 +113,6 @@ class LogBeside(LogOnDisk):
         self._writing: Future[None] = self._thread.submit(_import_polars)
 
     def finish(self) -> None:
-        """Wait until all rows are on the disk.
-
-        Raises:
-            DrakeTeleopError: if writing fails.
-        """
         self._writing.result()
 
     def _write(self, part: SimulationResult) -> None:

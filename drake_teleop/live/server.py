@@ -130,11 +130,7 @@ class LiveDrive:
         self._check()
 
     def until_signal(self) -> str:
-        """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`.
-
-        Raises:
-            DrakeTeleopError: if the record is incomplete.
-        """
+        """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`."""
         try:
             self.wait()
             return "stop"
@@ -409,11 +405,7 @@ def drive(
 def drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
-    """Run `drake-teleop drive` until Ctrl-C or SIGTERM.
-
-    Raises:
-        DrakeTeleopError: as `drive`, or for a stopped simulation or incomplete record.
-    """
+    """Run `drake-teleop drive` until Ctrl-C or SIGTERM."""
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
     reason = live.until_signal()

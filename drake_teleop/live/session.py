@@ -168,8 +168,6 @@ class Session:
     """Simulated station whose hand follows inputs.
 
     Attributes:
-        scenario: initial scenario.
-        inputs: present inputs.
         ms: simulated time [ms].
 
     Args:
@@ -249,7 +247,6 @@ class Session:
         return self.ms < self._filled_at_ms
 
     def advance(self, ms: int = SLICE_MS) -> None:
-        """Simulate the next `ms` milliseconds."""
         end = self.ms + ms
         if self.ms < self._filled_at_ms <= end:
             self._advance_to(self._filled_at_ms)
@@ -352,9 +349,7 @@ class Drive:
     ) -> SimulationResult:
         """Simulate the session again and return its log, equal bit by bit.
 
-        Args:
-            log: folder of the log; None for memory.
-            slice_ms: longest step between changes [ms].
+        `log` is the folder of the log, or None for memory; `slice_ms` the longest step [ms].
         """
         session = Session(self.scenario, self.load, log=log, device=self.device)
         end = self.changes[-1][0]
@@ -368,11 +363,7 @@ class Drive:
 
 
 def read_drive(folder: str | Path) -> Drive:
-    """Return the recorded live session in a folder.
-
-    Raises:
-        DrakeTeleopError: for an invalid file.
-    """
+    """Return the recorded live session in a folder."""
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO)
     changes = read_inputs(folder / INPUTS, made_by(scenario))

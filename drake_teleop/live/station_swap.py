@@ -35,9 +35,7 @@ def copy_state(
 ) -> None:
     """Copy time, states and changeable parameters of the station `before` to `station`.
 
-    Args:
-        then, context: contexts of `before` and of `station`.
-        excluded: names of blocks that are not copied.
+    `then` and `context` are their contexts; blocks named in `excluded` are not copied.
     """
     context.SetTime(then.get_time())
     sources = dict(_blocks(before))

@@ -1,7 +1,4 @@
-"""Simulated haptic device in a simulated hand, for tests and for trying a link.
-
-m x'' = f - b x' + k (x_hand - x) + d (x_hand' - x'), with the force f of the last tick.
-"""
+"""Simulated haptic device in a simulated hand, for tests and for trying a link."""
 
 from __future__ import annotations
 

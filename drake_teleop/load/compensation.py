@@ -4,8 +4,7 @@
     F'  = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj)      (T7)
 
 F is the measured wrench, F_o the sensor offsets, V phi the wrench of weight and inertia. Wrenches
-act on the load, about the sensor origin So, in S. V(a - g) = V(-g) + V(a) is linear in the specific
-force, so weight and inertia can have different scales sigma.
+act on the load, about the sensor origin So, in S.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def wrench_of_scales(
 def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
     """Return force and torque of V(-g) (excess_gripper phi_gripper + excess_object phi_object).
 
-    They are added to `wrench_of_scales` for shares of the weight that exceed those of the inertia.
+    They complete `wrench_of_scales` if the scale of the weight exceeds that of the inertia.
     """
     a, b = excess_gripper, excess_object
     up = times(-1.0, three(gravity, 0))
@@ -60,10 +59,6 @@ def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_ob
 def scaled_wrench_into(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
-    """Write F' (6,) of `scaled_wrench` into out, for one sample.
-
-    For sigma = gamma the result does not depend on errors of the load parameters.
-    """
     force, torque = wrench_of_scales(
         wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
     )
@@ -73,7 +68,6 @@ def scaled_wrench_into(
 
 @njit(cache=True)
 def add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    """Add the result of `weight_of_scales` to out (6,), for one sample."""
     force, torque = weight_of_scales(
         gravity, phi_gripper, phi_object, excess_gripper, excess_object
     )
@@ -184,19 +178,16 @@ def weight_and_inertia_scales(
 
 
 def unknown_gravity(where: str, remedy: str) -> DrakeTeleopError:
-    """Return the error for different scales of weight and inertia without known gravity."""
     return DrakeTeleopError(
         "is unknown, and sigma_weight differs from sigma_inertia", where=where, remedy=remedy
     )
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return sigma_gripper, sigma_object, gamma = 0, eta, 1 for `scaled_wrench`, Eq. (14).
+    """Return the scales sigma_gripper, sigma_object, gamma = 0, eta, 1 of `scaled_wrench`, Eq.
+    (14).
 
     They remove the gripper and keep the share eta of the object.
-
-    Raises:
-        DrakeTeleopError: if eta is outside [0, 1].
     """
     if not 0.0 <= number("eta", eta) <= 1.0:
         raise DrakeTeleopError(

@@ -1,7 +1,4 @@
-"""Identified load of a sensor, and the load of a gripped object as a difference.
-
-Parameters without excitation are undetermined: variance inf.
-"""
+"""Identified load of a sensor, and the load of a gripped object as a difference."""
 
 from __future__ import annotations
 
@@ -241,9 +238,8 @@ def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -
 
 
 def com_deviations(phi: Array, covariance: Array) -> Array:
-    """Return standard deviations (3,) of the centre of mass [m] for a load phi (10,).
-
-    `covariance` (16, 16) is that of [offsets; phi].
+    """Return standard deviations (3,) of the centre of mass [m]; `covariance` is of [offsets;
+    phi].
     """
     mass, com, _ = mass_com_inertia(phi)
     change = np.column_stack([-com, np.eye(3)]) / mass
@@ -261,8 +257,7 @@ def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
 def natural_scale(phi: Array) -> Array:
     """Return the typical size (16,) of each of [offsets; phi], to judge its standard deviation.
 
-    For mass m and size L = max(|c|, 3 cm) they are m g, m g L, m, m L and m L^2 / 3. The mass must
-    not be zero.
+    For mass m and size L = max(|c|, 3 cm) they are m g, m g L, m, m L and m L^2 / 3.
     """
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
@@ -342,8 +337,6 @@ _IS_PHI = np.arange(16) >= 6
 def identified_object(total: Identification, gripper: Identification) -> Identification:
     """Return the object's load: that of gripper with object (`total`) minus that of `gripper`.
 
-    Covariances of phi add. Other fields are those of `total`.
-
     Raises:
         DrakeTeleopError: if the object's mass is zero, or negative by more than 3 standard
             deviations.
@@ -384,10 +377,10 @@ def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return the smallest eigenvalue of the normalised pseudo-inertia, and its deviation, Eq. (T9).
+    """Return the smallest eigenvalue of the normalised pseudo-inertia, and its deviation, Eq.
+    (T9).
 
-    It is positive for a load that a rigid body can have. The deviation is inf for undetermined
-    loads.
+    It is positive for a load that a rigid body can have.
     """
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))

@@ -1,7 +1,7 @@
 """Inertial parameters phi of a rigid load: conversions, frames and physical consistency.
 
-phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], with mass m, centre of
-mass c, and inertia about the frame's origin. Pseudo-inertia: Wensing, Kim, Slotine, RA-L 2018.
+phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], with mass m, centre
+of mass c, and inertia about the frame's origin.
 """
 
 from __future__ import annotations
@@ -25,13 +25,7 @@ def _point_inertia(about: Array, mass: float) -> Array:
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:
     """Return the load phi (10,) about the sensor origin So, in S.
 
-    Args:
-        mass: [kg].
-        p_SoBcm_S: (3,) centre of mass from So, in S [m].
-        I_BBcm_S: (3, 3) inertia about the centre of mass, axes of S [kg m^2].
-
-    Raises:
-        DrakeTeleopError: for an asymmetric tensor.
+    The inertia I_BBcm_S (3, 3) [kg m^2] is about the centre of mass.
     """
     m = float(checked("mass", mass))
     p = checked("p_SoBcm_S", p_SoBcm_S, 3)
@@ -87,7 +81,6 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 
 
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
-    """Return the load phi (10,) with this pseudo-inertia J (4, 4)."""
     J = checked("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
         raise DrakeTeleopError(
@@ -101,11 +94,8 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     """Return whether a rigid body can have the parameters phi (10,), Eq. (T1).
 
-    Points, rods, plates and phi = 0 are consistent.
-
-    Args:
-        tolerance: accepted negative eigenvalue of the pseudo-inertia, normalised by mass and radius
-            of gyration.
+    Points, rods and plates are consistent. `tolerance` is the accepted negative eigenvalue of the
+    pseudo-inertia, normalised by mass and radius of gyration.
     """
     J = pseudo_inertia(phi)
     if not J.any():
@@ -121,15 +111,9 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:
-    """Return the load (10,) about Ao in frame A, given that about Bo in frame B, Eq. (T2).
+    """Return the load (10,) about Ao in frame A, from the load about Bo in frame B, Eq. (T2).
 
-    Args:
-        phi_B: (10,) load about Bo in B.
-        R_AB: (3, 3) rotation, v_A = R_AB v_B.
-        p_AoBo_A: (3,) position of Bo from Ao, in A [m].
-
-    Raises:
-        DrakeTeleopError: if R_AB is not a rotation.
+    R_AB rotates vectors from B to A.
     """
     R = checked("R_AB", R_AB, 3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:

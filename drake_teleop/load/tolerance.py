@@ -42,7 +42,6 @@ class Tolerance(NamedTuple):
 
     @property
     def required(self) -> tuple[str, ...]:
-        """Names of the quantities with a requirement, out of "mass", "com", "inertia"."""
         return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
 
     @property
@@ -51,7 +50,6 @@ class Tolerance(NamedTuple):
         return tuple(entry for name in self.required for entry in ENTRIES[name])
 
     def __str__(self) -> str:
-        """Return the tolerance as text for `read_tolerance`."""
         return ", ".join(
             f"com {1e3 * value:g} mm" if name == "com" else f"{name} {100.0 * value:g} %"
             for name, value in zip(QUANTITIES, self, strict=True)
@@ -90,7 +88,9 @@ def read_tolerance(text: str) -> Tolerance:
 
 
 def errors_of(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of the required numbers by [offsets; phi], over the tolerances."""
+    """Return derivatives (k, 16) of the required numbers by [offsets; phi], divided by the
+    tolerances.
+    """
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -113,10 +113,9 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_of(errors: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of the required numbers, over the tolerances.
+    """Return standard deviations (k,) of the required numbers, divided by the tolerances.
 
-    They are inf if undetermined. `errors` is from `errors_of`, `covariance` (16, 16) of [offsets;
-    phi].
+    `errors` is from `errors_of`, `covariance` (16, 16) of [offsets; phi].
     """
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)

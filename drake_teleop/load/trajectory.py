@@ -39,10 +39,8 @@ class FourierTrajectory:
     ) -> FourierTrajectory:
         """Return a trajectory without velocity and acceleration at both ends, Eq. (T17).
 
-        Args:
-            q0: (n,) constant part [rad]; the trajectory starts at q0 + sum(delta).
-            sine, cosine: (n, N - 1) free coefficients [rad]; harmonic k is scaled by 1/k.
-            frequency: base frequency [Hz].
+        Harmonic k of `sine` and `cosine` (n, N - 1) [rad] is divided by k. The trajectory starts
+        at q0 + sum(delta).
         """
         sine, cosine = np.asarray(sine, float), np.asarray(cosine, float)
         rest_rho, rest_delta = _rest_bases(sine.shape[-1] + 1)
@@ -50,7 +48,6 @@ class FourierTrajectory:
 
     @property
     def period(self) -> float:
-        """Period [s]."""
         return 1.0 / self.frequency
 
     def evaluate(self, t: ArrayLike) -> tuple[Array, Array, Array]:
@@ -81,11 +78,7 @@ class FourierTrajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:
-        """Read the YAML file of `save`.
-
-        Raises:
-            DrakeTeleopError: naming the file, if the content is not a trajectory.
-        """
+        """Read the YAML file of `save`."""
         from drake_teleop.common.texts import read_yaml
 
         data = read_yaml(path)

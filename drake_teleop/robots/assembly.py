@@ -1,4 +1,4 @@
-"""Readings that combine the wrench of one stream with the motion of another (docs/robot.md)."""
+"""Readings that combine the wrench of one stream with the motion of another."""
 
 from __future__ import annotations
 
@@ -135,9 +135,8 @@ _PERIOD_SAMPLES = 20  # for the median period of the motion
 class Parts:
     """One source of wrenches and motions, made of one or two sources of parts (single samples).
 
-    Attributes:
-        motion_stream: stream of the motion: poses if available, else an IMU.
-        two_clocks: whether wrench and motion have different clocks.
+    `motion_stream` is the stream of poses if available, else that of an IMU; `two_clocks` is True
+    if wrench and motion have different clocks.
     """
 
     live = True
@@ -168,7 +167,6 @@ class Parts:
         return found + [(part, now) for part in parts if alone or part.stream == WRENCH]
 
     def close(self) -> None:
-        """See `Source`."""
         self._wrench.close()
         if self._motion is not None:
             self._motion.close()
@@ -194,7 +192,6 @@ class PosedByJoints:
         self.streams: tuple[str, ...] = (*others, POSE)
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
         parts = self._source.read(timeout_s)
         if parts is None:
             return None
@@ -209,12 +206,12 @@ class PosedByJoints:
         return part._replace(stream=POSE, values=values)
 
     def close(self) -> None:
-        """See `PartSource`."""
         self._source.close()
 
 
 class MotionWindow:
-    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or IMU samples.
+    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or IMU
+    samples.
 
     Args:
         cutoff_hz: cut-off of the smoothing; None for the shortest window.
@@ -230,7 +227,6 @@ class MotionWindow:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all samples."""
         self._last: tuple[float, Array] | None = None
         self._next_t, self._rows = 0.0, deque[Array](maxlen=self._size)
         self._arrival = -math.inf
@@ -320,8 +316,8 @@ class Assembly:
         delay_s: delay of the motion's time stamps behind the wrench's [s].
         track: load for tracking this delay; None for a constant delay.
         X_FS: (7,) pose of the sensor in the frame F of the poses, [w x y z, position].
-        weight_removed: the robot has removed the weight from the wrench. Readings contain the
-            acceleration instead of the specific force; an IMU raises DrakeTeleopError.
+        weight_removed: True if the robot has removed the weight from the wrench; readings then
+            contain the acceleration instead of the specific force.
 
     Attributes:
         lag_s: delay of the readings [s].
@@ -355,11 +351,9 @@ class Assembly:
 
     @property
     def delay_s(self) -> float:
-        """Present delay of the motion behind the wrench [s]."""
         return self._delay if self._tracker is None else self._tracker.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """See `Source`."""
         arrived = self._parts.read(timeout_s)
         if arrived is None:
             return None
@@ -413,5 +407,4 @@ class Assembly:
         return Reading(part.number, part.t, values, flags, motion[9:] if len(motion) > 9 else None)
 
     def close(self) -> None:
-        """See `Source`."""
         self._parts.close()

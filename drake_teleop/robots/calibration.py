@@ -1,4 +1,4 @@
-"""Load identification from a stream until the tolerances are met (docs/robot.md)."""
+"""Load identification from a stream until the tolerances are met."""
 
 from __future__ import annotations
 
@@ -83,9 +83,8 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> Evaluation:
-    """Identify the record at `path` and return the result; `previous` is the previous one.
-
-    `cutoff_hz` and `delay`: see `identify_log`.
+    """Identify the load of a record and judge it against the tolerance and the previous
+    evaluation.
     """
     count, found, why = len(tolerance.entries), None, ""
     try:
@@ -119,9 +118,8 @@ def evaluate_record(
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return interval half-widths over the tolerances, and degrees of freedom, (k,) each.
-
-    The levels are 95 % (first) and `CONFIDENCE` (second).
+    """Return half-widths of the 95 % and `CONFIDENCE` intervals over the tolerances, and degrees
+    of freedom.
     """
     load = found.identification
     errors = errors_of(tolerance, load.phi)
@@ -213,14 +211,8 @@ def calibrate(
 ) -> list[Evaluation]:
     """Record a stream until the tolerance is met, the source ends or the time is over.
 
-    Args:
-        path: file of the record; the last result refers to it.
-        cutoff_hz, delay: see `identify_log`.
-        seconds: maximum length of the record.
-        show: callback for each result.
-
-    Returns:
-        All intermediate results.
+    The last of the returned evaluations refers to the record at `path`; `seconds` is its maximum
+    length, and `show` receives each evaluation.
 
     Raises:
         DrakeTeleopError: if there are too few samples, or the record cannot be written.

@@ -36,7 +36,7 @@ class Control:
         self.port = self._socket.getsockname()[1]
 
     def answer(self, tare: Callable[[], str]) -> None:
-        """Answer a waiting request, if any: call `tare` and send its result."""
+        """Answer a waiting request, if any, by the result of `tare`."""
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"
@@ -47,7 +47,6 @@ class Control:
             pass
 
     def close(self) -> None:
-        """Close the port."""
         self._socket.close()
 
 
@@ -61,14 +60,11 @@ def run(
     changes: Changes | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate readings until the source ends, or Ctrl-C.
+    """Compensate readings until the source ends, or Ctrl-C; return the number of wrenches and of
+    flags.
 
-    Args:
-        tare: tare once, after `TARE_S` of valid readings.
-        report: callback for a tare, and the first fault of each kind.
-
-    Returns:
-        The number of wrenches, under "wrenches", and the number with each flag.
+    `tare` tares once, after `TARE_S` of valid readings; `report` receives the result of a tare,
+    and the first fault of each kind.
     """
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_S / source.dt)
@@ -128,10 +124,9 @@ def compensate_command(
     """Run the command `compensate`; messages go to stderr.
 
     Args:
-        sigma, gamma, sigma_weight, sigma_inertia, cutoff_hz, predicted: see `Compensator`.
         largest: range of the sensor: force [N], torque [N m].
-        free: log of free motion, see `Detector`.
-        control: UDP port of `Control`.
+        free: log of free motion, for contact detection.
+        control: UDP port that accepts the request `tare`.
         attach: function from a maker of compensators to an object that is used as a compensator.
         stream: options of `open_source`.
     """

@@ -17,12 +17,9 @@ _MAX_REST_FORCE, _MAX_REST_RATE = 0.1, 0.02  # rms at rest [m/s^2], [rad/s]
 
 @njit(cache=True)
 def value_problem(values, largest, limits):
-    """Return 0 for valid values, else `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`.
+    """Return 0 for a valid reading (15,), else `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`.
 
-    Args:
-        values: (15,) reading.
-        largest: (15,) maximum valid magnitudes.
-        limits: (6,) range of the sensor.
+    `largest` (15,) are maximum valid magnitudes, `limits` (6,) the range of the sensor.
     """
     for i in range(15):
         if not math.isfinite(values[i]):
@@ -38,12 +35,10 @@ def value_problem(values, largest, limits):
 
 @njit(cache=True)
 def low_pass_into(x, low_pass, memory):
-    """Filter a sample in place, by a second-order low-pass as in `scipy.signal.lfilter`.
+    """Filter a sample (n,) in place, by a second-order low-pass as in `scipy.signal.lfilter`.
 
-    Args:
-        x: (n,) sample.
-        low_pass: (7,) coefficients b, a_1, a_2 and the steady-state memory at input 1.
-        memory: (2, n) filter memory; NaN starts in the steady state.
+    `low_pass` (7,) contains b, a_1, a_2 and the steady-state memory at input 1; `memory` (2, n)
+    with NaN starts in the steady state.
     """
     start = math.isnan(memory[0, 0])
     for i in range(len(x)):
@@ -63,9 +58,8 @@ def eliminate_into(values, gravity, offsets, phi, nothing, scales, low_pass, mem
     Args:
         values: (15,) reading.
         gravity: (3,) gravity in S, used only for different scales of weight and inertia.
-        offsets: (6,) sensor offsets.
         phi, nothing: (10,) the load, and zeros.
-        scales: (4,) see `scaled_wrench_into`; then scale of the weight minus that of the inertia.
+        scales: (4,) from `scales_into`.
         low_pass, memory: see `low_pass_into`; low_pass may be empty.
         rest: (rows, 21); row `at` receives the reading and its unfiltered contact wrench.
     """
@@ -91,10 +85,7 @@ def scales_into(sigma_weight, sigma_inertia, gamma, scales):
 
 @njit(cache=True)
 def add_to_statistics(row, count, mean, squares):
-    """Add a row to the mean and the sum of squared deviations of `count` rows with it.
-
-    The update is that of Welford (1962). `row`, `mean` and `squares` have one size.
-    """
+    """Add a row to the mean and the sum of squared deviations of `count` rows (Welford 1962)."""
     for i in range(len(row)):
         step = row[i] - mean[i]
         mean[i] += step / count
@@ -105,10 +96,8 @@ def add_to_statistics(row, count, mean, squares):
 def tare_into(count, mean, squares, noise_limits, offsets):
     """Add the mean contact wrench to the offsets (6,); return 0, or the reason of a refusal.
 
-    Args:
-        count: number of rows.
-        mean, squares: (21,) statistics of reading and unfiltered contact wrench.
-        noise_limits: (6,) maximum standard deviations of the contact wrench.
+    `mean` and `squares` (21,) are statistics of `count` readings with their contact wrench;
+    `noise_limits` (6,) are its maximum standard deviations.
     """
     for i in range(6, 9):
         if squares[i] > count * (_MAX_REST_FORCE * _MAX_REST_FORCE):

@@ -1,8 +1,6 @@
 """Contact wrench of each reading; a flagged zero wrench for each invalid reading.
 
-Results are bit-equal to `eliminate --causal`. After `STALE_S` without a valid reading the low-pass
-restarts in its steady state. A reading's age is the excess of (our clock - source's clock) over its
-minimum, which rises by `CLOCK_DRIFT`.
+Results are bit-equal to `eliminate --causal`.
 """
 
 from __future__ import annotations
@@ -178,7 +176,6 @@ class Compensator:
     def set_scales(
         self, sigma: float, gamma: float, sigma_weight: float | None, sigma_inertia: float | None
     ) -> None:
-        """Set the scales from the next reading on; raise DrakeTeleopError if they are unusable."""
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:

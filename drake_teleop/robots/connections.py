@@ -46,7 +46,7 @@ def open_source(
 
     Args:
         load: identified load, for the delay and for `weight_removed`.
-        rate_hz: rate of the wrenches; logs, UR robots and NetBoxes deliver their own.
+        rate_hz: rate of the wrenches, if the source does not deliver its own.
         cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live parts.
         real_time: replay a log in real time.
         motion: address of a second source, for the motion.
@@ -94,10 +94,9 @@ def open_recording(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> tuple[Source[Any], Records[Any]]:
-    """Return the stream that `calibrate` reads, and its recorder.
+    """Return the stream that `calibrate` reads, and its recorder; arguments as for `open_source`.
 
-    Args:
-        largest: (6,) range of the sensor [N, N m]; the others: see `open_source`.
+    `largest` (6,) is the range of the sensor [N, N m].
     """
     kind = _kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
@@ -115,7 +114,6 @@ def is_file(address: str) -> bool:
 
 
 def open_sink(address: str) -> Sink:
-    """Return the sink at an address; raise DrakeTeleopError if it is invalid."""
     kind = _kind(address) or Path(address).suffix
     if kind not in SINKS:
         remedy = f"give {_forms(SINKS)}"

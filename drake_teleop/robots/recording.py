@@ -109,11 +109,9 @@ class Recorder(Records[Reading]):
         super().__init__({WRENCH: largest})
 
     def add(self, sample: Reading) -> None:
-        """See `Records`."""
         self._add(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
-        """See `Records`."""
         t, values = self._longest_part()[WRENCH].table(VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
@@ -135,7 +133,6 @@ class PartRecorder(Records[tuple[Part, float]]):
         self._p_FS = X_FS[4:]
 
     def add(self, sample: tuple[Part, float]) -> None:
-        """See `Records`."""
         part, now = sample
         if part.stream not in self._part:
             return
@@ -146,7 +143,6 @@ class PartRecorder(Records[tuple[Part, float]]):
         self._add(part.stream, part.t, part.values, flags, now)
 
     def write(self, path: Path) -> None:
-        """See `Records`."""
         import polars as pl
 
         wrench, motion = (self._longest_part()[stream] for stream in (WRENCH, self._motion_stream))

@@ -171,12 +171,8 @@ def ros2_command(
 ) -> None:
     """Run the command `ros2` until SIGINT or SIGTERM; `options` are those of `compensate_command`.
 
-    Args:
-        out: folder of the calibrations.
-        calibrate: function from tolerance and seconds [s] to the arguments of `calibrate`.
-
-    Raises:
-        DrakeTeleopError: if an argument is invalid, or rclpy is missing.
+    `calibrate` maps tolerance and seconds to the arguments of the command `calibrate`, whose
+    results are written to `out`.
     """
     for address in (source, sink):
         if not address.startswith("ros2://"):

@@ -34,7 +34,6 @@ def read(host: str, pipe: int) -> None:
 
 
 def main() -> None:
-    """Run `read` with the command-line arguments host and file descriptor."""
     try:
         read(sys.argv[1], int(sys.argv[2]))
     finally:

@@ -1,7 +1,5 @@
-"""Detection of contact or of another load, sample by sample, for `compensate --watch`.
-
-With `--free LOG`, contact is detected as by `detect`, with a noise floor fitted to a log of free
-motion.
+"""Detection of contact or of another load, sample by sample, for `compensate --watch` and
+`--free`.
 """
 
 from __future__ import annotations
@@ -42,9 +40,8 @@ _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual.
-
-    `dt`: period of the readings [s]; `cutoff_hz`: low-pass of the residual of `load`.
+    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual of
+    `load`.
     """
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
@@ -88,11 +85,9 @@ _RATE_TOLERANCE = 0.05
 
 
 class Detector:
-    """Contact detector with the noise floor of a log after the causal low-pass.
+    """Contact detector with the noise floor of a log of free motion, after the causal low-pass.
 
-    Args:
-        free: log of free motion of the load, at the rate of the stream.
-        delay: delay of the log, see `eliminate_log`.
+    The log `free` must have the rate of the stream.
     """
 
     def __init__(
@@ -153,7 +148,7 @@ class Detector:
     def flags(self, values: Array, contact: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a valid reading (15,).
 
-        `contact` (6,): its low-passed contact wrench [N, N m].
+        `contact` (6,) is its low-passed contact wrench [N, N m].
         """
         touched = _detect(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings

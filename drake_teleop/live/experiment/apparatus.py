@@ -1,8 +1,4 @@
-"""Station and stimulus of an experiment's task under a condition.
-
-To render a force F, gamma is scaled by F over the contact force; the other interval has gamma = 0.
-A mass at the hand increases sigma, or eta for a held object.
-"""
+"""Station and stimulus of an experiment's task under a condition."""
 
 from __future__ import annotations
 
@@ -45,11 +41,7 @@ def load_for(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task under a condition.
-
-    Attributes:
-        mass: mass of the load, or of the held object, at the hand's scale [kg].
-    """
+    """Station of a task under a condition; `mass` is that of the load at the hand's scale [kg]."""
 
     task: Task
     condition: Condition
@@ -93,11 +85,6 @@ class Apparatus:
 def make_apparatus(
     task: Task, condition: Condition, scenario: Scenario, load: IdentifiedLoad | None
 ) -> Apparatus:
-    """Return the station of a task under a condition.
-
-    Raises:
-        DrakeTeleopError: if no such station is possible.
-    """
     setup = live_scenario(scenario)
     changes: dict[str, object] = {}
     if condition.delay is not None:
@@ -140,7 +127,6 @@ class IntervalLog:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """Add the newest rows of the log: signal name -> values."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])

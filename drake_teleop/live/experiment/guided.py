@@ -1,7 +1,4 @@
-"""Event handler for an experiment of one participant, in place of `Live`.
-
-Each interval is a recorded `Live`; the page receives only the rendered force.
-"""
+"""Event handler for an experiment of one participant, in place of `Live`."""
 
 from __future__ import annotations
 
@@ -46,9 +43,7 @@ def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 class Guided:
     """Event handler of an experiment, with the interface of `Live`; times `now` in s.
 
-    Attributes:
-        refused: number of invalid messages.
-        requested_scene: always "".
+    Each interval is a recorded live session; the page receives only the rendered force.
     """
 
     def __init__(
@@ -187,11 +182,7 @@ class Guided:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate the due slices of time; return a frame for the pages if one is due.
-
-        Raises:
-            CannotWrite: if the disk is full.
-        """
+        """Simulate the due slices of time; return a frame for the pages if one is due."""
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
@@ -221,7 +212,6 @@ class Guided:
         self._prepare_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
-        """Return the present frame for pages."""
         inner = self._live.frame()
         rendered = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
         task = self._procedure.task
@@ -244,7 +234,6 @@ class Guided:
         }
 
     def close(self) -> None:
-        """End the session and close the device link."""
         self._live.close()
         if self._link is not None:
             self._link.close()

@@ -20,11 +20,10 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
 
 @dataclass(frozen=True)
 class Trial:
-    """Planned trial.
+    """Planned trial: indices of its task and condition, and the interval with the stimulus, 1 or
+    2.
 
-    Attributes:
-        task, condition: index in the experiment.
-        signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
+    For the peg in a slot, `signal` is 0.
     """
 
     task: int
@@ -55,7 +54,6 @@ class IntervalResult:
 
 
 def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
-    """Return all trials of a participant, in order."""
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -103,17 +101,14 @@ class Procedure:
 
     @property
     def number(self) -> int:
-        """Number of the trial, from 0."""
         return len(self._rows)
 
     @property
     def trial(self) -> Trial:
-        """Present or next trial."""
         return self.trials[min(self.number, len(self.trials) - 1)]
 
     @property
     def task(self) -> Task:
-        """Task of the present trial."""
         return self.experiment.tasks[self.trial.task]
 
     @property
@@ -163,11 +158,9 @@ class Procedure:
             self.phase = ANSWER
 
     def start_second_interval(self) -> None:
-        """Start the trial's second interval."""
         self.phase = INTERVAL
 
     def restart_trial(self) -> None:
-        """Restart the trial after the page that drives has left."""
         if self.phase in (INTERVAL, GAP, ANSWER):
             self._new_trial()
             self.phase = READY

@@ -1,7 +1,6 @@
 """Thresholds, d', times and forces of an experiment with 95 % intervals.
 
-Threshold and d' (at the middle level) of a participant are posterior medians (`Psi`), times and
-forces geometric means. Participant 0 is the (geometric) mean of all, with its t interval.
+Threshold and d' of a participant are posterior medians, times and forces geometric means.
 """
 
 from __future__ import annotations
@@ -47,7 +46,6 @@ class Result(NamedTuple):
 
 
 def results(experiment: Experiment, store: Store) -> list[Result]:
-    """Return all rows of the result table."""
     found = []
     known = {n: [row for row in store.rows(n) if not row.practice] for n in store.participants()}
     for task in experiment.tasks:

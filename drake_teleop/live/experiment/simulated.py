@@ -1,8 +1,4 @@
-"""Simulated participants: an observer with noise compares rendered forces.
-
-A scripted hand presses down and up, or moves back and forth. The answer is the interval with the
-larger response: largest change of the rendered force plus normal noise.
-"""
+"""Simulated participants: an observer with noise compares rendered forces of a scripted hand."""
 
 from __future__ import annotations
 

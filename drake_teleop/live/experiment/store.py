@@ -56,12 +56,11 @@ _SCHEMA: dict[str, type[pl.DataType]] = {
 
 @dataclass(frozen=True)
 class Store:
-    """Stored trials in a folder."""
+    """Trials of an experiment on disk, in one folder."""
 
     folder: Path
 
     def path(self, participant: int) -> Path:
-        """Return the file of a participant."""
         return self.folder / "participants" / f"{participant:02}.csv"
 
     def participants(self) -> list[int]:
@@ -70,11 +69,7 @@ class Store:
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
     def rows(self, participant: int) -> list[Row]:
-        """Return a participant's finished trials.
-
-        Raises:
-            DrakeTeleopError: if the file is damaged.
-        """
+        """Return a participant's finished trials."""
         path = self.path(participant)
         if not path.exists():
             return []
@@ -90,7 +85,6 @@ class Store:
         return rows
 
     def write(self, participant: int, rows: list[Row]) -> None:
-        """Replace all stored trials of a participant."""
         make_folder(self.path(participant).parent)
         table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_SCHEMA)
         write_table(self.path(participant), table)

@@ -2,13 +2,11 @@
 
 | name | method |
 |---|---|
-| `ordinary` | least squares, equal weights, Eqs. (7)-(8) |
-| `whitened` | rows divided by each channel's noise, specified or estimated |
-| `total` | `whitened`, with noise in the motion |
-| `robust` | `total` without impacts and short contacts |
+| `ordinary` | least squares with equal weights, Eqs. (7)-(8) |
+| `whitened` | least squares, weighted by the noise of each wrench channel |
+| `total` | `whitened`, which also allows for noise of the motion |
+| `robust` | `total` without samples of impacts and short contacts |
 | `consistent` | `robust`, limited to loads that a rigid body can have; default |
-
-Details: docs/theory.md, "Details of the estimators".
 """
 
 from __future__ import annotations
@@ -75,7 +73,7 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
         rejected: (N,) True for rejected samples.
         note: warning for the user, or "".
-        equations: sums of the used samples.
+        equations: least squares sums of the used samples.
     """
 
     identification: Identification
@@ -197,13 +195,12 @@ def identify_batch(
 
     Args:
         wrench, s, omega, alpha, delay_s: as for `normal_equations.identify`, in the order of time.
-        method: "ordinary", "whitened", "total", "robust", "consistent" or a registered name.
-        noise: of wrench and motion; None: estimated wrench noise, exact motion.
+        noise: noise of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
         shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
         resolution: (2,) quantisation step of forces and torques [N, N m], with `shared_noise` only.
         prior, ellipsoid: only for "consistent".
-        gain_std: standard deviation of the sensor's 36 gains (relative).
+        gain_std: relative standard deviation of the sensor's 36 gains.
 
     Raises:
         DrakeTeleopError: for unsuitable options, fewer than 3 samples, or a zero wrench.

@@ -1,15 +1,13 @@
-"""Contact detection in a wrench from which the load's wrench is removed, sample by sample.
+"""Contact detection, sample by sample, in a wrench from which the load's wrench is removed.
 
-A statistic of the normalised wrench z and its innovations e (see `noise_floor`) reaches a threshold
-when contact begins::
+Contact begins when a statistic reaches a threshold. The statistics are functions of the wrench z
+in standard deviations of its noise, and of its unpredictable part e::
 
     level    |z|; its square is chi-squared with six degrees of freedom
     cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics
              30, 1988)
     glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)), n = 1, 2, 4 ... `WINDOW`:
              generalised likelihood ratio (Lorden 1971; Willsky and Jones 1976)
-
-Contact ends after `hold` samples with a level below `leave`; then the sums restart.
 """
 
 from __future__ import annotations
@@ -57,7 +55,7 @@ LEAVE = 0.7 * RARE
 def detection_update(
     memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
 ):
-    """Process one sample and write the `STATISTICS` to memory[5:8].
+    """Process one sample and write the three statistics to memory[5:8].
 
     Args:
         memory: (SIZE,), zeros before the first sample.
@@ -128,10 +126,7 @@ def _statistics(rows, parameters, slack, following, quiet, out):
 def statistics(
     floor: NoiseFloor, *samples: ArrayLike, slack: float = SLACK, following: float = 0.0
 ) -> Array:
-    """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations.
-
-    `slack` and `following` are as for `ContactDetector`.
-    """
+    """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations."""
     rows = checked_samples(*samples)
     out = np.empty((len(rows[0]), 3))
     sums = float(positive("slack", slack)), float(following), LEAVE
@@ -157,11 +152,7 @@ def _last_sum(memory, hold, widths):
 def hysteresis_update(memory, statistic, enter, leave, hold, widths):
     """Return whether there is contact, after `detection_update` of the same memory.
 
-    Args:
-        statistic: index into `STATISTICS`.
-        enter: threshold of this statistic at which contact begins.
-        leave, hold: contact ends after `hold` samples with a level below `leave`.
-        widths: `NoiseFloor.widths`.
+    `statistic` is an index into `STATISTICS`; `widths` is `NoiseFloor.widths`.
     """
     if memory[FLAG] == 0.0:
         if memory[FIRST_STATISTIC + statistic] >= enter:
@@ -178,9 +169,8 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 @njit(cache=True)
 def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Process one sample and return whether there is contact.
-
-    The last two arguments are `ContactDetector.settings`.
+    """Process one sample and return whether there is contact; `decision` is
+    `ContactDetector.settings`.
     """
     slack, following, statistic, enter, leave, hold = decision
     detection_update(
@@ -201,7 +191,7 @@ class ContactDetector:
     """Contact detector with hysteresis for a stream of samples.
 
     Args:
-        threshold: of the statistic at which contact begins, such as `NoiseFloor.threshold`.
+        threshold: value of the statistic at which contact begins.
         statistic: "level", "cusum" or "glr".
         leave, hold: contact ends after `hold` samples with a level below `leave`.
         slack: slack of the cumulative sum [standard deviations].
@@ -236,7 +226,6 @@ class ContactDetector:
 
     @staticmethod
     def initial_memory() -> Array:
-        """Return the memory (SIZE,) before the first sample."""
         return np.zeros(SIZE)
 
     def update(self, *sample: ArrayLike) -> bool:
@@ -246,7 +235,7 @@ class ContactDetector:
         return bool(flag_update(self._memory, *arrays, *self.settings))
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
-        """Update by the N `Samples` of a log; return (N,) True for contact."""
+        """Process the N `Samples` of a log; return (N,) True for contact."""
         rows = checked_samples(*samples)
         out = np.empty(len(rows[0]), np.bool_)
         _flags(self._memory, tuple(rows), self.settings, out)
@@ -254,10 +243,10 @@ class ContactDetector:
 
 
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return the central axis of wrenches (..., 6) in S (Poinsot); NaN where the force is 0.
+    """Return direction, point and pitch [m] of the central axis of wrenches (..., 6) in S
+    (Poinsot).
 
-    Returns:
-        direction of the force (..., 3), point nearest to So (..., 3) [m], and pitch (...) [m].
+    The point (..., 3) is the nearest to So [m]. Wrenches without force give NaN.
     """
     w = checked("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
@@ -285,10 +274,7 @@ def fit_noise_floor(
 ) -> NoiseFloor:
     """Return the noise floor of a record of free motion; fast motion gives the best estimate.
 
-    Args:
-        contact, s, omega, alpha, acceleration: see `Samples`.
-        covariance: (16, 16) from `finite_covariance`.
-        fade: as in `NoiseFloor`.
+    `covariance` (16, 16) is from `finite_covariance`.
 
     Raises:
         DrakeTeleopError: for fewer than 100 samples.

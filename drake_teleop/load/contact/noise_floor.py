@@ -2,8 +2,8 @@
 
     sigma_c^2 = n_c^2 + (J P J^T)_cc + k_c^2 |a|^2 + l_c^2 |alpha|^2,    J = [E V]
 
-n is the noise at rest, P the covariance of [offsets; phi]; a, alpha are accelerations of S without
-gravity, whose peaks are held and fade. z is r / sigma, decorrelated between channels, with the
+n is the noise at rest, P the covariance of [offsets; phi]. The peaks of the accelerations a, alpha
+of S (without gravity) are held and fade. z is r / sigma, decorrelated between channels, with the
 innovations e_k = (z_k - rho z_{k-1}) / sqrt(1 - rho^2).
 """
 
@@ -63,7 +63,6 @@ class Samples(NamedTuple):
     acceleration: Array
 
     def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
-        """Return the samples in `rows`."""
         return Samples(*(x[rows] for x in self))
 
 
@@ -144,14 +143,15 @@ def _square(x):
 
 @njit(cache=True)
 def hold_peaks(memory, acceleration, alpha, fade):
-    """Update the held squared accelerations in a detector's memory."""
     memory[HELD_A] = max(_square(acceleration), fade * memory[HELD_A])
     memory[HELD_ALPHA] = max(_square(alpha), fade * memory[HELD_ALPHA])
 
 
 @njit(cache=True)
 def parameter_variance(s, omega, alpha, P, V, out):
-    """Write the variances (6,) due to uncertain [offsets; phi] into out; V (6, 10) is scratch."""
+    """Write the wrench variances (6,) due to uncertain [offsets; phi] into `out`; V (6, 10) is
+    scratch.
+    """
     regressor_into(s, omega, alpha, V)
     for c in range(6):
         value = P[c, c]
@@ -167,7 +167,7 @@ def parameter_variance(s, omega, alpha, P, V, out):
 
 @njit(cache=True)
 def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out):
-    """Write the noise sigma (N, 6) of a record's contact wrench into out."""
+    """Write the noise sigma (N, 6) of a record's contact wrench into `out`."""
     memory, V = np.zeros(3), np.empty((6, 10))
     for k in range(s.shape[0]):
         hold_peaks(memory, acceleration[k], alpha[k], fade)
@@ -184,9 +184,9 @@ def checked_samples(*arrays: ArrayLike) -> list[Array]:
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] with bounded standard deviations.
+    """Return the covariance (16, 16) of [offsets; phi] with standard deviations up to
+    `natural_scale`.
 
-    The bound is `natural_scale`.
     `tared` means that offsets are from the same record: their variance is 0.
     """
     P, natural = covariance.copy(), natural_scale(phi)

@@ -1,11 +1,9 @@
-"""Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24).
+"""Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24)::
 
-    known       the known load explains the mean wrench of blocks of `BLOCK` seconds
-    disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
-    changed     a new load has explained it for `HOLD` seconds
-    identified  mass and first moments of the new load are identified: it is now the known load
-
-Method: docs/theory.md, "Another load".
+known       the known load explains the mean wrench of blocks of `BLOCK` seconds
+disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
+changed     a new load has explained it for `HOLD` seconds
+identified  mass and first moments of the new load are identified: it is now the known load
 """
 
 from __future__ import annotations
@@ -75,7 +73,6 @@ def whitening(motion, phi, noise, model_var, n):
 
     Args:
         motion: (9,) mean [s, omega, alpha].
-        phi: (10,) load.
         noise: (15 or more,) long-run variances per sample of wrench and motion.
         model_var: squared relative model error.
         n: samples of the block.
@@ -207,11 +204,7 @@ def change_update(memory, sample, block, noise, window, hold, bound):
     Args:
         memory: from `change_memory`, updated.
         sample: (15 or more,) [wrench, s, omega, alpha].
-        block: samples of a block.
-        noise: (17,) long-run variances per sample of wrench (6) and motion (9), squared relative
-            model error, and its duration [blocks].
-        window, hold: durations `WINDOW` and `HOLD` [blocks].
-        bound: see `change_parameters`.
+        block, noise, window, hold, bound: from `change_parameters`.
     """
     V = np.empty((6, 10))
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
@@ -301,12 +294,15 @@ def change_parameters(
 ) -> Parameters:
     """Return the arguments block, noise, window, hold, bound of `change_update`.
 
+    They are: samples of a block; (17,) long-run variances of wrench (6) and motion (9), squared
+    model error and its duration [blocks]; durations `WINDOW` and `HOLD` [blocks]; and the bound
+    below.
+
     Args:
         wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
         period: time between samples [s].
         model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
-        bound: required standard deviation of a new load's mass, relative to the change of mass;
-            default `BOUND`, or twice the model error if larger.
+        bound: required standard deviation of a new load's mass, relative to the change of mass.
     """
     positive("period", period)
     if not 0.0 <= model_error < 1.0:
@@ -327,8 +323,7 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     """Return the initial memory of the change detector for a known load.
 
     Args:
-        theta, covariance: (16,), (16, 16) of [offsets; phi]; standard deviations are limited to
-            `PRIOR_STD`.
+        theta, covariance: (16,), (16, 16) of [offsets; phi].
         offset_drift: (6,) standard deviation of the drift since the identification [N, N m].
     """
     prior = np.square(PRIOR_STD)
@@ -380,13 +375,7 @@ def watch_load(
     omega: ArrayLike,
     alpha: ArrayLike,
 ) -> NDArray[np.int_]:
-    """Return the detector's states (N,) for N samples of a log, as indices into `STATES`.
-
-    Args:
-        memory: from `change_memory`, updated.
-        parameters: from `change_parameters`.
-        wrench, s, omega, alpha: as for `identify`.
-    """
+    """Return the detector's states (N,) for N samples of a log, as indices into `STATES`."""
     _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
     _watch(memory, np.concatenate(rows, axis=1), states, *parameters)
@@ -396,8 +385,7 @@ def watch_load(
 def identified_load(memory: Array, known: Identification) -> Identification:
     """Return the last new load that the detector identified, or `known` if there is none.
 
-    Inertias without excitation keep their former values with a large standard deviation;
-    `condition_number` and `delay_s` are those of `known`.
+    Inertias without excitation keep their former values with a large standard deviation.
     """
     if memory[_BASE] == KNOWN:
         return known

@@ -1,7 +1,6 @@
 """Recursive least squares for load and offsets, Eq. (T6).
 
-Each sample is six rank-one updates (Ljung, System Identification, section 11.2). Without forgetting
-the result equals batch least squares with a weak prior.
+Each sample is six rank-one updates (Ljung, System Identification, section 11.2).
 """
 
 from __future__ import annotations
@@ -47,7 +46,6 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
         theta: (16,) estimate [offsets; phi], updated.
         P: (16, 16) covariance, exactly symmetric, updated.
         samples: (N, at least 15) rows [wrench, s, omega, alpha].
-        noise_std, forgetting: as for `RecursiveEstimator`.
         largest: (16,) upper bound of the variances during forgetting.
         squares: (6,) sums of squared residuals, updated [N^2, N^2 m^2].
     """
@@ -138,18 +136,16 @@ class RecursiveEstimator(ABC):
     ) -> RecursiveEstimator:
         """Return an estimator for standard deviations of wrench (6,) and motion (9,).
 
-        Noise of the motion is ignored if unsupported.
+        An estimator that does not support noise of the motion ignores it.
         """
         return cls(noise_std, forgetting=forgetting, bound=bound)
 
     @property
     def phi(self) -> Array:
-        """Load (10,) about So in S [kg, kg m, kg m^2]."""
         return self._theta[6:].copy()
 
     @property
     def offsets(self) -> Array:
-        """Sensor offsets (6,) [N, N m]."""
         return self._theta[:6].copy()
 
     @property
@@ -170,20 +166,15 @@ class RecursiveEstimator(ABC):
         return bool(self._is_certain(deviations, theta, self._bound).all())
 
     @abstractmethod
-    def initial_memory(self, theta: Array) -> Array:
-        """Return the memory for an initial estimate theta (16,)."""
+    def initial_memory(self, theta: Array) -> Array: ...
 
     @abstractmethod
-    def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance (16, 16) of an external theta and memory [SI]."""
+    def covariance_of(self, theta: Array, memory: Array) -> Array: ...
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
-        """Process one sample with an external theta and memory, without checks.
+        """Process one sample with an external theta and memory, without checks; update both.
 
-        Args:
-            theta: (16,) estimate, updated.
-            memory: C-contiguous array from `initial_memory`, updated.
-            sample: array that begins with [wrench, s, omega, alpha].
+        `memory` is C-contiguous; `sample` begins with [wrench, s, omega, alpha].
         """
         self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
@@ -191,8 +182,7 @@ class RecursiveEstimator(ABC):
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None: ...
 
     @abstractmethod
-    def _residual_rms(self) -> Array:
-        """Return the RMS (6,) of the residuals [N, N m]."""
+    def _residual_rms(self) -> Array: ...
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
         """Process one sample of a free motion: wrench (6,), others (3,), as for `identify`.
@@ -221,7 +211,6 @@ class RecursiveEstimator(ABC):
         self._samples += len(rows[0])
 
     def identification(self) -> Identification:
-        """Return the present estimate."""
         if self._theta[6] == 0.0:
             raise DrakeTeleopError(
                 "has not received a sample", where="estimator", remedy="call update first"
@@ -262,11 +251,9 @@ class RecursiveLeastSquares(RecursiveEstimator):
         self._squares = np.zeros(6)
 
     def initial_memory(self, theta: Array) -> Array:
-        """Return the covariance (16, 16) of the prior."""
         return np.diag(self._prior)
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance (16, 16), a copy of the memory."""
         return memory.copy()
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:

@@ -1,8 +1,7 @@
 """Recursive total least squares: load and offsets for noise of wrench and motion, Eq. (T18).
 
 The estimate minimises lambda, the squared residuals over their expected value (Kubus, Kroeger,
-Wahl, IROS 2008). As in `moments`, row c of the regressor [E V] is T_c z, with the wrench F
-last:
+Wahl, IROS 2008). As in `moments`, row c of the regressor [E V] is T_c z, with the wrench F last:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
 
@@ -68,11 +67,7 @@ def scratch():
 
 @njit(cache=True)
 def write_z(wrench, motion, z):
-    """Write z = [1, s, alpha, products of omega, wrench] (19,).
-
-    Args:
-        wrench, motion: (6,) [N, N m], and (9,) [s, omega, alpha].
-    """
+    """Write z = [1, s, alpha, products of omega, wrench] (19,)."""
     s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
     for i in range(3):
@@ -105,12 +100,9 @@ def forget(memory, theta, information, forgetting):
 
 @njit(cache=True)
 def residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L, L Z and S = L Z L^T, the sum of r r^T, for the residual r = F - [E V] theta = L z.
+    """Write L, L Z and S = L Z L^T (6, 6) for the residual r = F - [E V] theta = L z.
 
-    Args:
-        Z: (19, 19) sum of z z^T, or noise covariance of z.
-        index, factors: from `terms`.
-        L, LZ, S: (6, 19), (6, 19), (6, 6), written.
+    Z (19, 19) is the sum of z z^T or its noise covariance; `index`, `factors` are from `terms`.
     """
     L[:] = 0.0
     LZ[:] = 0.0
@@ -134,7 +126,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the expected noise of Z, the sum of z z^T (19, 19), into Q."""
+    """Write the expected noise of the sum of z z^T, Z (19, 19), into Q."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
@@ -152,11 +144,8 @@ def noise_products(Z, noise_std, motion_std, Q):
 def weighted_gram(Z, W, index, factors, E, G, first):
     """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z.
 
-    Args:
-        Z: (19, 19) sum of y z^T.
-        W: (6, 6) weights between the channels.
-        index, factors: from `terms`.
-        E: (13, 6, 16) scratch.
+    Z (19, 19) is the sum of y z^T, W (6, 6) the weights between channels; E (13, 6, 16) is
+    scratch.
     """
     E[:] = 0.0
     for t in range(len(factors)):
@@ -237,7 +226,6 @@ class MomentEstimator(RecursiveEstimator):
     """Recursive estimator whose memory is the sum of z z^T, and a row for the prior."""
 
     def initial_memory(self, theta: Array) -> Array:
-        """Return the memory (20, 19): sum of z z^T; in the last row the prior's right-hand side."""
         memory = np.zeros((20, 19))
         memory[-1, :16] = theta / self._prior
         return memory
@@ -291,11 +279,7 @@ def select_compensated(G, N, strength, K, taper):
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
     """Write [G g] into G (16, >= 17) and the noise of G into N (16, 16); return lambda.
 
-    Args:
-        Z: (19, 19) sum of z z^T.
-        noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
-        index, factors, space: from `terms` and `scratch`.
-        Q: (19, 19) scratch.
+    Z (19, 19) is the sum of z z^T; `space` is from `scratch`, and Q (19, 19) is scratch.
     """
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
@@ -385,12 +369,11 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveTotalLeastSquares:
-        """Return an estimator for standard deviations of wrench (6,) and motion (9,)."""
         return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property
     def noise_scale(self) -> float:
-        """Ratio lambda of observed to specified noise variances."""
+        """Ratio of observed to specified noise variances."""
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:

@@ -5,9 +5,7 @@
     changed     another load: the fallback (gripper or nothing) is used until the known load
                 explains the wrench again or the new load is identified
 
-A new load counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for `EXPLAINED`
-seconds, with a centre of mass within `MAX_COM_DISTANCE_M`: a constant push at rest looks like a
-weight. At rest, the offsets follow residuals below `MAX_OFFSET_RESIDUAL`.
+At rest, the offsets follow small residuals.
 """
 
 from __future__ import annotations

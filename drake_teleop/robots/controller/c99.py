@@ -107,7 +107,6 @@ class Target(NamedTuple):
 
 
 def c99_files(target: Target) -> Files:
-    """Return the files of the format `c99` by name."""
     return {
         **kernel_files(target),
         "test_vector.h": _test_vector(target),
@@ -130,7 +129,6 @@ def kernel_files(target: Target) -> Files:
 
 
 def template(name: str) -> str:
-    """Return the text of a shipped template."""
     return resources.files(PACKAGE).joinpath(f"templates/{name}").read_text(encoding="utf-8")
 
 

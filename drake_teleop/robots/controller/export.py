@@ -37,11 +37,8 @@ def export_controller(
 ) -> list[str]:
     """Write the files of the format `to`, a key of `FORMATS`; return warnings.
 
-    Args:
-        rate_hz: rate of the readings.
-        cutoff_hz: cut-off of the low-pass; None: no low-pass.
-        largest: range of the sensor: force [N], torque [N m].
-        sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
+    `largest` is the range of the sensor: force [N], torque [N m]; `sign` is -1 if the sensor
+    reports the wrench of load on sensor (usual), else 1.
 
     Raises:
         DrakeTeleopError: without a rate, for a sensor's pose, for a wrench without the load's
