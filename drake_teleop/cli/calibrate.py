@@ -1,16 +1,4 @@
-"""`drake-teleop calibrate`: guided identification of the load from a live stream.
-
-Files in the output folder, beside those of `identify`:
-
-============= ==================================================================================
-log.parquet   recorded log, for `identify log.parquet`; log.yaml with a table for each stream
-              if the source delivers poses or an IMU
-settling.png  half-widths of the intervals over time, with the advice
-summary.json  that of `identify`, with "tolerance", "known" (by name), "all_known",
-              "half_widths_95" over the tolerances, "doubts" (list of texts), "looks" (number
-              of evaluations)
-============= ==================================================================================
-"""
+"""`drake-teleop calibrate`: guided identification of the load from a live stream."""
 
 from __future__ import annotations
 
@@ -55,8 +43,7 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `largest` is the range of the sensor: force [N], torque [N m]; `stream_options` see
-    `open_source`.
+    `largest` is the range of the sensor: force [N], torque [N m].
     """
     tolerance = read_tolerance(until)
     make_folder(out)
@@ -99,7 +86,6 @@ def calibrate_command(
 
 
 def shown(at: Evaluation, tolerance: Tolerance) -> Group:
-    """Return the terminal output of an intermediate result: table, problems and advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):

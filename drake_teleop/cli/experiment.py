@@ -26,10 +26,7 @@ def experiment_command(
 ) -> pl.DataFrame:
     """Continue an experiment and return its result table.
 
-    Args:
-        participant: its number; default: the first with trials left, or a new one.
-        simulated: total number of simulated participants; 0 for people.
-        page: options of the page, see `drive`.
+    `simulated` is the total number of simulated participants, 0 for people.
     """
     experiment, scenarios = LoadExperiment(study)
     with open_results(out, experiment) as store:
@@ -48,10 +45,7 @@ def experiment_command(
 
 
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """Return a participant's number: the requested one, the first with trials left, or a new one.
-
-    `trials` is the number of trials of each participant.
-    """
+    """Return a participant's number: the requested, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
     known = store.participants()

@@ -259,13 +259,11 @@ yes = click.option(
 
 
 def load(*, required: bool = False, default: str = "") -> Callable[[Any], Any]:
-    """Return the option `--load`; its help contains the text `default`."""
     text = "identification.json of the load." + (f"  [default: {default}]" if default else "")
     return click.option("--load", type=PATH, required=required, help=text)
 
 
 def sigma(text: str) -> Callable[[Any], Any]:
-    """Return the option `--sigma` with the help `text`."""
     return click.option("--sigma", type=SCALE, default=0.0, show_default=True, help=text)
 
 

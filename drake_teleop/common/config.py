@@ -45,10 +45,7 @@ def choice(
 
 
 def plain(default: Any, doc: str, registry: Registry[Any] | None = None) -> Any:
-    """Return a dataclass field for a flag, word, integer, list or mapping of names.
-
-    With a registry of dataclasses the field contains these.
-    """
+    """Return a dataclass field for a flag, word, integer, list or mapping of names."""
     metadata = {"doc": doc, "registry": registry}
     if isinstance(default, (list, dict)):
         return dataclasses.field(default_factory=lambda: type(default)(default), metadata=metadata)
@@ -56,7 +53,6 @@ def plain(default: Any, doc: str, registry: Registry[Any] | None = None) -> Any:
 
 
 def in_short(value: Any) -> str:
-    """Return a short text of a value for a message."""
     if value is None:
         return "nothing"
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -66,11 +62,7 @@ def in_short(value: Any) -> str:
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Check field names and types of parsed YAML against a dataclass.
-
-    The key "_tag" contains a mapping's tag; `tagged` allows a tag to select one of several
-    dataclasses.
-    """
+    """Check field names and types of parsed YAML against a dataclass."""
     if not isinstance(data, dict):
         raise DrakeTeleopError(
             f"expected a mapping of fields, found {in_short(data)}",
@@ -91,7 +83,6 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
 
 
 def check_name(schema: type, name: Any, where: str) -> None:
-    """Raise DrakeTeleopError, with a similar name, if the dataclass has no field `name`."""
     names = _field_names(schema)
     if name not in names:
         remedy = suggestion(name, names, f"fields: {', '.join(names)}")
@@ -183,7 +174,6 @@ class Kind(NamedTuple):
 
 @functools.cache
 def kind_of(hint: Any) -> Kind:
-    """Return the structure of a type hint."""
     if typing.get_origin(hint) is list:
         inner = kind_of(typing.get_args(hint)[0])
         return Kind(inner.lists + 1, inner.items, False)
@@ -268,8 +258,6 @@ class FieldInfo:
         kind: "number", "whole number", "true or false", "word" or "block" (a dataclass), of the
             innermost items.
         lists: number of nested lists, 0 for one value.
-        length: required length of the list, or None.
-        optional: whether the value may be null.
         by_name: whether the value is a mapping of names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.
         low, high: range of a quantity, limits included.
@@ -293,7 +281,6 @@ class FieldInfo:
 
     @property
     def range(self) -> str:
-        """Text of the allowed range, words or dataclasses."""
         if self.unit:
             unit = "" if self.unit == "1" else f" {self.unit}"
             return f"{self.low:.7g} to {self.high:.7g}{unit}"
@@ -303,7 +290,6 @@ class FieldInfo:
 
     @property
     def text(self) -> str:
-        """Line of a help text for the field."""
         metadata = [self.range] if self.range else []
         if self.default is None or self.kind != "block":
             metadata.append(f"default {_shown(self.default)}")
@@ -328,7 +314,6 @@ def _changed_fields(self: Any) -> str:
 
 
 def _changed_lines(config: Any) -> Iterator[str]:
-    """Yield a line for each field that differs from its default."""
     for entry in dataclasses.fields(config):
         value = getattr(config, entry.name)
         if value == _default(entry):
@@ -357,7 +342,7 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 
 @contextmanager
 def unchecked_assignments() -> Iterator[None]:
-    """Disable the checks of assigned values, for a reader that checks the whole later."""
+    """Disable the checks of assigned values in this context."""
     token = _checks_assignments.set(False)
     try:
         yield
@@ -366,10 +351,7 @@ def unchecked_assignments() -> Iterator[None]:
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
-    """Return the descriptions of the fields of a settings dataclass or instance.
-
-    For an inner block pass the outer field's `default`.
-    """
+    """Return the descriptions of the fields of a settings dataclass or instance."""
     return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 
 

@@ -90,7 +90,6 @@ def install_extra(name: str) -> str:
 
 
 def require_library(module: str, library: str, extra: str, where: str) -> None:
-    """Raise DrakeTeleopError if a module is missing, which the optional `extra` installs."""
     if importlib.util.find_spec(module) is None:
         what = f"needs the library {library}, which is not installed"
         raise DrakeTeleopError(what, where=where, remedy=install_extra(extra))

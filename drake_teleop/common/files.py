@@ -34,9 +34,7 @@ class CannotWrite(DrakeTeleopError):
 def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -> Iterator[Path]:
     """Yield a temporary name to write under; then rename the file to `path`.
 
-    After a failure `path` is unchanged. The temporary file is beside `aside`, for a `path` in a
-    folder that is read as one table; with `shared` its name is unique, so that several processes
-    may write.
+    After a failure `path` is unchanged. With `shared` several processes may write the file.
     """
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -52,7 +50,6 @@ def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -
 
 @contextmanager
 def wrap_write_errors(path: Path) -> Iterator[None]:
-    """Convert OSError to CannotWrite with the file's name."""
     try:
         yield
     except OSError as error:
@@ -70,7 +67,6 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def write_picture(path: Path, figure: Figure, **options: Any) -> None:
-    """Write a figure in the format of the file's extension."""
     with whole_file(path) as temporary:
         figure.savefig(temporary, format=path.suffix.removeprefix("."), **options)
 
@@ -94,10 +90,7 @@ def write_table(
 def output_folder(
     out: Path, last: str = "summary.json", *, kept: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create a command's output folder; the output is complete when the file `last` exists.
-
-    `kept` are earlier files that remain, for the error message.
-    """
+    """Create a command's output folder; the output is complete when the file `last` exists."""
     make_folder(out)
     with wrap_write_errors(out / last):
         (out / last).unlink(missing_ok=True)
@@ -122,10 +115,7 @@ def make_folder(folder: Path) -> None:
 
 
 def set_aside(*paths: Path) -> Path | None:
-    """Move existing recordings into a new folder `earlier-1`, `earlier-2`, ... beside them.
-
-    Return this folder, or None if no recording exists.
-    """
+    """Move existing recordings into a new folder `earlier-1`, `earlier-2`, ... and return it."""
     existing = [path for path in paths if path.exists()]
     if not existing:
         return None
@@ -139,7 +129,6 @@ def set_aside(*paths: Path) -> Path | None:
 
 
 def part_of_log(folder: Path, first_row: int) -> Path:
-    """Return the path of the log file that begins with a given row."""
     return folder / _PART_NAME.format(first_row)
 
 

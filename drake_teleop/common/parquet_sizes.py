@@ -1,8 +1,4 @@
-"""Check of the sizes in a Parquet file, because a damaged size can make polars abort the process.
-
-Metadata are structs in Thrift's compact protocol with the field numbers of `parquet.thrift`
-(https://github.com/apache/parquet-format).
-"""
+"""Check of the sizes in a Parquet file: a damaged size can make polars abort the process."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Vectors of 3, rotation matrices of 9 numbers (by rows) and unit quaternions for compiled code.
 
-The functions allocate no memory. In Python those of vectors accept any scalar type of Drake. Sums
-are evaluated from left to right. Quaternions are tuples (w, x, y, z).
+The functions allocate no memory. Quaternions are tuples (w, x, y, z).
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def add_into(x, i, a):
 
 @register_jitable
 def put(x, i, a, j, n):
-    """Copy n numbers from index j of a to index i of x (faster than a slice assignment)."""
+    """Copy n numbers from index j of a to index i of x."""
     for k in range(n):
         x[i + k] = a[j + k]
 
@@ -80,7 +79,6 @@ def cross(a, b):
 
 @register_jitable
 def plus_cross(c, a, b):
-    """Return c + a x b."""
     return (
         c[0] + a[1] * b[2] - a[2] * b[1],
         c[1] + a[2] * b[0] - a[0] * b[2],
@@ -151,13 +149,11 @@ def multiply(a, b):
 
 @njit(cache=True)
 def conjugate(a):
-    """Return the quaternion of the inverse rotation."""
     return (a[0], -a[1], -a[2], -a[3])
 
 
 @njit(cache=True)
 def rotate(a, v):
-    """Return the vector v, rotated by the quaternion a."""
     axis = three(a, 1)
     t = times(2.0, cross(axis, v))
     return plus_cross(plus(v, times(a[0], t)), axis, t)

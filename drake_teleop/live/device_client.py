@@ -56,8 +56,7 @@ class Device(Protocol):
 class Client:
     """Connection of a haptic device and a station.
 
-    `guard` contains the safety functions; `behind` is the delay [s] between each device position
-    and the force that answers it.
+    `behind` is the delay [s] between each device position and the force that answers it.
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:

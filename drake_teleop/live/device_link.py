@@ -94,7 +94,6 @@ class DeviceLink:
         self._force_ages.append(state.behind)
 
     def silent(self, now: float) -> bool:
-        """Return whether no valid packet was received for 50 ms."""
         return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send(self, wrench: np.ndarray) -> None:
@@ -112,7 +111,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return the `Inputs` of the device's pose by name; a silent device releases the hand."""
+        """Return the `Inputs` of the device's pose; a silent device releases the hand."""
         state = self.poll(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}

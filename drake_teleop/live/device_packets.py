@@ -1,8 +1,7 @@
-"""Packets between a haptic device and the station; in C: `drake_teleop_device.h`.
+"""Packets between a haptic device and the station: little-endian, in the device's base frame B.
 
-Little-endian, without padding, in the device's base frame B. From the device: "DTD1", flags,
-number, time [s], position (3) [m], orientation (4) [w, x, y, z], behind [s]. To the device:
-"DTF1", 0, number and time of the answered packet, wrench [f; tau] (6) [N, N m].
+From the device: "DTD1", flags, number, time [s], position (3) [m], orientation (4) [w, x, y, z],
+behind [s]. To the device: "DTF1", 0, number and time of the answered packet, wrench (6) [N, N m].
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ CLUTCH_OPEN = 1
 
 
 class DeviceState(NamedTuple):
-    """State of a haptic device: packet number, time on the device's clock [s], pose and flags.
+    """State of a haptic device, with its packet number and time on the device's clock [s].
 
     Attributes:
         position: p_BE [m].
@@ -72,10 +71,7 @@ def unpacked_state(packet: bytes) -> DeviceState | None:
 def plausible_state(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
-    """Return the device state, or None if a value is implausible.
-
-    `numbers` (8,): position [m], orientation [w, x, y, z] and `behind` [s].
-    """
+    """Return the device state, or None if a value is implausible."""
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.

@@ -1,7 +1,6 @@
 """Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
 
-Axes: x right, y forward, z up. Button a opens the clutch. Tested only with a virtual service, not
-with the device.
+Tested only with a virtual service, not with the device.
 """
 
 from __future__ import annotations
@@ -50,7 +49,6 @@ def read_message(text: Any) -> Message | None:
 
 
 def force_message(device: str, wrench: Sequence[float]) -> str:
-    """Return the JSON message that displays the force of a wrench [f; tau] in B [N]."""
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(

@@ -58,8 +58,6 @@ MAX_SLOWDOWN = 20.0
 class Live:
     """Event handler of a live session: messages of pages and ticks of a clock; times `now` in s.
 
-    Without a driver the hand releases the stylus, and after 0.25 s the simulation waits.
-
     Attributes:
         refused: number of invalid messages.
         stopped: failure that stops the simulation, or "".
@@ -70,7 +68,6 @@ class Live:
         record: folder of the record; if not empty, the next free one; None: no record.
         show: function that returns the 3D scene's part of a frame.
         link: link to a haptic device; None: the page moves the hand.
-        begin: initial inputs.
     """
 
     def __init__(
@@ -169,7 +166,6 @@ class Live:
             self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        """Handle a message of a page; count invalid messages."""
         message = parse(text)
         if message is None:
             self.refused += 1
@@ -206,16 +202,13 @@ class Live:
 
     @property
     def ms(self) -> int:
-        """Simulated time [ms]."""
         return self._session.ms
 
     @property
     def is_idle(self) -> bool:
-        """Whether the simulation does not advance at present."""
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next simulation slice or page frame [s]."""
         frame = self._frame_due - now
         return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
 
@@ -286,7 +279,6 @@ class Live:
         return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """Return the values that pages show now."""
         rows = self._session.new_rows()
         if len(rows["t"]):
             self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(

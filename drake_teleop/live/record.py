@@ -70,7 +70,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Write the inputs at a time [ms] at once, if they have changed."""
+        """Write the inputs at a time [ms], if they have changed."""
         line = row(ms, inputs)
         if line != self._last:
             self._append(line)

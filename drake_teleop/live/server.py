@@ -1,7 +1,6 @@
 """Server of `drake-teleop drive`: one page on this machine and its websocket.
 
-One port of 127.0.0.1 serves only clients with the token in the page's address; the websocket
-accepts only this page.
+It serves only clients with the token in the page's address.
 """
 
 from __future__ import annotations
@@ -405,7 +404,6 @@ def drive(
 def drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
-    """Run `drake-teleop drive` until Ctrl-C or SIGTERM."""
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
     reason = live.until_signal()

@@ -1,1 +1,1 @@
-"""Inertial load of a wrist force/torque sensor: model, identification and removal from the wrench."""
+"""Inertial load of a wrist force/torque sensor: identification, and removal from the wrench."""

@@ -238,9 +238,7 @@ def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -
 
 
 def com_deviations(phi: Array, covariance: Array) -> Array:
-    """Return standard deviations (3,) of the centre of mass [m]; `covariance` is of [offsets;
-    phi].
-    """
+    """Return standard deviations (3,) of the centre of mass [m]."""
     mass, com, _ = mass_com_inertia(phi)
     change = np.column_stack([-com, np.eye(3)]) / mass
     part = covariance[6:10, 6:10]
@@ -250,15 +248,11 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    """Return (16,) True where a standard deviation is at most 5 % of `natural_scale`."""
     return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
 def natural_scale(phi: Array) -> Array:
-    """Return the typical size (16,) of each of [offsets; phi], to judge its standard deviation.
-
-    For mass m and size L = max(|c|, 3 cm) they are m g, m g L, m, m L and m L^2 / 3.
-    """
+    """Return the typical size (16,) of each of [offsets; phi], to judge its uncertainty."""
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
     scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
@@ -335,12 +329,7 @@ _IS_PHI = np.arange(16) >= 6
 
 
 def identified_object(total: Identification, gripper: Identification) -> Identification:
-    """Return the object's load: that of gripper with object (`total`) minus that of `gripper`.
-
-    Raises:
-        DrakeTeleopError: if the object's mass is zero, or negative by more than 3 standard
-            deviations.
-    """
+    """Return the object's load: that of gripper with object (`total`) minus that of `gripper`."""
     phi: Array = total.phi - gripper.phi
     covariance = total.covariance.copy()
     covariance[6:, 6:] += gripper.covariance[6:, 6:]
@@ -377,11 +366,7 @@ def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return the smallest eigenvalue of the normalised pseudo-inertia, and its deviation, Eq.
-    (T9).
-
-    It is positive for a load that a rigid body can have.
-    """
+    """Return the smallest eigenvalue of the normalised pseudo-inertia and its deviation."""
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))
     length = np.sqrt(spread / mass) if spread > 0.0 else 1.0

@@ -23,10 +23,6 @@ def _point_inertia(about: Array, mass: float) -> Array:
 
 
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:
-    """Return the load phi (10,) about the sensor origin So, in S.
-
-    The inertia I_BBcm_S (3, 3) [kg m^2] is about the centre of mass.
-    """
     m = float(checked("mass", mass))
     p = checked("p_SoBcm_S", p_SoBcm_S, 3)
     I = checked("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
@@ -41,13 +37,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
 
 
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
-    """Return mass [kg], centre of mass p_SoBcm_S (3,) [m] and inertia I_BBcm_S (3, 3) [kg m^2].
-
-    The inertia is about the centre of mass. The mass may be negative.
-
-    Raises:
-        DrakeTeleopError: if the mass is zero.
-    """
+    """Return mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m^2], all in S."""
     phi = checked("phi", phi, 10)
     m = float(phi[0])
     if m == 0.0:
@@ -61,16 +51,12 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
 
 
 def inertia_about_origin(phi: ArrayLike) -> Array:
-    """Return the inertia tensor (3, 3) of phi about So in S [kg m^2], Eq. (3)."""
     xx, xy, xz, yy, yz, zz = checked("phi", phi, 10)[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def pseudo_inertia(phi: ArrayLike) -> Array:
-    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1).
-
-    Sigma (3, 3) is the second moment of mass about So, tr(I) / 2 E - I [kg m^2].
-    """
+    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1)."""
     phi = checked("phi", phi, 10)
     I = inertia_about_origin(phi)  # noqa: E741
     J = np.empty((4, 4))
@@ -94,8 +80,7 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     """Return whether a rigid body can have the parameters phi (10,), Eq. (T1).
 
-    Points, rods and plates are consistent. `tolerance` is the accepted negative eigenvalue of the
-    pseudo-inertia, normalised by mass and radius of gyration.
+    `tolerance` is the accepted negative eigenvalue of the normalised pseudo-inertia.
     """
     J = pseudo_inertia(phi)
     if not J.any():
@@ -111,10 +96,7 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:
-    """Return the load (10,) about Ao in frame A, from the load about Bo in frame B, Eq. (T2).
-
-    R_AB rotates vectors from B to A.
-    """
+    """Return the load (10,) about Ao in frame A, from the load about Bo in frame B, Eq. (T2)."""
     R = checked("R_AB", R_AB, 3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
         raise DrakeTeleopError(

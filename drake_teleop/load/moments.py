@@ -1,10 +1,8 @@
 """Second moments of a record, from which all least squares estimates follow, Eq. (T4).
 
-They are the mean of z z^T (19, 19), where row c of the regressor [E V] is T_c z with constant T_c:
+They are the mean of z z^T, where row c of the regressor [E V] is T_c z with constant T_c:
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
-
-F is the wrench and w the angular velocity omega.
 """
 
 from __future__ import annotations
@@ -71,7 +69,7 @@ class Noise:
 
 
 class Moments:
-    """Sum over a record of z z^T (19, 19), z = [1, wrench, s, alpha, products of omega]."""
+    """Second moments z z^T (19, 19) of a record, summed over its samples."""
 
     def __init__(self) -> None:
         self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_BLOCKS, 19))
@@ -148,9 +146,7 @@ def coefficients() -> Array:
 
 
 def centripetal_matrix(r: Array) -> Array:
-    """Return C (..., 3, 6) such that C z[13:19] is the acceleration omega x (omega x r) of r (...,
-    3).
-    """
+    """Return C (..., 3, 6) such that C z[13:19] is the acceleration omega x (omega x r)."""
     x, y, z = np.moveaxis(r, -1, 0)
     o = np.zeros_like(x)
     rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
@@ -158,11 +154,7 @@ def centripetal_matrix(r: Array) -> Array:
 
 
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
-    """Return the Gram matrix (16, 16) and the right-hand side (16,) of least squares for [offsets;
-    phi].
-
-    Z (19, 19) is a mean or a noise covariance of z, W (6, 6) the weights between channels.
-    """
+    """Return Gram matrix (16, 16) and right-hand side (16,) of least squares for [offsets; phi]."""
     T = coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
     WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
@@ -172,11 +164,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta, theta = [offsets;
-    phi].
-
-    Z (19, 19) is a mean of z z^T or a noise covariance of z.
-    """
+    """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta."""
     L = -np.einsum("cjk,j->ck", coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T
@@ -189,7 +177,7 @@ def excited_columns(Z: Array) -> NDArray[np.bool_]:
 
 
 def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
-    """Return R (n, rank) with R^T gram R = 1, for the minimum-norm solution R R^T right."""
+    """Return R (n, rank) such that R R^T is the pseudo-inverse of the Gram matrix."""
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
@@ -198,7 +186,6 @@ def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
 
 @njit(cache=True)
 def _accumulate(wrench, s, omega, alpha, weights, sums, blocks, state):
-    """Add samples to the upper half of the sums of z z^T, and to those of z per block."""
     z = np.empty(19)
     last, length, filled = state
     for i in range(wrench.shape[0]):

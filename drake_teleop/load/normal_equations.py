@@ -37,8 +37,6 @@ _WRENCH, _FORCE = slice(1, 7), slice(7, 10)
 class NormalEquations(Moments):
     """Least squares sums of a record, from which load and sensor offsets are solved.
 
-    Samples are added in the order of time, because their noise may be correlated.
-
     Args:
         noise: (6,) standard deviations of the wrench channels [N, N m]; None: equal weights.
         resolution: (2,) quantisation step of forces and torques [N, N m], only for poses at rest.
@@ -77,10 +75,7 @@ class NormalEquations(Moments):
         )
 
     def covariance(self) -> Array:
-        """Return the finite covariance (16, 16) of the minimum-norm solution [offsets; phi].
-
-        It gives the variance of each combination of parameters that the record determines.
-        """
+        """Return the finite covariance (16, 16) of the minimum-norm solution [offsets; phi]."""
         inverse, _, _ = self._pseudo_inverse()
         return self._covariance(inverse @ self.normal_equations()[1], inverse)[0]
 
@@ -102,7 +97,6 @@ class NormalEquations(Moments):
         return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Return Gram matrix (16, 16) and right-hand side (16,) of [offsets; phi]."""
         weights = self._weights if weights is None else checked("weights", weights, 6)
         return normal_equations(self._sums, np.diag(weights))
 
@@ -112,7 +106,6 @@ class NormalEquations(Moments):
 
     @property
     def unexcited(self) -> NDArray[np.bool_]:
-        """Booleans (16,): True for parameters that do not influence the wrench."""
         return ~excited_columns(self.mean)
 
     @property
@@ -120,14 +113,11 @@ class NormalEquations(Moments):
         return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
-        """Return the sums (6,) of squared residuals of the channels for theta = [offsets; phi]."""
         squares = np.diag(residual_covariance(self._sums, checked("theta", theta, 16)))
         return np.maximum(squares, 0.0)
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
-        """Return residual variances (6,) that allow for correlation in time, and their degrees of
-        freedom.
-        """
+        """Return residual variances (6,) with correlation in time, and their degrees of freedom."""
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(checked("theta", theta, 16), inverse)[:2]
 

@@ -1,8 +1,6 @@
 """Wrench of a load by its motion: regressor V of Eq. (5), and Newton-Euler Eqs. (1)-(2).
 
-Vectors are in the sensor frame S about its origin So; the wrench acts on the load. Functions
-`..._into` are compiled and do not check their input. A sample is one row of numbers (logs: the
-first 15):
+A sample is one row of numbers (logs: the first 15):
 
     [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
      saturated or lost | joint positions (n) | time (output of the wrist sensor only)]

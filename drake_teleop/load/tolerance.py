@@ -58,11 +58,6 @@ class Tolerance(NamedTuple):
 
 
 def read_tolerance(text: str) -> Tolerance:
-    """Return the tolerance of a text such as "mass 0.5 %, com 0.5 mm".
-
-    Raises:
-        DrakeTeleopError: for another form, or a value outside 1e-9 to 10.
-    """
     found: dict[str, float] = {}
     for part in text.split(","):
         match = _ENTRY_PATTERN.fullmatch(part)
@@ -88,9 +83,7 @@ def read_tolerance(text: str) -> Tolerance:
 
 
 def errors_of(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of the required numbers by [offsets; phi], divided by the
-    tolerances.
-    """
+    """Return derivatives (k, 16) of the required numbers by [offsets; phi], over the tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -113,10 +106,7 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_of(errors: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of the required numbers, divided by the tolerances.
-
-    `errors` is from `errors_of`, `covariance` (16, 16) of [offsets; phi].
-    """
+    """Return standard deviations (k,) of the required numbers, over the tolerances."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)

@@ -39,8 +39,7 @@ class FourierTrajectory:
     ) -> FourierTrajectory:
         """Return a trajectory without velocity and acceleration at both ends, Eq. (T17).
 
-        Harmonic k of `sine` and `cosine` (n, N - 1) [rad] is divided by k. The trajectory starts
-        at q0 + sum(delta).
+        `sine` and `cosine` (n, N - 1) [rad] are coefficients whose harmonic k is divided by k.
         """
         sine, cosine = np.asarray(sine, float), np.asarray(cosine, float)
         rest_rho, rest_delta = _rest_bases(sine.shape[-1] + 1)
@@ -66,7 +65,6 @@ class FourierTrajectory:
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
-        """Write the coefficients as YAML, by joint name."""
         from drake_teleop.common.texts import yaml_text
 
         joints = {
@@ -78,7 +76,6 @@ class FourierTrajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:
-        """Read the YAML file of `save`."""
         from drake_teleop.common.texts import read_yaml
 
         data = read_yaml(path)

@@ -65,9 +65,7 @@ class Address:
         return text
 
     def sign(self) -> float:
-        """Return 1 or -1 (default), the factor from the source's wrench to that of sensor on load,
-        Eq. (1).
-        """
+        """Factor, 1 or -1, from the source's wrench to that of sensor on load, Eq. (1)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(

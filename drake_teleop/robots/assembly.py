@@ -133,11 +133,7 @@ _PERIOD_SAMPLES = 20  # for the median period of the motion
 
 
 class Parts:
-    """One source of wrenches and motions, made of one or two sources of parts (single samples).
-
-    `motion_stream` is the stream of poses if available, else that of an IMU; `two_clocks` is True
-    if wrench and motion have different clocks.
-    """
+    """One source of wrenches and motions, made of one or two sources of single samples."""
 
     live = True
 
@@ -210,8 +206,7 @@ class PosedByJoints:
 
 
 class MotionWindow:
-    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or IMU
-    samples.
+    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or an IMU.
 
     Args:
         cutoff_hz: cut-off of the smoothing; None for the shortest window.
@@ -240,11 +235,7 @@ class MotionWindow:
             self.reset()
 
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Return the motions that a part, received at time `now` [s], completes.
-
-        Each is a time [s] with specific force, angular velocity and acceleration in S; from poses
-        also with gravity in S: (9,) or (12,).
-        """
+        """Return times [s] and motions [s, omega, alpha] that a part completes; poses add gravity."""
         row = self._row(part)
         if row is None:
             return []
@@ -316,11 +307,7 @@ class Assembly:
         delay_s: delay of the motion's time stamps behind the wrench's [s].
         track: load for tracking this delay; None for a constant delay.
         X_FS: (7,) pose of the sensor in the frame F of the poses, [w x y z, position].
-        weight_removed: True if the robot has removed the weight from the wrench; readings then
-            contain the acceleration instead of the specific force.
-
-    Attributes:
-        lag_s: delay of the readings [s].
+        weight_removed: True if the robot has removed the load's weight from the wrench.
     """
 
     live = True

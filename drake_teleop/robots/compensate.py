@@ -36,7 +36,7 @@ class Control:
         self.port = self._socket.getsockname()[1]
 
     def answer(self, tare: Callable[[], str]) -> None:
-        """Answer a waiting request, if any, by the result of `tare`."""
+        """Answer a waiting request, if any."""
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"
@@ -60,12 +60,7 @@ def run(
     changes: Changes | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate readings until the source ends, or Ctrl-C; return the number of wrenches and of
-    flags.
-
-    `tare` tares once, after `TARE_S` of valid readings; `report` receives the result of a tare,
-    and the first fault of each kind.
-    """
+    """Compensate readings until the source ends, or Ctrl-C; count wrenches and flags."""
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_S / source.dt)
 
@@ -127,7 +122,6 @@ def compensate_command(
         largest: range of the sensor: force [N], torque [N m].
         free: log of free motion, for contact detection.
         control: UDP port that accepts the request `tare`.
-        attach: function from a maker of compensators to an object that is used as a compensator.
         stream: options of `open_source`.
     """
     found = Identification.load(load)

@@ -102,12 +102,6 @@ class Compensator:
         wait: delay of the motion, in readings, for which the source has corrected.
         predicted: extrapolate over `wait` and the delay of the low-pass.
         largest: (6,) range of the sensor [N, N m].
-        detector: contact detector; its flag replaces that of `watch`.
-
-    Attributes:
-        offsets: (6,) sensor offsets [N, N m].
-        lag_s: delay of a slow contact without prediction [s].
-        good_count: number of successive valid readings.
     """
 
     def __init__(
@@ -211,7 +205,6 @@ class Compensator:
         return self._zero(_STALE)
 
     def time_to_stale(self, now: float) -> float:
-        """Return the time until the last reading is stale [s]."""
         return max(0.0, self._now + STALE_S - now)
 
     def tare(self) -> str:
@@ -238,7 +231,6 @@ class Compensator:
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
     def _tare_result(self) -> tuple[int, Array, Array]:
-        """Return the reason of a refusal or 0, the change of the offsets, and the new offsets."""
         mean, squares, offsets = np.zeros(VALUES + 6), np.zeros(VALUES + 6), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             add_to_statistics(row, float(number), mean, squares)

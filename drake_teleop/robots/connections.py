@@ -42,7 +42,7 @@ def open_source(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> Source[Reading]:
-    """Return the source at an address (docs/robot.md).
+    """Return the source at an address.
 
     Args:
         load: identified load, for the delay and for `weight_removed`.
@@ -51,7 +51,6 @@ def open_source(
         real_time: replay a log in real time.
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
-        arm: kinematics for joint positions.
     """
     kind = _kind(address)
     if kind in PART_SOURCES:
@@ -94,10 +93,7 @@ def open_recording(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> tuple[Source[Any], Records[Any]]:
-    """Return the stream that `calibrate` reads, and its recorder; arguments as for `open_source`.
-
-    `largest` (6,) is the range of the sensor [N, N m].
-    """
+    """Return the stream that `calibrate` reads, and its recorder."""
     kind = _kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
@@ -109,7 +105,6 @@ def open_recording(
 
 
 def is_file(address: str) -> bool:
-    """Return whether the address of a sink is a file or a folder of files."""
     return not _kind(address) and Path(address).suffix in SINKS
 
 

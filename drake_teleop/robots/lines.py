@@ -39,9 +39,7 @@ _BLOCK_BYTES = 65536
 
 
 def read_line(line: bytes, number: int) -> Reading:
-    """Return the reading in a line, flagged as damaged if it is invalid; `number` is its default
-    number.
-    """
+    """Return the reading in a line, flagged as damaged if it is invalid."""
     if len(line) > _MAX_LINE_BYTES:
         return DAMAGED
     try:

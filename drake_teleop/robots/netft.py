@@ -172,10 +172,7 @@ class SampleClock:
         self._first: tuple[int, float] | None = None
 
     def time_of(self, number: int, now: float) -> float:
-        """Return the time [s] of a sample that is received at `now` [s] of our monotonic clock.
-
-        A number below that of an earlier sample is out of order or after a restart.
-        """
+        """Return the time [s] of a sample that is received at `now` [s] of our monotonic clock."""
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _JUMP_S:
             self._first = number, now

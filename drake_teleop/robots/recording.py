@@ -1,7 +1,4 @@
-"""Recorders that collect the samples of a stream and write them as a log.
-
-If a clock is set, a new record starts; the longest one is written.
-"""
+"""Recorders that collect the samples of a stream and write them as a log."""
 
 from __future__ import annotations
 
@@ -47,8 +44,9 @@ _T = TypeVar("_T")
 class Records(ABC, Generic[_T]):
     """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
+    If a clock is set, a new record starts; the longest one is written.
+
     Attributes:
-        file, files: name of the log, and of all written files.
         left_out: number of rejected samples.
         began_anew: number of clock changes.
     """
@@ -87,7 +85,6 @@ class Records(ABC, Generic[_T]):
 
     @property
     def seconds(self) -> float:
-        """Length of the record [s]."""
         return _seconds(self._longest_part())
 
     @abstractmethod
@@ -95,8 +92,7 @@ class Records(ABC, Generic[_T]):
         """Add a sample if it is valid."""
 
     @abstractmethod
-    def write(self, path: Path) -> None:
-        """Write the log; raise DrakeTeleopError if there are too few samples."""
+    def write(self, path: Path) -> None: ...
 
 
 class Recorder(Records[Reading]):

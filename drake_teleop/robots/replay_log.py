@@ -20,13 +20,8 @@ from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 class LogSource(Source[Reading]):
     """Source of a log's readings, with the motion aligned to the wrench.
 
-    `wait` is the removed delay of the motion, in readings.
-
-    Args:
-        load: load for the estimate of the delay; None: no alignment.
-        cutoff_hz, delay: see `eliminate_log`.
-        real_time: replay in real time; else as fast as possible.
-        chunk: maximum number of readings per call.
+    `wait` is the removed delay of the motion, in readings; `chunk` the largest number of readings
+    per call. Without a `load` the motion is not aligned.
     """
 
     def __init__(

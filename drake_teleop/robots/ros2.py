@@ -49,12 +49,10 @@ class RosNode:
         self._executor.add_node(self.node)
 
     def spin(self, timeout_s: float) -> None:
-        """Wait for one event and execute its callback."""
         self._executor.spin_once(timeout_sec=timeout_s)
 
     @delayed_signals()
     def close(self) -> None:
-        """Leave the network; a second call does nothing."""
         if self._context.ok():
             shared_node.cache_clear()
             self._executor.shutdown()
@@ -64,7 +62,6 @@ class RosNode:
 
 @cache
 def shared_node(domain: int) -> RosNode:
-    """Return the node of this process in a ROS domain."""
     return RosNode(domain)
 
 

@@ -27,7 +27,6 @@ SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 
 
 def domain_of(address: Address) -> int:
-    """Return the ROS domain in an address, by default 0."""
     text = address.parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         raise DrakeTeleopError(
@@ -39,7 +38,6 @@ def domain_of(address: Address) -> int:
 
 
 def topic_of(address: Address, text: str) -> str:
-    """Return a topic name without leading slash."""
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
@@ -53,7 +51,7 @@ def topic_of(address: Address, text: str) -> str:
 def source_topics(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """Return the topics in an address by name (see `KINDS`), the frames of `tf`, and the streams."""
+    """Return the topics in an address by name, the frames of `tf`, and the streams."""
     topics = {WRENCH: topic_of(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
         if (text := address.parameter(stream)) is not None:
@@ -77,16 +75,11 @@ def source_topics(
 
 
 def damaged(name: str) -> Part:
-    """Return the part for an invalid message."""
     return DAMAGED_WRENCH._replace(stream=_STREAMS.get(name, name))
 
 
 class MessageConverter:
-    """Converter of ROS 2 messages to parts (samples of single streams).
-
-    `frames` are parent and child frame of the pose from `/tf`, or empty; `joints` the names of the
-    joints, in the order of the values.
-    """
+    """Converter of ROS 2 messages to parts; `frames` are parent and child of the pose in `/tf`."""
 
     def __init__(
         self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()

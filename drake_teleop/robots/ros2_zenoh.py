@@ -40,7 +40,6 @@ def require_libraries(where: str) -> None:
 
 
 def message_types() -> Any:
-    """Return the store of ROS 2 message types of rosbags."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -65,7 +64,7 @@ def open_session(address: Address) -> Any:
 
 
 def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
-    """Return the zenoh key of a topic, by default with any hash (ROS Humble has none)."""
+    """Return the zenoh key of a topic, by default with any type hash."""
     return f"{domain}/{topic}/{_dds(kind)}/{hashed}"
 
 
@@ -82,7 +81,7 @@ def liveliness_tokens(
 
 
 def attachment(number: int, ns: int, sender: bytes) -> bytes:
-    """Return the attachment of a message, as in rmw_zenoh since 0.2.4; `ns`: send time."""
+    """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
     return _ATTACHMENT.pack(number, ns, len(sender), sender)
 
 
@@ -115,7 +114,6 @@ class Messages(MessageConverter):
         self._counts = dict.fromkeys(KINDS, 0)
 
     def parts(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
-        """Return the parts of a CDR message, flagged if it is invalid."""
         self._counts[name] += 1
         number = message_number(attachment)
         if number is None:

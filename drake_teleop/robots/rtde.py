@@ -95,7 +95,6 @@ class RtdeSource:
 
 
 def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
-    """Return wrench, pose and acceleration of a sample of `rtde_reader` as parts."""
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
     values_of_stream = {

@@ -1,9 +1,4 @@
-"""Sources and sink of UDP packets, with the layout of `drake_teleop_udp.h`.
-
-Little-endian, without padding. Input: "DTW1", flags (`ReadingFlag.SATURATED` only), number, time
-[s], wrench (6), s, omega, alpha (3 each); or "DTP1", the same head, wrench (6), pose (w x y z,
-position). Output: "DTC1", the same head, contact wrench (6), scaled wrench (6).
-"""
+"""Sources and sink of UDP packets: little-endian, without padding, as in `drake_teleop_udp.h`."""
 
 from __future__ import annotations
 
@@ -57,7 +52,6 @@ def pack_parts(wrench: Part, pose: Part) -> bytes:
 
 
 def unpack_parts(packet: bytes) -> list[Part]:
-    """Return wrench and pose in a packet; a damaged wrench if it is invalid."""
     if len(packet) != POSED.size or packet[:4] != _POSED_TAG:
         return [DAMAGED_WRENCH]
     _, flags, number, t = _HEAD.unpack_from(packet)
@@ -83,7 +77,6 @@ def unpack_wrench(packet: bytes) -> Compensated:
 
 
 def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
-    """Return host (default: this machine) and port of an address."""
     try:
         parts = urlsplit(address)
         host, port = parts.hostname or THIS_MACHINE, port if parts.port is None else parts.port
@@ -99,7 +92,6 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that receives UDP packets."""
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.bind((host, port))

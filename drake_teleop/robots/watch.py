@@ -1,6 +1,4 @@
-"""Detection of contact or of another load, sample by sample, for `compensate --watch` and
-`--free`.
-"""
+"""Detection of contact or of another load, sample by sample, for `compensate`."""
 
 from __future__ import annotations
 
@@ -40,15 +38,13 @@ _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual of
-    `load`.
-    """
+    """Return a reading's white noise (6,) [N, N m] that explains the residual of `load`."""
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
 
 class Watch:
-    """Detector of contact and of another load; `cutoff_hz`: low-pass of the residual of `load`."""
+    """Detector of contact and of another load than the identified one."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = raw_noise(load, dt, cutoff_hz)
@@ -64,7 +60,7 @@ class Watch:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Reset all but the identified load; `offsets` (6,): sensor offsets [N, N m]."""
+        """Reset all but the identified load."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = watched_memory(self._out, self._covariance)
 
@@ -85,10 +81,7 @@ _RATE_TOLERANCE = 0.05
 
 
 class Detector:
-    """Contact detector with the noise floor of a log of free motion, after the causal low-pass.
-
-    The log `free` must have the rate of the stream.
-    """
+    """Contact detector with the noise floor of a log of free motion, after the causal low-pass."""
 
     def __init__(
         self,
@@ -132,7 +125,6 @@ class Detector:
         self.restart()
 
     def restart(self) -> None:
-        """Reset all but the noise floor."""
         self._memory = ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
@@ -146,10 +138,7 @@ class Detector:
         return out
 
     def flags(self, values: Array, contact: Array) -> int:
-        """Return `ReadingFlag.IN_CONTACT` or 0 for a valid reading (15,).
-
-        `contact` (6,) is its low-passed contact wrench [N, N m].
-        """
+        """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
         touched = _detect(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )

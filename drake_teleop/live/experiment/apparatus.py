@@ -50,10 +50,9 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return sigma, sigma_object and gamma [%] that render a stimulus `level`.
+        """Return sigma, sigma_object and gamma [%] that render a stimulus of this level.
 
-        `level` is a force at the tool [N] or a mass at the hand [kg], 0 for none; `pressed` is the
-        expected contact force [N].
+        `level` is a force [N] or mass [kg], `pressed` the expected contact force [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -114,7 +113,6 @@ class IntervalLog:
     """Measures of an interval, from the log's rows.
 
     Attributes:
-        time: time of the last row [s].
         done_at: time at which the tool was at the slot's floor [s]; 0 before.
     """
 
@@ -152,10 +150,7 @@ class IntervalLog:
         return _largest_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def change(self, after: float) -> float:
-        """Return the largest 20 ms mean of the rendered force's change [N] from time `after` [s].
-
-        The reference is the mean of the 0.1 s before `after`.
-        """
+        """Return the largest 20 ms mean of the rendered force's change [N] since `after` [s]."""
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)
         rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)

@@ -126,7 +126,6 @@ class Experiment:
     simulated: SimulatedParticipant = field(default_factory=SimulatedParticipant)
 
     def check(self, where: str) -> None:
-        """Check the experiment without its scenarios."""
         check_ranges(self, where)
         for name in ("tasks", "conditions"):
             if not getattr(self, name):

@@ -93,7 +93,6 @@ class Guided:
         return self._show(without_forces(rows))
 
     def hello(self) -> dict[str, Any]:
-        """Return the experiment's constants, which a new page receives first."""
         procedure = self._procedure
         known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
         hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
@@ -101,7 +100,6 @@ class Guided:
         return self._live.hello() | known | hidden | {"study": study}
 
     def join(self, client: int, now: float) -> None:
-        """Add a page; the first one drives (its inputs move the hand)."""
         if self._driver is None:
             self._set_driver(client, now)
 
@@ -111,7 +109,6 @@ class Guided:
         self._live.join(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; if it drives, the trial restarts."""
         if client == self._driver:
             self._remove_driver(now)
 
@@ -137,7 +134,6 @@ class Guided:
             self._write_error = str(error)
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        """Handle a message of a page; count invalid messages."""
         message = parse_study(text)
         if message is None:
             self.refused += 1
@@ -164,7 +160,6 @@ class Guided:
             self._live.pace.start(now)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next simulation slice or page frame [s]."""
         return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
 
     @property
@@ -182,7 +177,6 @@ class Guided:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate the due slices of time; return a frame for the pages if one is due."""
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
@@ -240,7 +234,7 @@ class Guided:
 
 
 def parse_study(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message: set, rates, drive, go, answer; or None."""
+    """Return the valid requests in a page's message, or None."""
     message = parse(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:

@@ -20,11 +20,7 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
 
 @dataclass(frozen=True)
 class Trial:
-    """Planned trial: indices of its task and condition, and the interval with the stimulus, 1 or
-    2.
-
-    For the peg in a slot, `signal` is 0.
-    """
+    """Planned trial; `signal` is the interval with the stimulus, 1 or 2, or 0 for the peg task."""
 
     task: int
     condition: int
@@ -38,7 +34,6 @@ class IntervalResult:
 
     Attributes:
         level: level of the stimulus; 0 without one.
-        force_N: largest contact force at the tool.
         valid: False without contact.
         done: whether the tool reached the floor of the slot.
         time_s: time until the floor.
@@ -74,8 +69,6 @@ class Procedure:
     """Progress of a participant, continued from the stored trials.
 
     Attributes:
-        phase: `CONSENT` to `END`.
-        interval: 1 or 2.
         level: intended level of the trial's stimulus [N or kg].
         prepared_intervals: number of intervals so far.
         said: whether the last answer was right.
@@ -133,7 +126,6 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def go(self) -> None:
-        """Leave a phase that shows text."""
         if self.phase == CONSENT:
             self.phase = END if self.number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):
@@ -166,7 +158,7 @@ class Procedure:
             self.phase = READY
 
     def answer(self, interval: int, time_s: float) -> None:
-        """Store the answer (interval 1 or 2, after `time_s`), if the phase is `ANSWER`."""
+        """Store the answer (interval 1 or 2, after `time_s`), if one is due."""
         if self.phase == ANSWER:
             self._finish_trial(interval, interval == self.trial.signal, time_s)
 

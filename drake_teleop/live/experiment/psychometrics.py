@@ -2,8 +2,7 @@
 
     d'(x) = (x / threshold)^slope,    P(correct) = lapse / 2 + (1 - lapse) Phi(d' / sqrt 2)
 
-Sources: Foley and Legge, Vision Research 21, 1981; Green and Swets, 1966; Psi method: Kontsevich
-and Tyler, Vision Research 39, 1999; Prins, J. Vision 13(7), 2013.
+Psi method: Kontsevich and Tyler, Vision Research 39, 1999; Prins, J. Vision 13(7), 2013.
 """
 
 from __future__ import annotations
@@ -71,7 +70,6 @@ class Psi:
         return float(self.levels[np.argmin(lost)])
 
     def update(self, level: float, correct: bool) -> None:
-        """Update the posterior with an answer to any level >= 0."""
         p = self._probability(level)
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()

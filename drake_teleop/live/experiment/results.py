@@ -1,7 +1,4 @@
-"""Thresholds, d', times and forces of an experiment with 95 % intervals.
-
-Threshold and d' of a participant are posterior medians, times and forces geometric means.
-"""
+"""Thresholds, d', times and forces of an experiment with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -105,7 +102,6 @@ def _wilson(successes: int, n: int) -> Estimate:
 
 
 def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
-    """Write trials.csv, results.csv and results.png; return the result table."""
     import polars as pl
 
     found = results(experiment, store)

@@ -39,7 +39,6 @@ _ROWS_PERIOD_MS = 200
 def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    """Return the stations: (index of task, index of condition) -> station."""
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
         load = load_for(scenario)
@@ -88,10 +87,7 @@ def take_part(
 def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """Return the interval, 1 or 2, with the larger response [N] after adding noise.
-
-    A difference of `noise` at rest corresponds to d' = 1. A lapse gives a random answer.
-    """
+    """Return the interval, 1 or 2, with the larger response [N] after adding noise."""
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
     noisy = [

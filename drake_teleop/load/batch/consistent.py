@@ -1,6 +1,4 @@
-"""Least squares fit of the load, restricted to loads that a rigid body can have, by a semidefinite
-program (Eqs. (T1), (T5); Wensing, Kim, Slotine, RA-L 2018).
-"""
+"""Least squares fit among loads that a rigid body can have, Eqs. (T1), (T5)."""
 
 from __future__ import annotations
 
@@ -29,14 +27,11 @@ _PRIORS = ("entropic", "geodesic")
 class Prior:
     """Prior knowledge of the load, which adds a cost to the least squares fit.
 
-    For pseudo-inertias J of the load and J_0 of the prior, the cost is the entropic one, tr(J_0^-1 J)
-    - log det J (Lee, Wensing, Park, T-RO 2020), or the geodesic one, 1/2 tr((J_0^-1 (J - J_0))^2)
-    (Lee, Park, RA-L 2018).
-
     Attributes:
         phi: (10,) prior load about So in S, of a body with extent in all directions.
         weight: factor of the cost, a residual variance per sample.
-        kind: "entropic" or "geodesic".
+        kind: cost of the pseudo-inertia J: "entropic" (Lee, Wensing, Park, T-RO 2020) or "geodesic"
+            (Lee, Park, RA-L 2018).
     """
 
     phi: ArrayLike
@@ -82,9 +77,7 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def row(self) -> Array:
-        """Return the vector a (10,) of the constraint a^T phi >= 0, which mass inside the
-        ellipsoid meets.
-        """
+        """Return a (10,) such that a^T phi >= 0 for each phi whose mass is inside the ellipsoid."""
         A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
             raise DrakeTeleopError(
@@ -105,9 +98,8 @@ def consistent_least_squares(
 ) -> Array:
     """Return the parameters [offsets; phi] (16,) with the best fit that a rigid body can have.
 
-    Args:
-        gram, right: (16, 16), (16,) weighted normal equations; per sample if there is a prior.
-        theta: (16,) their solution, returned if it satisfies the constraints.
+    `theta` (16,) is the unconstrained solution of the weighted normal equations `gram` and
+    `right`.
     """
     row = None if ellipsoid is None else ellipsoid.row()
     inside = row is None or row @ theta[6:] >= 0.0
@@ -139,9 +131,7 @@ def _parameter_units(phi: Array) -> Array:
 
 
 def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None) -> Array:
-    """Return the consistent phi, divided by `unit`, that minimises phi^T H phi / 2 - b^T phi +
-    prior cost.
-    """
+    """Return phi / unit of the consistent load with the least phi^T H phi / 2 - b^T phi + prior."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
@@ -199,9 +189,7 @@ def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
 
 
 def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return matrix (11, 11) and vector (11,) of the cone t >= |R x - d|, with R^T R = H and R^T d
-    = b.
-    """
+    """Return matrix and vector of the cone t >= |R x - d|, with R^T R = H and R^T d = b."""
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale

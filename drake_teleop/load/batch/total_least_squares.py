@@ -1,5 +1,6 @@
-"""Total least squares: an estimate of the load that allows for noise of wrench and motion, Eq.
-(T4) (Van Huffel, Vandewalle, 1991, chapters 3 and 8; Kukush, Van Huffel, Metrika 59, 2004).
+"""Total least squares, which allows for noise of wrench and motion, Eq. (T4).
+
+Source: Van Huffel, Vandewalle, The Total Least Squares Problem, 1991, chapters 3 and 8.
 """
 
 from __future__ import annotations
@@ -31,15 +32,13 @@ _MIN_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
 class NormalForm(NamedTuple):
-    """Normal equations gram theta = right, per sample, and their solution theta = [offsets; phi]
-    (16,).
+    """Normal equations gram theta = right, and their solution theta = [offsets; phi] (16,).
 
     Attributes:
-        gram: (16, 16) Gram matrix, compensated for noise.
+        gram: (16, 16) Gram matrix per sample, compensated for noise.
         weights: (6, 6) weights between wrench channels.
         scale: ratio of residual variance to specified noise variance.
         transfer: (16, 16) matrix from the ordinary least squares solution to theta.
-        undetermined: (16,) True for parameters that the motion does not determine.
     """
 
     gram: Array
@@ -109,7 +108,7 @@ def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> Norm
 
 
 def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """Return the smallest noise scale lambda at which the augmented normal equations are singular."""
+    """Return the smallest noise scale at which the augmented normal equations are singular."""
 
     def excess(ratio: float) -> float:
         return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))
@@ -155,7 +154,6 @@ class Record:
         return moments
 
     def every(self, step: int) -> Record:
-        """Return every `step`-th sample."""
         return Record(*(table[::step] for table in self.arrays))
 
     def residual(self, theta: Array, part: slice) -> Array:

@@ -41,10 +41,7 @@ _NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
 
 
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
-    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi] [SI].
-
-    They follow Student's t distribution, and are infinite for undetermined parameters.
-    """
+    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi]."""
     if not 0.0 < level < 1.0:
         raise DrakeTeleopError(
             f"{level} is not between 0 and 1", where="level", remedy="give, say, 0.95"
@@ -58,7 +55,6 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
 def prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Return (n,) True where a standard deviation is at least `share` of the prior's."""
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
@@ -77,7 +73,7 @@ class Combination:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading: index of the leading parameter in `PARAMETERS`.
         share: standard deviation relative to the natural scale of the combination.
-        words: the sum as text; "..." stands for terms below a tenth of the largest.
+        words: the sum as text.
     """
 
     coefficients: Array
@@ -94,9 +90,7 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Base parameters: the combinations of load and offsets that a record determines.
-
-    Source: Gautier, Khalil, IEEE Trans. Robotics and Automation 6(3), 1990.
+    """Combinations of load and offsets that a record determines (Gautier, Khalil, 1990).
 
     Attributes:
         without_influence: names of parameters without influence on the wrench.
@@ -198,11 +192,7 @@ ARM = 0.06
 
 
 def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the covariance (16, 16) of data and prior, and (16,) True where the prior dominates.
-
-    `covariance` (16, 16) of [offsets; phi] is that of the data, `information` (10, 10) the prior's
-    inverse covariance of phi.
-    """
+    """Return the covariance (16, 16) of data and prior; (16,) True where the prior dominates."""
     determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
     used = determined | (np.arange(16) >= 6)
     # Scaled so that all entries have similar size.
@@ -222,11 +212,7 @@ def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np
 
 
 def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
-    """Return the covariance (16, 16) of a fit with white noise that is correlated between
-    channels.
-
-    `plain` is the covariance for uncorrelated channels.
-    """
+    """Return the covariance (16, 16) of a fit with noise that is correlated between channels."""
     W, Z = fit.form.weights, fit.moments.mean
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -250,8 +236,7 @@ def _inverse_gram(fit: Fit) -> Array:
 def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
-    `kept` (N,) marks used samples; `steps` (6, 6) is the covariance of the wrench change per
-    sample.
+    `steps` (6, 6) is the covariance of the wrench change per sample.
     """
     covariance = np.zeros((16, 16))
     if not steps.any():
@@ -273,13 +258,7 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
 
 
 def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
-    """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains.
-
-    Args:
-        products: (bands, 6, n, 6) mean products of regressor (channel, parameter) and wrench channel.
-        W: (bands, 6, 6) weights between the channels.
-        inverse: (n, n) inverse Gram matrix.
-    """
+    """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains."""
     right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
     length = np.repeat([1.0, ARM], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
@@ -287,9 +266,7 @@ def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
 
 
 def gain_covariance(fit: Fit, offsets: bool) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] for sensor gain errors of standard
-    deviation 1.
-    """
+    """Return the covariance (16, 16) of [offsets; phi] for gain errors of standard deviation 1."""
     Z, W = fit.moments.mean, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = inverse_root(normal_equations(Z, W)[0], used)
@@ -299,7 +276,7 @@ def gain_covariance(fit: Fit, offsets: bool) -> Array:
 
 
 def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """Return the covariance (16, 16) of the solution `form`, from that of least squares, `plain`."""
+    """Return the covariance (16, 16) of the solution `form`, from that of least squares."""
     unknown = np.isinf(np.diag(plain))
     covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
     if not offsets:  # covariance for known offsets

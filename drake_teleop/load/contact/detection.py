@@ -1,13 +1,10 @@
 """Contact detection, sample by sample, in a wrench from which the load's wrench is removed.
 
-Contact begins when a statistic reaches a threshold. The statistics are functions of the wrench z
-in standard deviations of its noise, and of its unpredictable part e::
+The statistics are functions of the normalised wrench z and its unpredictable part e::
 
     level    |z|; its square is chi-squared with six degrees of freedom
-    cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics
-             30, 1988)
-    glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)), n = 1, 2, 4 ... `WINDOW`:
-             generalised likelihood ratio (Lorden 1971; Willsky and Jones 1976)
+    cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|) (Crosier, Technometrics 30, 1988)
+    glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)) (Willsky and Jones 1976)
 """
 
 from __future__ import annotations
@@ -55,14 +52,9 @@ LEAVE = 0.7 * RARE
 def detection_update(
     memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
 ):
-    """Process one sample and write the three statistics to memory[5:8].
+    """Process one sample and write level, cusum and glr to memory[5:8].
 
-    Args:
-        memory: (SIZE,), zeros before the first sample.
-        contact: (6,) contact wrench F_c, Eq. (13) [N, N m].
-        s, omega, alpha, acceleration: (3,) motion, as in `Samples`.
-        parameters: `NoiseFloor.parameters`.
-        slack, following, quiet: `slack`, `following`, `leave` of `ContactDetector`.
+    `memory` (SIZE,) is zero before the first sample; `quiet` is `leave` of `ContactDetector`.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -150,10 +142,7 @@ def _last_sum(memory, hold, widths):
 
 @njit(cache=True)
 def hysteresis_update(memory, statistic, enter, leave, hold, widths):
-    """Return whether there is contact, after `detection_update` of the same memory.
-
-    `statistic` is an index into `STATISTICS`; `widths` is `NoiseFloor.widths`.
-    """
+    """Return whether there is contact, after `detection_update` of the same memory."""
     if memory[FLAG] == 0.0:
         if memory[FIRST_STATISTIC + statistic] >= enter:
             memory[FLAG], memory[QUIET_FOR] = 1.0, 0.0
@@ -169,9 +158,7 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 @njit(cache=True)
 def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Process one sample and return whether there is contact; `decision` is
-    `ContactDetector.settings`.
-    """
+    """Process one sample and return whether there is contact."""
     slack, following, statistic, enter, leave, hold = decision
     detection_update(
         memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
@@ -229,13 +216,12 @@ class ContactDetector:
         return np.zeros(SIZE)
 
     def update(self, *sample: ArrayLike) -> bool:
-        """Process one sample (fields of `Samples`); return whether there is contact."""
         named = zip(Samples._fields, sample, strict=True)
         arrays = [checked(name, x, 6 if name == "contact" else 3) for name, x in named]
         return bool(flag_update(self._memory, *arrays, *self.settings))
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
-        """Process the N `Samples` of a log; return (N,) True for contact."""
+        """Process N samples of a log; return (N,) True for contact."""
         rows = checked_samples(*samples)
         out = np.empty(len(rows[0]), np.bool_)
         _flags(self._memory, tuple(rows), self.settings, out)
@@ -243,11 +229,7 @@ class ContactDetector:
 
 
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return direction, point and pitch [m] of the central axis of wrenches (..., 6) in S
-    (Poinsot).
-
-    The point (..., 3) is the nearest to So [m]. Wrenches without force give NaN.
-    """
+    """Return direction, point nearest to So and pitch [m] of the central axis of wrenches in S."""
     w = checked("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
     square = np.sum(f * f, axis=-1)
@@ -272,13 +254,6 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
-    """Return the noise floor of a record of free motion; fast motion gives the best estimate.
-
-    `covariance` (16, 16) is from `finite_covariance`.
-
-    Raises:
-        DrakeTeleopError: for fewer than 100 samples.
-    """
     from scipy.optimize import nnls
 
     rows = checked_samples(contact, s, omega, alpha, acceleration)

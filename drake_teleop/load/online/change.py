@@ -1,9 +1,9 @@
 """Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24)::
 
-known       the known load explains the mean wrench of blocks of `BLOCK` seconds
+known       the known load explains the mean wrench of blocks of samples
 disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
-changed     a new load has explained it for `HOLD` seconds
-identified  mass and first moments of the new load are identified: it is now the known load
+changed     a new load explains it
+identified  mass and first moments of the new load are identified
 """
 
 from __future__ import annotations
@@ -69,14 +69,7 @@ _RESOLUTION = 1e-10
 
 @njit(cache=True)
 def whitening(motion, phi, noise, model_var, n):
-    """Return a matrix (6, 6) that maps the wrench noise of a block mean to unit covariance.
-
-    Args:
-        motion: (9,) mean [s, omega, alpha].
-        noise: (15 or more,) long-run variances per sample of wrench and motion.
-        model_var: squared relative model error.
-        n: samples of the block.
-    """
+    """Return a matrix (6, 6) that maps the wrench noise of a block mean to unit covariance."""
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
@@ -110,13 +103,9 @@ def whitening(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def update_estimate(estimate, V, wrench, root):
-    """Update an estimate by the mean of a block, Eq. (T6); return chi-squared of its innovation.
+    """Update an estimate [theta (16); covariance (256)] by the mean of a block, Eq. (T6).
 
-    Args:
-        estimate: [theta (16); covariance (256)], theta = [offsets; phi], updated.
-        V: (6, 10) mean regressor.
-        wrench: (6,) mean wrench [N, N m].
-        root: (6, 6) from `whitening`.
+    Return chi-squared of its innovation.
     """
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
@@ -148,10 +137,7 @@ def update_estimate(estimate, V, wrench, root):
 
 @njit(cache=True)
 def _update_filter(memory, place, block, noise):
-    """Update a filter by a block; return chi-squared of its innovation.
-
-    Model errors count once in the test, but for their duration in the update.
-    """
+    """Update a filter by a block; return chi-squared of its innovation."""
     phi = memory[place + 6 : place + 16].copy()
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
     V = memory[_V:_KNOWN].reshape(6, 10)
@@ -199,13 +185,7 @@ def _inflate_inertia_variances(memory, noise, block):
 
 @njit(cache=True)
 def change_update(memory, sample, block, noise, window, hold, bound):
-    """Process one sample in the change detector.
-
-    Args:
-        memory: from `change_memory`, updated.
-        sample: (15 or more,) [wrench, s, omega, alpha].
-        block, noise, window, hold, bound: from `change_parameters`.
-    """
+    """Process one sample in the change detector, without checks; `memory` is updated."""
     V = np.empty((6, 10))
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
     regressor_into(s, omega, alpha, V)
@@ -292,16 +272,12 @@ def change_parameters(
     model_error: float = 0.0,
     bound: float | None = None,
 ) -> Parameters:
-    """Return the arguments block, noise, window, hold, bound of `change_update`.
-
-    They are: samples of a block; (17,) long-run variances of wrench (6) and motion (9), squared
-    model error and its duration [blocks]; durations `WINDOW` and `HOLD` [blocks]; and the bound
-    below.
+    """Return the parameters of the change detector.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
         period: time between samples [s].
-        model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
+        model_error: relative error of the load's wrench.
         bound: required standard deviation of a new load's mass, relative to the change of mass.
     """
     positive("period", period)
@@ -322,9 +298,7 @@ def change_parameters(
 def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT) -> Array:
     """Return the initial memory of the change detector for a known load.
 
-    Args:
-        theta, covariance: (16,), (16, 16) of [offsets; phi].
-        offset_drift: (6,) standard deviation of the drift since the identification [N, N m].
+    `offset_drift` (6,) is the standard deviation of the drift since the identification [N, N m].
     """
     prior = np.square(PRIOR_STD)
     P = covariance.copy()
@@ -345,7 +319,6 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
 
 @njit(cache=True)
 def known_load(memory):
-    """Return [offsets; phi] (16,) of the known load, a view into the memory."""
     return memory[_KNOWN : _KNOWN + 16]
 
 
@@ -357,7 +330,6 @@ def change_state(memory):
 
 @njit(cache=True)
 def new_load(memory):
-    """Return [offsets; phi] (16,) of the new load, a view into the memory."""
     return memory[_NEW : _NEW + 16]
 
 
@@ -383,10 +355,7 @@ def watch_load(
 
 
 def identified_load(memory: Array, known: Identification) -> Identification:
-    """Return the last new load that the detector identified, or `known` if there is none.
-
-    Inertias without excitation keep their former values with a large standard deviation.
-    """
+    """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE] == KNOWN:
         return known
     phi, P = memory[_KNOWN + 6 : _KNOWN + 16].copy(), memory[_KNOWN + 16 : _WATCH]

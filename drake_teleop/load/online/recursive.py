@@ -1,7 +1,4 @@
-"""Recursive least squares for load and offsets, Eq. (T6).
-
-Each sample is six rank-one updates (Ljung, System Identification, section 11.2).
-"""
+"""Recursive least squares for load and offsets, Eq. (T6) (Ljung, System Identification, 11.2)."""
 
 from __future__ import annotations
 
@@ -40,14 +37,10 @@ _MIN_RELATIVE_VARIANCE = 1e-10
 
 @njit(cache=True)
 def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
-    """Update a recursive least squares estimate by N samples, without checks.
+    """Update estimate theta (16,) and covariance P (16, 16) by N samples, without checks.
 
-    Args:
-        theta: (16,) estimate [offsets; phi], updated.
-        P: (16, 16) covariance, exactly symmetric, updated.
-        samples: (N, at least 15) rows [wrench, s, omega, alpha].
-        largest: (16,) upper bound of the variances during forgetting.
-        squares: (6,) sums of squared residuals, updated [N^2, N^2 m^2].
+    `largest` (16,) limits the variances during forgetting; `squares` (6,) are the sums of squared
+    residuals.
     """
     V, gain = np.empty((6, 10)), np.empty(16)
     step = 1.0 / math.sqrt(forgetting)
@@ -93,7 +86,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
 class RecursiveEstimator(ABC):
     """Recursive estimator of load and sensor offsets, theta = [offsets; phi] (16,).
 
-    Its state is theta and a `memory` array; both can be external, such as a Drake state.
+    Its state, theta and a `memory` array, can be external.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
@@ -134,10 +127,7 @@ class RecursiveEstimator(ABC):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveEstimator:
-        """Return an estimator for standard deviations of wrench (6,) and motion (9,).
-
-        An estimator that does not support noise of the motion ignores it.
-        """
+        """Return an estimator for standard deviations of wrench (6,) and motion (9,)."""
         return cls(noise_std, forgetting=forgetting, bound=bound)
 
     @property
@@ -150,7 +140,6 @@ class RecursiveEstimator(ABC):
 
     @property
     def covariance(self) -> Array:
-        """Covariance (16, 16) of [offsets; phi] for white noise [SI]."""
         return self.covariance_of(self._theta, self._memory)
 
     @property
@@ -159,7 +148,6 @@ class RecursiveEstimator(ABC):
         return self.settled_at(self._theta, self._memory)
 
     def settled_at(self, theta: Array, memory: Array) -> bool:
-        """Return `settled` for an external theta and memory."""
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
@@ -172,10 +160,7 @@ class RecursiveEstimator(ABC):
     def covariance_of(self, theta: Array, memory: Array) -> Array: ...
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
-        """Process one sample with an external theta and memory, without checks; update both.
-
-        `memory` is C-contiguous; `sample` begins with [wrench, s, omega, alpha].
-        """
+        """Process one sample with an external theta and memory, without checks."""
         self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
     @abstractmethod
@@ -185,11 +170,7 @@ class RecursiveEstimator(ABC):
     def _residual_rms(self) -> Array: ...
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Process one sample of a free motion: wrench (6,), others (3,), as for `identify`.
-
-        Raises:
-            DrakeTeleopError: for invalid input; the estimate is then unchanged.
-        """
+        """Process one sample of a free motion: wrench (6,), others (3,)."""
         parts = (wrench, s, omega, alpha)
         shapes = [np.shape(part) for part in parts]
         if shapes != [(6,), (3,), (3,), (3,)]:
@@ -205,7 +186,7 @@ class RecursiveEstimator(ABC):
         self._samples += 1
 
     def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Update by N samples of a free motion, (N, 6) and (N, 3); faster than `update`."""
+        """Process N samples of a free motion, (N, 6) and (N, 3); faster than `update`."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])

@@ -1,11 +1,10 @@
 """Recursive total least squares: load and offsets for noise of wrench and motion, Eq. (T18).
 
-The estimate minimises lambda, the squared residuals over their expected value (Kubus, Kroeger,
-Wahl, IROS 2008). As in `moments`, row c of the regressor [E V] is T_c z, with the wrench F last:
+The estimate minimises the squared residuals over their expected value (Kubus, Kroeger, Wahl, IROS
+2008). Row c of the regressor [E V] is T_c z with constant T_c; [G g] are the normal equations, and
+Z (19, 19) is the sum of z z^T:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
-
-G, g are the normal equations, N is the noise in G. Compiled functions check no input.
 """
 
 from __future__ import annotations
@@ -53,7 +52,6 @@ def terms() -> tuple[NDArray[np.uintp], Array]:
 
 @njit(cache=True)
 def scratch():
-    """Return working arrays of `rtls_normal_equations`."""
     return (
         np.empty((13, 6, 16)),
         np.empty(16),
@@ -67,7 +65,6 @@ def scratch():
 
 @njit(cache=True)
 def write_z(wrench, motion, z):
-    """Write z = [1, s, alpha, products of omega, wrench] (19,)."""
     s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
     for i in range(3):
@@ -100,10 +97,7 @@ def forget(memory, theta, information, forgetting):
 
 @njit(cache=True)
 def residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L, L Z and S = L Z L^T (6, 6) for the residual r = F - [E V] theta = L z.
-
-    Z (19, 19) is the sum of z z^T or its noise covariance; `index`, `factors` are from `terms`.
-    """
+    """Write L, L Z and S = L Z L^T (6, 6) for the residual r = F - [E V] theta = L z."""
     L[:] = 0.0
     LZ[:] = 0.0
     for c in range(6):
@@ -126,7 +120,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the expected noise of the sum of z z^T, Z (19, 19), into Q."""
+    """Write the expected noise of Z into Q."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
@@ -142,11 +136,7 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 @njit(cache=True)
 def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z.
-
-    Z (19, 19) is the sum of y z^T, W (6, 6) the weights between channels; E (13, 6, 16) is
-    scratch.
-    """
+    """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z."""
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
@@ -167,10 +157,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def weighted_right(LZ, W, index, factors, g):
-    """Write the right-hand side g (16,), the sum of X^T W r with X = [E V] of z.
-
-    LZ (6, 19) is the sum of r z^T; r is the wrench or the residual.
-    """
+    """Write the right-hand side g (16,), the sum of X^T W r with X = [E V] of z."""
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -242,10 +229,7 @@ class MomentEstimator(RecursiveEstimator):
 
 @njit(cache=True)
 def select_compensated(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise can be compensated, otherwise to 0.
-
-    Restricted to these, G - strength N is positive definite. K (16, 16) is scratch.
-    """
+    """Set `taper` (16,) to 1 for parameters whose noise can be compensated, otherwise to 0."""
     taper[:] = 1.0
     for i in range(16):
         for j in range(16):
@@ -277,10 +261,7 @@ def select_compensated(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write [G g] into G (16, >= 17) and the noise of G into N (16, 16); return lambda.
-
-    Z (19, 19) is the sum of z z^T; `space` is from `scratch`, and Q (19, 19) is scratch.
-    """
+    """Write [G g] into G and the noise of G into N; return the noise scale."""
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
     residual_products(Q, theta, index, factors, L, LZ, S)
@@ -305,14 +286,10 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
 def rtls_update(
     theta, memory, samples, noise_std, motion_std, forgetting, information, index, factors
 ):
-    """Update a recursive total least squares estimate by N samples.
+    """Update theta (16,) and memory (20, 19) of recursive total least squares by N samples.
 
-    Args:
-        theta: (16,) estimate [offsets; phi], updated.
-        memory: (20, 19) of `MomentEstimator`, updated.
-        samples: (N, at least 15) rows [wrench, s, omega, alpha].
-        noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
-        forgetting, information: factor per sample, and (16,) inverse variances of the prior.
+    `noise_std` (6,) and `motion_std` (9,) are standard deviations of the wrench and of [s, omega,
+    alpha]; `information` (16,) are inverse variances of the prior.
     """
     space, Q, z, taper = scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
@@ -340,9 +317,7 @@ def rtls_update(
 class RecursiveTotalLeastSquares(MomentEstimator):
     """Recursive total least squares, which allows for noise of the measured motion.
 
-    Args:
-        noise_std, forgetting, prior_std, bound: as for `RecursiveEstimator`.
-        motion_std: (9,) noise of s [m/s^2], omega [rad/s], alpha [rad/s^2]; zeros: least squares.
+    `motion_std` (9,) is the noise of s [m/s^2], omega [rad/s], alpha [rad/s^2].
     """
 
     method = "recursive total least squares"
@@ -377,10 +352,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance lambda H^-1 G H^-1 (16, 16), H = G - lambda N.
-
-        Directions without sufficient information get the prior's variance.
-        """
+        """Return the covariance (16, 16); poorly excited directions have the prior's variance."""
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
         root = np.linalg.inv(_cholesky(G + information))

@@ -1,11 +1,8 @@
 """Monitor of a known load in use, which selects the load to eliminate, sample by sample::
 
-    settled     the known load explains the wrench and is used
-    disturbed   contact, or the moment of a grasp; the known load is used
-    changed     another load: the fallback (gripper or nothing) is used until the known load
-                explains the wrench again or the new load is identified
-
-At rest, the offsets follow small residuals.
+settled     the known load explains the wrench and is used
+disturbed   contact, or the moment of a grasp; the known load is used
+changed     another load; the fallback (gripper or nothing) is used
 """
 
 from __future__ import annotations
@@ -62,7 +59,6 @@ SIZE = _CHANGE + change.SIZE
 
 
 def watched_memory(theta: Array, covariance: Array) -> Array:
-    """Return the initial memory for a known [offsets; phi] (16,) and its covariance (16, 16)."""
     rest = np.zeros(_CHANGE)
     rest[_STATE] = SETTLED
     return np.concatenate([rest, change.change_memory(theta, covariance)])
@@ -116,15 +112,10 @@ def _is_within_reach(known, new):
 
 @njit(cache=True)
 def watched_update(out, memory, sample, fallback, period, block, noise, window, hold, bound):
-    """Process one sample: monitor the known load and write the load to eliminate; no checks.
+    """Process one sample: monitor the known load and write the load to eliminate into `out` (16,).
 
-    Args:
-        out: (16,) [offsets; phi] to eliminate, updated.
-        memory: from `watched_memory`, updated.
-        sample: (15 or more,) [wrench, s, omega, alpha].
-        fallback: (10,) phi that is used for a changed load.
-        period: time between samples [s].
-        block, noise, window, hold, bound: from `change.change_parameters`.
+    `fallback` (10,) is the phi for a changed load; the last arguments are from
+    `change_parameters`.
     """
     watch = memory[_CHANGE:]
     change_update(watch, sample, block, noise, window, hold, bound)

@@ -125,7 +125,6 @@ def _description(target: Target, version: str, token: str, compiled: list[str]) 
 
 
 def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
-    """Add the outputs to the model structure: by value reference (FMI 3.0) or index (FMI 2.0)."""
     for tag in ("Output", "InitialUnknown"):
         group = structure if new else SubElement(structure, f"{tag}s")
         for k in outputs:
@@ -136,7 +135,6 @@ def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
 
 
 def _variables(target: Target) -> list[tuple[str, str, str, float | None]]:
-    """Return name, causality, unit and start value in the order of fmu.h."""
     wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
