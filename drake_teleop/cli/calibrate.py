@@ -76,7 +76,7 @@ def calibrate_command(
         "seconds": last.t,
         "looks": len(looks),
         "left_out": recorder.left_out,
-        "began_anew": recorder.began_anew,
+        "clock_changes": recorder.clock_changes,
     }
     write_json(out / "summary.json", summary)
     verdict = "known" if summary["all_known"] else "[bold red]not known[/]"

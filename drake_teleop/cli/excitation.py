@@ -80,7 +80,7 @@ def excite_command(
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
             raise DrakeTeleopError(
-                "the model does not say where the sensor is",
+                "is missing, and the model does not contain the sensor's position",
                 where="--sensor-frame",
                 remedy="name the frame or link at which it measures",
             )

@@ -36,7 +36,7 @@ def experiment_command(
             else:
                 from drake_teleop.live.experiment.server import serve_experiment
 
-                number = whose_turn(store, len(trials_of(experiment, 1)), participant)
+                number = next_participant(store, len(trials_of(experiment, 1)), participant)
                 serve_experiment(experiment, scenarios, store, number, **page)
         finally:
             table = write_results(experiment, store)
@@ -44,7 +44,7 @@ def experiment_command(
     return table
 
 
-def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
+def next_participant(store: Store, trials: int, wanted: int | None = None) -> int:
     """Return a participant's number: the requested, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted

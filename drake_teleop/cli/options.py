@@ -13,7 +13,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from drake_teleop.common.config import in_short
+from drake_teleop.common.config import short_text
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir, studies_dir
 from drake_teleop.common.registry import REGISTRIES
@@ -59,11 +59,11 @@ def _check_range(
 ) -> None:
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
-        text = f"{in_short(number)} is outside {in_short(low or 0)} to {in_short(high)}"
+        text = f"{short_text(number)} is outside {short_text(low or 0)} to {short_text(high)}"
         kind.fail(text, param, ctx)
     if low is not None and (number < low or (kind.min_open and number == low)):
         relation = "not above" if kind.min_open else "below"
-        kind.fail(f"{in_short(number)} is {relation} {in_short(low)}", param, ctx)
+        kind.fail(f"{short_text(number)} is {relation} {short_text(low)}", param, ctx)
 
 
 class Number(click.FloatRange):

@@ -52,7 +52,7 @@ def plain(default: Any, doc: str, registry: Registry[Any] | None = None) -> Any:
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def in_short(value: Any) -> str:
+def short_text(value: Any) -> str:
     if value is None:
         return "nothing"
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -65,7 +65,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
     """Check field names and types of parsed YAML against a dataclass."""
     if not isinstance(data, dict):
         raise DrakeTeleopError(
-            f"expected a mapping of fields, found {in_short(data)}",
+            f"expected a mapping of fields, found {short_text(data)}",
             where=where,
             remedy=f"the fields are {', '.join(_field_names(schema))}",
         )
@@ -133,7 +133,8 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
     for number in values:
         if not low <= number <= high:  # also false for NaN
             raise DrakeTeleopError(
-                f"{in_short(number)}{unit} is outside {in_short(low)} to {in_short(high)}{unit}",
+                f"{short_text(number)}{unit} is outside "
+                f"{short_text(low)} to {short_text(high)}{unit}",
                 where=place,
                 remedy=f"check the value and its unit ({metadata['doc']})",
             )

@@ -140,7 +140,7 @@ def remove_log(path: Path) -> None:
     parts = sorted(path.glob(PARTS_OF_LOG))
     if others := sorted(set(path.iterdir()) - set(parts)):
         raise DrakeTeleopError(
-            f"holds {others[0].name}, which is no part of a log",
+            f"contains {others[0].name}, which is not part of a log",
             where=str(path),
             remedy="give another folder for the log",
         )

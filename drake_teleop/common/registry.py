@@ -43,14 +43,18 @@ class Registry(dict[str, _Part]):
                 remedy="use only letters, digits, _ . -, first a letter, digit, _ or .",
             )
         if name in self.shipped:
-            raise DrakeTeleopError(f"'{name}' is shipped", where=self.kind, remedy="rename yours")
+            raise DrakeTeleopError(
+                f"'{name}' is a part of drake_teleop", where=self.kind, remedy="use another name"
+            )
         self[name] = part
         return part
 
     def remove(self, name: str) -> None:
         if name in self.shipped:
             raise DrakeTeleopError(
-                f"'{name}' is shipped", where=self.kind, remedy="remove only registered parts"
+                f"'{name}' is a part of drake_teleop",
+                where=self.kind,
+                remedy="remove only registered parts",
             )
         del self[self.check(name)]
 

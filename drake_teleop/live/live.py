@@ -37,8 +37,8 @@ Show = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 """Function from rows of a log to the 3D scene's part of a frame."""
 
 #: Period of the frames for the page [s].
-FRAME = 1 / 60
-_MIN_FRAME_PERIOD_S = 0.25 * FRAME  # s, shortest time between two frames
+FRAME_PERIOD_S = 1 / 60
+_MIN_FRAME_PERIOD_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two frames
 #: Smallest contact force at the hand that a gamepad displays [N].
 TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; maximum number of slices between two polls
@@ -229,8 +229,8 @@ class Live:
         show_now = self._show_now and now >= self._last_frame_at + _MIN_FRAME_PERIOD_S
         if now < self._frame_due and not show_now:
             return None
-        scheduled = max(self._frame_due + FRAME, now - FRAME)
-        self._frame_due = now + 1.5 * FRAME if show_now else scheduled
+        scheduled = max(self._frame_due + FRAME_PERIOD_S, now - FRAME_PERIOD_S)
+        self._frame_due = now + 1.5 * FRAME_PERIOD_S if show_now else scheduled
         self._last_frame_at, self._show_now = now, False
         return self.frame()
 

@@ -206,7 +206,7 @@ class Identification:
             **optional,
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
-            raise _file_error("does not follow from phi, covariance and flags", f"{path}:verdicts")
+            raise _file_error("contradicts phi, covariance and flags", f"{path}:verdicts")
         for name, value in result._derived().items():
             if isinstance(value, bool):
                 follows = document[name] is value
@@ -214,9 +214,7 @@ class Identification:
                 stated = numbers(name, *np.shape(value))
                 follows = np.allclose(stated, value, rtol=1e-6, atol=1e-9)
             if not follows:
-                raise DrakeTeleopError(
-                    "does not follow from phi", where=f"{path}:{name}", remedy="edit phi"
-                )
+                raise DrakeTeleopError("contradicts phi", where=f"{path}:{name}", remedy="edit phi")
         return result
 
     def _derived(self) -> dict[str, Any]:

@@ -235,7 +235,7 @@ class MotionWindow:
             self.reset()
 
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Return times [s] and motions [s, omega, alpha] that a part completes; poses add gravity."""
+        """Return times [s] and motions [s, omega, alpha, known gravity] that a part completes."""
         row = self._row(part)
         if row is None:
             return []

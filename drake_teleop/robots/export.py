@@ -201,7 +201,7 @@ def _bota(load: Load) -> str:
     return _json({"payload_compensator_config": config})
 
 
-_SIX = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_INERTIA_NAMES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def _urdf(load: Load) -> str:
@@ -209,7 +209,7 @@ def _urdf(load: Load) -> str:
     inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
     SubElement(inertial, "origin", xyz=_words(load.com), rpy="0 0 0")
     SubElement(inertial, "mass", value=_number(load.mass))
-    SubElement(inertial, "inertia", dict(zip(_SIX, map(_number, load.six), strict=True)))
+    SubElement(inertial, "inertia", dict(zip(_INERTIA_NAMES, map(_number, load.six), strict=True)))
     return _xml(root)
 
 
@@ -220,7 +220,7 @@ def _sdf(load: Load) -> str:
     SubElement(inertial, "pose").text = f"{_words(load.com)} 0 0 0"
     SubElement(inertial, "mass").text = _number(load.mass)
     inertia = SubElement(inertial, "inertia")
-    for name, value in zip(_SIX, load.six, strict=True):
+    for name, value in zip(_INERTIA_NAMES, load.six, strict=True):
         SubElement(inertia, name).text = _number(value)
     return _xml(root)
 

@@ -48,7 +48,7 @@ class Records(ABC, Generic[_T]):
 
     Attributes:
         left_out: number of rejected samples.
-        began_anew: number of clock changes.
+        clock_changes: number of clock changes.
     """
 
     file: str
@@ -56,7 +56,7 @@ class Records(ABC, Generic[_T]):
 
     def __init__(self, largest: dict[str, Array | None]) -> None:
         self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
-        self.left_out, self.began_anew = 0, 0
+        self.left_out, self.clock_changes = 0, 0
         self._part, self._other_clock = self._empty_part(), self._empty_part()
         self._longest = self._part
 
@@ -76,7 +76,7 @@ class Records(ABC, Generic[_T]):
             other = self._other_clock[stream] = _Samples()
         self.left_out += not (samples if same_clock else other).add(t, values, now)
         if len(other.t) == _CLOCK_SAMPLES:
-            self.began_anew += 1
+            self.clock_changes += 1
             self._longest = self._longest_part()
             self._part, self._other_clock = self._other_clock, self._empty_part()
 

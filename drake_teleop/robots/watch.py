@@ -10,7 +10,12 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.contact.detection import RARE, ContactDetector, fit_noise_floor, flag_update
+from drake_teleop.load.contact.detection import (
+    MAX_NOISE_LEVEL,
+    ContactDetector,
+    fit_noise_floor,
+    flag_update,
+)
 from drake_teleop.load.contact.noise_floor import finite_covariance
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters
@@ -116,7 +121,7 @@ class Detector:
         covariance = finite_covariance(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
-        threshold = max(RARE, floor.threshold(_STATISTIC))
+        threshold = max(MAX_NOISE_LEVEL, floor.threshold(_STATISTIC))
         self._settings = ContactDetector(
             floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
         ).settings

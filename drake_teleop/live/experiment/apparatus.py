@@ -116,7 +116,7 @@ class IntervalLog:
         done_at: time at which the tool was at the slot's floor [s]; 0 before.
     """
 
-    def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
+    def __init__(self, scenario: Scenario, insert: Insert | None) -> None:
         self.time, self.done_at = 0.0, 0.0
         self._forces: list[Array] = []
         self._rendered: list[Array] = []

@@ -18,7 +18,7 @@ from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
 from drake_teleop.live.experiment.simulated import seeded
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.live import FRAME, Live, Show, parse
+from drake_teleop.live.live import FRAME_PERIOD_S, Live, Show, parse
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
@@ -71,7 +71,7 @@ class Guided:
         self._show = self._shows[trial.task]
         insert = self._scenarios[trial.task].operator.task
         insert = insert if isinstance(insert, Insert) else None
-        self._rows = IntervalLog(procedure.task, self._apparatus.scenario, insert)
+        self._rows = IntervalLog(self._apparatus.scenario, insert)
         self._stimulus = self._apparatus.inputs(procedure.present_level, procedure.expected_force)
         name = f"{procedure.number:04}-{procedure.interval}"
         self._live = Live(
@@ -189,7 +189,7 @@ class Guided:
             return self.frame() if frame_is_due else None
         if now < self._frame_due:
             return None
-        self._frame_due = now + FRAME
+        self._frame_due = now + FRAME_PERIOD_S
         return self.frame()
 
     def _end_interval_if_over(self, now: float) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.axes import Axes
 
-_Z = 1.959964
+_NORMAL_QUANTILE = 1.959964
 _PICTURED_QUANTITIES = (
     "threshold of contact [N at the tool]",
     "threshold of mass [kg at the hand]",
@@ -95,9 +95,9 @@ def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Esti
 
 
 def _wilson(successes: int, n: int) -> Estimate:
-    p, z2 = successes / n, _Z**2
+    p, z2 = successes / n, _NORMAL_QUANTILE**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    half = _NORMAL_QUANTILE / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
     return Estimate(p, max(middle - half, 0.0), min(middle + half, 1.0))
 
 

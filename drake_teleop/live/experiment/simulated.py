@@ -102,7 +102,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     assert not isinstance(task, PegInSlot)
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
     stimulus = apparatus.inputs(procedure.present_level, procedure.expected_force)
-    rows = IntervalLog(task, apparatus.scenario, None)
+    rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
     while session.ms < 1e3 * task.interval:
         t = max(1e-3 * session.ms - _MOTION_START_S, 0.0)

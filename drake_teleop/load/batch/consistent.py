@@ -53,7 +53,7 @@ class Prior:
             )
         if np.linalg.eigvalsh(pseudo_inertia(self.phi))[0] <= 0.0:
             raise DrakeTeleopError(
-                "its body has no extent in some direction",
+                "is the load of a body that has no extent in some direction",
                 where="prior.phi",
                 remedy="give a body with mass, and inertia about all axes",
             )

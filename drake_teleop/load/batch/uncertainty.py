@@ -187,7 +187,7 @@ def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     return text + " + ..." if small.any() else text
 
 
-ARM = 0.06
+TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
@@ -260,7 +260,7 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
 def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
     """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains."""
     right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
-    length = np.repeat([1.0, ARM], 3)
+    length = np.repeat([1.0, TORQUE_ARM_M], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
     return np.asarray(effect.reshape(len(inverse), 36))
 

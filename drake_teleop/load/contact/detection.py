@@ -39,12 +39,12 @@ COUNT, FLAG, QUIET_FOR, FIRST_STATISTIC = 0, 3, 4, 5
 Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
 SIZE = RING + 6 * WINDOW
 """Length of the memory of `detection_update`."""
-SLACK = 1.0
+DEFAULT_SLACK = 1.0
 """Default slack of the cumulative sum [standard deviations]. In white noise, half of the smallest
 shift to be detected is best; this value tolerates lasting errors of the load."""
-RARE = 6.2
+MAX_NOISE_LEVEL = 6.2
 """Level that normal noise reaches once in a million samples."""
-LEAVE = 0.7 * RARE
+END_LEVEL = 0.7 * MAX_NOISE_LEVEL
 """Level below which contact may end."""
 
 
@@ -116,12 +116,12 @@ def _statistics(rows, parameters, slack, following, quiet, out):
 
 
 def statistics(
-    floor: NoiseFloor, *samples: ArrayLike, slack: float = SLACK, following: float = 0.0
+    floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK, following: float = 0.0
 ) -> Array:
     """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations."""
     rows = checked_samples(*samples)
     out = np.empty((len(rows[0]), 3))
-    sums = float(positive("slack", slack)), float(following), LEAVE
+    sums = float(positive("slack", slack)), float(following), END_LEVEL
     _statistics(tuple(rows), floor.parameters, *sums, out)
     return out
 
@@ -192,9 +192,9 @@ class ContactDetector:
         threshold: float,
         *,
         statistic: str = "cusum",
-        leave: float = LEAVE,
+        leave: float = END_LEVEL,
         hold: int = 20,
-        slack: float = SLACK,
+        slack: float = DEFAULT_SLACK,
         following: float = 0.0,
     ) -> None:
         column = statistic_index(statistic)

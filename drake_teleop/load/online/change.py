@@ -35,10 +35,10 @@ STATES = ("known", "disturbed", "changed", "identified")
 """States of the monitor, by index."""
 KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
 
-BLOCK, WINDOW, HOLD, MEMORY = 0.016, 2.0, 0.2, 0.3
+BLOCK_S, WINDOW_S, HOLD_S, MODEL_ERROR_S = 0.016, 2.0, 0.2, 0.3
 """Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
 error."""
-BOUND = 0.0025
+DEFAULT_BOUND = 0.0025
 """Default of `bound`: four standard deviations are 1 % of the change of mass."""
 OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
@@ -287,9 +287,13 @@ def change_parameters(
             where="model_error",
             remedy="give the relative error of the model",
         )
-    bound = max(BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
-    block = max(1, round(BLOCK / period))
-    window, hold, memory = (max(1, round(x / (block * period))) for x in (WINDOW, HOLD, MEMORY))
+    bound = (
+        max(DEFAULT_BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
+    )
+    block = max(1, round(BLOCK_S / period))
+    window, hold, memory = (
+        max(1, round(x / (block * period))) for x in (WINDOW_S, HOLD_S, MODEL_ERROR_S)
+    )
     std = positive("wrench_std", wrench_std, 6), checked("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
     return block, np.append(noise, memory), window, hold, bound

@@ -25,7 +25,7 @@ from drake_teleop.load.regressor import (
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Standard deviations of the default prior about zero [N, N m, kg, kg m, kg m^2]."""
 
-SETTLED = 0.05
+MAX_SETTLED_STD = 0.05
 """Default of `bound`, relative to the natural scale."""
 
 # Smallest relative eigenvalue that is not rounding.
@@ -105,7 +105,7 @@ class RecursiveEstimator(ABC):
         noise_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = SETTLED,
+        bound: float = MAX_SETTLED_STD,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise DrakeTeleopError(

@@ -21,8 +21,8 @@ from drake_teleop.common.numeric import Array, checked
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.moments import coefficients
 from drake_teleop.load.online.recursive import (
+    MAX_SETTLED_STD,
     PRIOR_STD,
-    SETTLED,
     RecursiveEstimator,
     RecursiveLeastSquares,
 )
@@ -34,7 +34,7 @@ RIDGE = 1e-13
 _WRENCH, _PRODUCTS = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
-_EXCESS = 4.0
+_MIN_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
 _MIN_PIVOT = 1e-13
 # Fewest samples for the noise scale from residuals.
@@ -303,7 +303,7 @@ def rtls_update(
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        gain = 1.0 - _EXCESS * math.sqrt(2.0 / Z[0, 0])
+        gain = 1.0 - _MIN_EXCESS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
             select_compensated(G, N, scale / gain, K, taper)
             for i in range(6, 16):
@@ -329,7 +329,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         motion_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = SETTLED,
+        bound: float = MAX_SETTLED_STD,
     ) -> None:
         self._motion_std = checked("motion_std", motion_std, 9)
         if (self._motion_std < 0.0).any():
@@ -359,7 +359,9 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        excited = (shares < _MIN_PIVOT) | (excess > _EXCESS * math.sqrt(2.0 / max(samples, 1.0)))
+        excited = (shares < _MIN_PIVOT) | (
+            excess > _MIN_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
+        )
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
         factor = inverse @ _cholesky(scale * G + information)
         unknown = directions[:, ~excited]

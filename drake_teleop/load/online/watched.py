@@ -34,7 +34,7 @@ LOAD_STATES = ("learning", "settled", "disturbed", "changed")
 """States of a load estimator, by index; "learning": the load is not identified yet."""
 LEARNING, SETTLED, DISTURBED, OTHER_LOAD = range(4)
 
-FADE, REST, FOLLOW, EXPLAINED = 0.1, 0.3, 3.0, 0.1
+FADE_TIME_S, MIN_REST_S, OFFSET_TIME_S, MIN_EXPLAINED_S = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
 and explanation of a changed force by a new load."""
 MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
@@ -84,7 +84,7 @@ def _is_at_rest(memory, sample, period):
         memory[_REST_SAMPLES] = 0.0
         put(memory, _REST_S, memory, _S, 3)
     memory[_REST_SAMPLES] += 1.0
-    return memory[_REST_SAMPLES] * period > REST
+    return memory[_REST_SAMPLES] * period > MIN_REST_S
 
 
 @njit(cache=True)
@@ -101,7 +101,7 @@ def _force_has_changed(memory, residual, age, period):
     put(highest, 0, np.maximum(highest, low_passed), 0, 3)
     differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
     memory[_CHANGED_SAMPLES] = memory[_CHANGED_SAMPLES] + 1.0 if differs else 0.0
-    return memory[_CHANGED_SAMPLES] * period > EXPLAINED
+    return memory[_CHANGED_SAMPLES] * period > MIN_EXPLAINED_S
 
 
 @njit(cache=True)
@@ -131,11 +131,11 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
         memory[_STATE] = SETTLED
         if at_rest and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
-                known[i] += period / FOLLOW * residual[i]
+                known[i] += period / OFFSET_TIME_S * residual[i]
     elif memory[_STATE] != OTHER_LOAD:
         other = verdict == CHANGED and force_changed and _is_within_reach(known, new_load(watch))
         memory[_STATE] = OTHER_LOAD if other else DISTURBED
     put(target, 0, known, 0, 16)
     if memory[_STATE] == OTHER_LOAD:
         put(target, 6, fallback, 0, 10)
-    out += period / (FADE + period) * (target - out)
+    out += period / (FADE_TIME_S + period) * (target - out)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.uncertainty import ARM
+from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.candidates import Candidate, similar_factors
 from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
@@ -83,7 +83,7 @@ def gain_covariance(state: State) -> Array:
     """
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
-    unit = np.repeat([1.0, ARM], 3)
+    unit = np.repeat([1.0, TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
     wrench = (rows.columns == np.arange(FORCES.start, FORCES.stop)[:, None]) - fit.residual
     J, inverse = state.model.derivative(state.x), fit.covariance

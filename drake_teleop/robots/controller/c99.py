@@ -27,7 +27,7 @@ CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 KERNEL = ("wrench_compensator.h", "wrench_compensator.c")
 _VECTOR_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _VECTOR_READINGS = 1000
-_TORQUES_SMALLER = np.repeat([1.0, 0.05], 3)
+_VECTOR_AMPLITUDES = np.repeat([1.0, 0.05], 3)
 _SETTINGS = (
     *("phi", "offsets", "sigma_weight", "sigma_inertia", "gamma", "low_pass", "low_pass_count"),
     *("range", "largest", "noise_limits", "stale_steps", "tare_steps"),
@@ -162,7 +162,7 @@ def _simulated_readings(target: Target) -> tuple[Array, Array]:
     alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])
     down = np.array([3.0, -4.0, -8.0]) + omega
     motion = 5.0 * alpha - down, omega, alpha
-    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TORQUES_SMALLER
+    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _VECTOR_AMPLITUDES
     wrench = non_contact_wrench(*motion, target.found.phi) + target.found.offsets + contact
     readings = np.round(np.hstack([wrench, *motion, down]), 6)
     largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)
