@@ -61,17 +61,13 @@ class FourChannelConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
         p[_SLAVE_FEEDBACK], p[_HAND_FEEDBACK] = self.slave_feedback, self.hand_feedback
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet, which contains the hand's measured wrench.
-
-    Arguments: `methods.master_step`.
-    """
+    """Compute the rendered wrench and the packet, which contains the hand's measured wrench."""
     difference = memory[_DIFFERENCE]
     difference[:] = 0.0
     connected = arrived(received)
@@ -91,7 +87,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     if arrived(received):
         shift = memory[_DIFFERENCE]
         for i in range(6):

@@ -1,6 +1,6 @@
-"""Passivity method "ledger" with an energy balance at the slave's actual motion: master's end.
+"""Passivity method "ledger", master's end: an energy balance at the slave's actual motion.
 
-docs/theory.md, "The energy ledger", has equations, guarantees, constants, and the steps M1 to M7
+docs/theory.md, "The energy ledger", explains the equations, the constants, and the steps M1 to M7
 (master) and S1 to S6 (slave, in `ledger_slave`).
 """
 
@@ -145,7 +145,6 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
@@ -163,7 +162,7 @@ def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
 
 
 def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the slave's largest speed (2,) that its reserve of energy permits [m/s, rad/s].
+    """Return the largest speed (2,) of the slave that its energy reserve permits [m/s, rad/s].
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
@@ -173,7 +172,6 @@ def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     velocity, offset_to_slave = memory[OWN_VELOCITY], wrench  # overwritten below
     smooth_velocity(twist, min(T / _VELOCITY_FILTER_S, 1.0), memory)
     memory[_WALL_DEPTH] += work_along(memory[_INWARD], dx)
@@ -223,7 +221,7 @@ def _update_hand_ledger(g, dx, in_contact, p, memory):
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     """Write the predicted contact wrench (M2, M3) into `wrench`.
 
-    `offset_to_slave` (6,) is the pose of the hand minus the slave's pose without a wall.
+    `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
     contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_STIFFNESS)
@@ -296,7 +294,6 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 @njit(cache=True)
 def _find_slave_step(received, memory):
-    """Write the displacement of the received pose since the last step into the memory."""
     last = memory[_LAST_SLAVE_POSE]
     difference_into(received[POSE], last, memory[_SLAVE_STEP])
     put(last, 0, received, POSE.start, 7)
@@ -304,7 +301,7 @@ def _find_slave_step(received, memory):
 
 @njit(cache=True)
 def _add_friction(T, size, force, received, dx, p, memory, wrench):
-    """Write the friction (6,) into `wrench`: model of the hand plus the model's error (T68)."""
+    """Write the friction (6,) into `wrench`: model at the hand plus the model's error (T68)."""
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
     slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
     normal = memory[NORMAL]
@@ -340,7 +337,7 @@ def _add_friction(T, size, force, received, dx, p, memory, wrench):
 
 @njit(cache=True)
 def _friction_stiffness(g, p):
-    """Return k_h of (T68) for translation [N/m] or rotation [N m/rad]."""
+    """Return k_h of (T68) for translation (g = 0) [N/m] or rotation (g = 1) [N m/rad]."""
     factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
     return factor * _MAX_STIFFNESS / max(p[METRIC][g], _LEAST_METRIC)
 
@@ -391,7 +388,7 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _opposing_share(g, dx, T, p, memory):
-    """Return the share of a wrench against the motion that the master's energy permits, 0 to 1."""
+    """Return the share, 0 to 1, of a wrench against the motion that the master's energy permits."""
     if memory[LEDGER][g] >= _LEAST_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]

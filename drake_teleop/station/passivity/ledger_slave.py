@@ -112,7 +112,7 @@ _DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(
 
 @njit(cache=True)
 def smooth_velocity(twist, share, memory):
-    """Low-pass the velocity of this end in `memory`; `share` is the weight of the new twist."""
+    """Low-pass the velocity in `memory`; `share` is the weight of the new `twist`."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -139,9 +139,10 @@ def work_along(wrench, displacement):
 
 @njit(cache=True)
 def find_direction(wrench, round_trip, T, p, memory):
-    """Update the mean direction of the contact; return the component of `wrench` (6,) along it [N].
+    """Update the contact's mean direction, a unit wrench; return the component of `wrench` along it
+    [N].
 
-    The direction is a unit wrench. A much larger or opposite wrench replaces the mean at once.
+    A much larger or opposite wrench replaces the mean at once.
     """
     mean, normal = memory[MEAN_WRENCH], memory[NORMAL]
     rate = 1.0
@@ -170,7 +171,6 @@ def receive(g, received, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = arrived(received)
     memory[_PERIOD] = T
@@ -255,7 +255,7 @@ def _servo_lag(p):
 
 @njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
-    """Return k_d, the largest stiffness that is rendered to the hand (S3) [N/m]."""
+    """Return k_d (S3), the largest contact stiffness that is rendered to the hand [N/m]."""
     normal, fill_level = memory[NORMAL], 0.0
     depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
@@ -455,7 +455,7 @@ def _step_servo_model(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Limit the motors' energy for a changed command; see `methods.command_sent`."""
+    """Limit the motors' energy for a command that the safe state changed."""
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_motor_energy(command, pose, twist, p, memory):

@@ -7,12 +7,7 @@ PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` f
 
 
 class Slots:
-    """Allocator of consecutive places in a vector: hands out indices and slices.
-
-    Args:
-        size: length of the vector.
-        first: index of the first place.
-    """
+    """Allocator of consecutive places in a vector of `size` numbers, from index `first`."""
 
     def __init__(self, size: int, first: int = 0) -> None:
         self._size, self._next = size, first
@@ -22,11 +17,7 @@ class Slots:
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
-        """Reserve `length` places and return their slice.
-
-        Raises:
-            IndexError: if fewer places remain.
-        """
+        """Reserve `length` places and return their slice; raise IndexError if fewer remain."""
         first, self._next = self._next, self._next + length
         if self._next > self._size:
             raise IndexError(f"{self._next} numbers do not fit into {self._size}")

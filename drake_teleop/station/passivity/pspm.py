@@ -1,7 +1,7 @@
 """Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
-A spring pulls each end to a set position, which moves as near to the requested one as the stored
-energy permits. The energy balance holds if K and D of the servo are configured correctly.
+A spring pulls each end to a set position, which is as near to the requested one as the stored
+energy permits. The balance holds if K and D of the servo are configured correctly.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -67,14 +67,12 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Write the initial energy of one channel end into its memory."""
     memory[LEDGER] = p[_INITIAL]
 
 
@@ -103,7 +101,6 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     offset, requested, received_wrench = memory[_OFFSET], memory[_REQUESTED], received[WRENCH]
     K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
@@ -124,7 +121,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
@@ -144,7 +140,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Adopt the command that is sent as the spring's set position; see `methods.command_sent`."""
+    """Use the command that is sent as the spring's set position."""
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
     K, D = p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, offset)

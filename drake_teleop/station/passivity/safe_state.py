@@ -1,8 +1,7 @@
 """Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
 An end is *silent* without new packets of a healthy sender for `timeout` seconds, or if data of
-either end are not finite or beyond 1e6 in SI units. Both ends begin silent. A silent master fades
-the wrench to zero; a silent slave stops.
+either end are not finite or beyond 1e6 in SI units. Both ends begin silent.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _LAST_COMMAND, _PREVIOUS_COMMAND = (
 
 
 def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """Return the state (MASTER_WATCH,) of the master's silence monitor before the first packet.
+    """Return the silence monitor (MASTER_WATCH,) of the master before the first packet.
 
     With `full` (2,), the device's limits [N, N m], it is the state of normal operation.
     """
@@ -52,7 +51,10 @@ def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.
 
 
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the initial state (SLAVE_WATCH,) of the slave's silence monitor, with its command."""
+    """Return the silence monitor (SLAVE_WATCH,) of the slave before the first packet.
+
+    `pose` (7,) is the command X_WS until then.
+    """
     watch = np.zeros(SLAVE_WATCH)
     watch[SILENT] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
@@ -70,7 +72,7 @@ def _update_silence(alive, fault, T, watch):
 
 @njit(cache=True)
 def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
-    """Write the limits of the rendered wrench for this step: they fall to zero during silence.
+    """Write the limits of the rendered wrench for this step; they fall to zero during silence.
 
     Args:
         alive: whether a new packet of a healthy slave came at this step.
@@ -79,7 +81,7 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
         timeout: time without packets until the end is silent [s].
         full: (2,) the device's limits [N, N m].
         held: (6,) wrench displayed since the last step [N, N m].
-        watch: (MASTER_WATCH,) monitor state, updated.
+        watch: (MASTER_WATCH,) silence monitor, updated.
         limits: (2,) written: largest force and torque [N, N m].
     """
     _update_silence(alive, fault, T, watch)
@@ -102,14 +104,14 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
 
 @njit(cache=True)
 def slave_command_into(alive, fault, T, timeout, requested, watch, command):
-    """Write the command that is sent to the slave at this step; during silence it stops.
+    """Write the command that is sent to the slave at this step; during silence the slave stops.
 
     Args:
         alive: whether a new packet of a healthy master came at this step.
         fault: whether the slave's data are not finite, or a new packet reports this of the hand.
         T, timeout: as for `master_limits_into`.
         requested: (7,) pose X_WS from the passivity method.
-        watch: (SLAVE_WATCH,) monitor state, updated.
+        watch: (SLAVE_WATCH,) silence monitor, updated.
         command: (7,) written: commanded pose X_WS.
     """
     _update_silence(alive, fault, T, watch)
@@ -146,16 +148,10 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def retreat(twist, T, p, memory, wrench):
-    """Reduce a rendered wrench that pushes the hand, so that a released hand stays slow.
+    """Reduce a wrench (6,) that pushes the hand, so that a released hand stays slow.
 
     For hand speeds along the wrench between `RETREAT` and twice this, it falls to 0. While the hand
     decelerates, the slave's inertial force remains.
-
-    Args:
-        twist: (6,) twist of the command before the channel [v; omega], in W.
-        T: time between steps [s].
-        p, memory: parameters and memory of the master's end; memory is updated.
-        wrench: (6,) in W and the master's power units, updated.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)
     for i in range(6):

@@ -1,8 +1,7 @@
 """Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991), theory.md (T33) to (T36).
 
-The receiver outputs the integral of the wave through a filter, within the received energy
-(Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold create no
-energy at the hand and the slave's *command*, for the `backward` work of module `energy`.
+The receiver filters the integral of the wave within the received energy (Niemeyer and Slotine
+2004). So jitter and loss create no energy at the hand and at the slave's *command*.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -81,14 +80,13 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
         p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 
 
 @njit(cache=True)
 def _play(received, T, p, memory, wave):
-    """Write the wave (6,) of this step, taken from the integral of the received wave (T34)."""
+    """Write the wave (6,) of this step, the filtered rate of the received wave integral (T34)."""
     ledger, played = memory[LEDGER], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
@@ -107,7 +105,6 @@ def _play(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
     catching_up, newest = memory[_CATCHING_UP], received[SEQUENCE]
@@ -154,7 +151,6 @@ def _limit_change(g, energy, dx, most, held, wrench):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
     if memory[FILL_TIME] > 0.0:
