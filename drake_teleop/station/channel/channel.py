@@ -1,7 +1,4 @@
-"""Channel between master and slave: network and passivity method at both ends (long: one step).
-
-In every period both ends run one step of the method; their packets pass the network.
-"""
+"""Channel between master and slave: network and passivity method at both ends (long: one step)."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -76,8 +73,7 @@ class Channel(NetworkConfig):
     def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
         """Return the networks of both directions: forward (master to slave) and backward.
 
-        Raises:
-            DrakeTeleopError: if a preset is combined with other fields.
+        A preset that is combined with other fields raises a DrakeTeleopError.
         """
         names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
@@ -135,11 +131,7 @@ _NO_LOAD = np.zeros(6)
 def initial_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the state vector of both ends before their first step.
-
-    Args:
-        start: (7,) pose X_WS of the slave and of its command.
-    """
+    """Return the state of both ends before their first step; `start` (7,) is the slave's X_WS."""
     ends = np.zeros(_SIZE)
     ends[_POSE_M][:7] = ends[_POSE_S][:7] = start
     ends[_VALID_TIME] = STOP_TIME
@@ -211,14 +203,10 @@ def master_end(
     steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends, work, packet,
     wrench_received,
 ):  # fmt: skip
-    """Run one step of the master's end.
+    """Run one step of the master's end; arguments are those of `channel_step`.
 
-    Args:
-        received: (PACKET_SIZE,) newest packet of the slave.
-        fresh: True if it is new.
-        work: (2,) energy input of the hand, updated.
-        packet: (PACKET_SIZE,) written: packet to the slave.
-        wrench_received: (7,) as the other arguments: see `channel_step`.
+    `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
+    hand is added to `work` (2,) [J], and the packet to the slave is written into `packet`.
     """
     before, held = ends[_POSE_M], ends[_WRENCH_M]
     watch, memory = ends[_WATCH_M], ends[MEMORY_M]
@@ -251,12 +239,10 @@ def slave_end(
     steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
-    """Run one step of the slave's end.
+    """Run one step of the slave's end; arguments are those of `channel_step`.
 
-    Args:
-        received: (PACKET_SIZE,) newest packet of the master.
-        fresh: True if it is new.
-        packet: (PACKET_SIZE,) written: packet to the master; other arguments: see `channel_step`.
+    `received` is the master's newest packet, `fresh` is True if it is new. The packet to the master
+    is written into `packet`.
     """
     before, held = ends[_POSE_S], ends[_WRENCH_S]
     watch, memory, work = ends[_WATCH_S], ends[MEMORY_S], ports[_WORK_S]
@@ -338,9 +324,9 @@ def _to_master(wrench, frame, out):
 class TeleopChannel(LeafSystem):
     """Network with a passivity method at both ends; a packet takes at least one period.
 
-    Both ends have a safe state for silence and faults (`station.passivity.safe_state`). While the
-    wrist sensor is saturated, the last valid wrench is used. The rendered wrench depends on the
-    inputs without delay, so that wrench times increment of the command is the work at the device.
+    Both ends have a safe state for silence and faults. While the wrist sensor is saturated, the
+    last valid wrench is used. The rendered wrench depends on the inputs without delay, so that
+    wrench times increment of the command is the work at the device.
 
     .. pydrake_system::
 

@@ -59,10 +59,7 @@ class LoadEstimatorConfig:
     )
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the method's covariance is too small for `watch`.
-
-        `where` is the block's path for the message.
-        """
+        """Raise a DrakeTeleopError if the method's covariance is too small for `watch`."""
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
                 f"the covariance of '{self.method}' is too small to notice a change by",
@@ -81,8 +78,7 @@ class LoadEstimator(LeafSystem):
         - sample: the wrist sensor's sample
         output_ports:
         - load_estimate: (16,) Eq. (7), [offsets (6); phi (10)] in S about So
-        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATES`; 1, settled,
-          once the predicted uncertainty of every parameter is within the config's bound
+        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATES`
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].

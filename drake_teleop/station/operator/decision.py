@@ -1,7 +1,7 @@
 """Decisions of the simulated operator during a task, from vision and perceived force.
 
-The hand moves by planned displacements, and waits until their effect is visible (Ferrell 1965). All
-assumptions and sources: `docs/operator.md`.
+The hand moves by planned displacements, and waits until their effect is visible (Ferrell 1965).
+`docs/operator.md` lists assumptions and sources.
 """
 
 from __future__ import annotations
@@ -161,8 +161,7 @@ def _random_number(person, step, draw):
 def look_into(person, step, displacement_W, seen_W):
     """Write the seen displacement of the tool from its start (3,), in W [m], into `seen_W`.
 
-    Its random error is constant for 50 steps, a fixation of the eyes. `person` is from
-    `pack_person`, `displacement_W` (3,) is the true displacement.
+    Its random error is constant for 50 steps, a fixation of the eyes.
     """
     for i in range(3):
         noise = person[_VISION_NOISE] * _random_number(person, step // _FIXATION_STEPS, 4 + i)
@@ -217,11 +216,10 @@ def _enter_phase(state, memory, phase, ready):
 
 @njit(cache=True)
 def decide(task, person, time, seen_W, felt, state, memory):
-    """Update the operator's decisions by one step of `PERIOD`; inputs are not checked.
+    """Update the operator's decisions by one step of `PERIOD`.
 
     Args:
-        task: from `pack_task`.
-        person: from `pack_person`.
+        task, person: from `pack_task` and `pack_person`.
         time: now [s].
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
         felt: (5,) output of `perceive_into`, delayed by the reaction time.

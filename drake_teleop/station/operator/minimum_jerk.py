@@ -17,10 +17,7 @@ STOP = 0.15  # s, stopping time of the hand, estimate
 
 @njit(cache=True)
 def plan_at(plan, time, i):
-    """Return position [m], speed and acceleration of axis `i` in a plan (20,) at `time` [s].
-
-    After the plan the speed is constant.
-    """
+    """Return position [m], speed and acceleration of axis `i` in a plan (20,) at `time` [s]."""
     h = plan[1]
     u = min((time - plan[0]) / h, 1.0)
     c = plan[2 + 6 * i : 8 + 6 * i]
@@ -47,8 +44,8 @@ def add_plan_into(memory, time, pose, twist):
 def plan_move(memory, time, length, change, end_speed):
     """Plan a minimum-jerk motion by the displacement `change` (3,) [m] in the time `length` [s].
 
-    It continues the present motion and ends without acceleration, with the velocity `end_speed`
-    (3,).
+    It continues the present motion and ends with the velocity `end_speed` (3,), without
+    acceleration.
     """
     plan, h = memory[PLAN : PLAN + PLAN_SIZE], length
     for i in range(3):

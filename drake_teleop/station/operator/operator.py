@@ -136,8 +136,8 @@ def _ramp(time, length):
 def intent_into(packed, start, t, pose, twist):
     """Write the intended pose X_BE (7,) and twist [v; omega] (6,) of the hand at time t [s].
 
-    `packed` (n, 12) is from `pack_intent`, `start` (7,) is X_BE before the first segment.
-    Translations add; rotations apply in the order of the list, each about axes of B.
+    `packed` is from `pack_intent`, `start` (7,) is X_BE before the first segment. Translations add;
+    rotations apply in the order of the list, each about axes of B.
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
@@ -166,9 +166,7 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write a pose (7,) with unit quaternion into `out`; return whether the input was valid.
-
-    Valid are a finite pose and twist (6,) with a quaternion that is not zero.
+    """Write the pose (7,) with unit quaternion into `out`; return whether pose and twist are valid.
     """
     square, rest = 0.0, 0.0
     for k in range(4):
@@ -197,8 +195,7 @@ def _limit(vector, limit):
 def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
 
-    f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector of the shorter
-    rotation. Both are limited to 60 N and 2 N m.
+    f = K (x_intent - x) + B (v_intent - v); tau likewise. Both are limited to 60 N and 2 N m.
 
     Args:
         impedance: (4,) [K, B, rotational K, rotational B].
@@ -283,9 +280,6 @@ class Operator(LeafSystem):
         start: (7,) X_BE to which the intent is relative.
         training, arm, tip: required for a task: station properties, the slave's arm, and the
             position of the tool's tip in S and at the start in W (6,) [m].
-
-    Raises:
-        DrakeTeleopError: during simulation, if the intended motion is not finite.
     """
 
     __slots__ = ONE_DICT

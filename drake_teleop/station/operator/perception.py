@@ -1,12 +1,8 @@
 """Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
-The expected force (internal model: Shadmehr and Mussa-Ivaldi, J. Neurosci. 14, 1994) is
-
-    u_expected = m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0
-
-A Kalman filter estimates m, b, c, u_0 without contact. Contact is detected if the excess u -
-u_expected reaches the absolute threshold and the Weber fraction of recent expected forces. See
-`docs/operator.md`.
+The expected force is m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). A Kalman
+filter estimates m, b, c, u_0 without contact. Contact is a force beyond the expected one that
+reaches the absolute threshold and the Weber fraction.
 """
 
 import math
@@ -71,15 +67,13 @@ def initial_memory() -> Array:
 
 @njit(cache=True)
 def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, attentive, out):
-    """Update the operator's force perception by one step; inputs are not checked.
+    """Update the operator's force perception by one step of `dt` [s].
 
     Args:
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
         parameters: (4,) from `Perception.parameters`.
-        dt: time since the last step [s].
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
-        hand_force: (3,) force of the hand on the stylus [N].
-        velocity: (3,) velocity of the stylus, in the same axes [m/s].
+        hand_force, velocity: (3,) force of the hand on the stylus [N], its velocity [m/s].
         attentive: if false, update only the expectation and detect no contact.
         out: (5,) written: force on the hand beyond the expected one (3) [N], threshold [N], 1 if
             contact is detected.
@@ -162,7 +156,7 @@ def perceive(
     Args:
         t: (N,) evenly spaced times [s].
         hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s], in the
-            same axes, as in the signals `hand_wrench_E` and `twist_master`.
+            same axes.
         hand_mass: mass of the hand that moves with the stylus [kg].
         attentive: start time of detection [s]; before, only the expectation is updated.
 
@@ -171,7 +165,7 @@ def perceive(
             detected.
 
     Raises:
-        DrakeTeleopError: for wrong shapes, values that are not finite, or times not increasing.
+        DrakeTeleopError: for arrays of wrong shape, or values that are not finite.
     """
     rows = {"hand_force": (hand_force, 3), "velocity": (velocity, 3)}
     _, (force, speed) = checked_rows(**rows)

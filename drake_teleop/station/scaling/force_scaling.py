@@ -1,4 +1,4 @@
-"""Scaling of the slave's wrench for the master, and removal of the load's wrench (Figs. 2, 4)."""
+"""Scaling of contact wrench and load's wrench from slave to master (Figs. 2 and 4 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -46,7 +46,9 @@ _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
 
 
 class Scales(NamedTuple):
-    """Scales of a wrench: shares of inertia and weight, of gripper and object; and of contact."""
+    """Scales of a wrench: sigma is kept of a part's inertia, weight of its weight, gamma of
+    contact.
+    """
 
     sigma_gripper: float
     sigma_object: float
@@ -86,9 +88,8 @@ class ForceScalingConfig:
     def scales(self, where: str = "force_scaling") -> Scales:
         """Return the scales of gripper, object and contact.
 
-        Raises:
-            DrakeTeleopError: if eta is given without gripper_phi, sigma = 0 and gamma = 1 (section
-                V), or with another sigma; `where` is the block's path.
+        An eta that does not fit the other fields raises a DrakeTeleopError; `where` is the block's
+        path.
         """
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
@@ -108,7 +109,6 @@ class ForceScalingConfig:
 
 @njit(cache=True)
 def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
-    """Write the result of `wrench_to_master` for one wrench (6,) into `out` (6,); compiled."""
     for part in range(2):
         scale = torque_scale if part == 1 else force_scale
         base = 3 * part
@@ -124,16 +124,13 @@ def wrench_to_master(
     force_scale: float,
     torque_scale: float,
 ) -> NDArray[np.float64]:
-    """Return the wrench to render at the master for a wrench at the slave's sensor.
-
-    It is the reaction, rotated and scaled: for a load that is held up, the hand is pulled down.
+    """Return the wrench to render for a wrench at the slave's sensor: its reaction, scaled.
 
     Args:
         wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
         R_WS: (..., 3, 3) orientation of the sensor.
         R_WB: (3, 3) alignment of the master's base B with the world.
-        force_scale: force at the master over force at the slave.
-        torque_scale: torque at the master over torque at the slave.
+        force_scale, torque_scale: value at the master over value at the slave.
 
     Returns:
         (..., 6) F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
@@ -146,11 +143,10 @@ def wrench_to_master(
 
 @njit(cache=True)
 def scales_at(change, time, scales):
-    """Write the six scales at `time`: a minimum-jerk blend from old to new scales.
+    """Write the six scales at `time` [s]: a minimum-jerk blend from old to new scales.
 
     Args:
         change: (14,) old scales (6), new scales (6), start of the change [s], duration [s].
-        time: present time [s].
         scales: (6,) written: sigma_gripper, sigma_object (of the inertia), gamma, force scale,
             shares of the weight of gripper and object.
     """
@@ -180,12 +176,11 @@ def _scaled_into(sample, estimate, gripper, arm, scales, out):
 
 @njit(cache=True)
 def fault_of(sample, estimate, time, valid_range):
-    """Return the code (`Fault`) of the first fault in a sample and a load estimate.
+    """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
     Args:
         sample: sample of the wrist sensor, see `drake_teleop.load.regressor`.
         estimate: (16,) [offsets; phi].
-        time: present time [s].
         valid_range: (7,) largest wrench [N, N m], largest age [s].
     """
     if not abs(time - sample[TIME]) <= valid_range[6]:
@@ -231,8 +226,7 @@ class ForceScaling(LeafSystem):
     """Scaling of contact wrench and load's wrench, and transformation to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj) has contact wrench F_c, regressor V,
-    and inertial parameters phi of gripper and object. `SetScales` changes the scales during a
-    simulation.
+    and inertial parameters phi of gripper and object.
 
     .. pydrake_system::
 
@@ -247,7 +241,7 @@ class ForceScaling(LeafSystem):
         - scaled_contact_and_fault: the three above in one vector, for a log
         - non_contact_wrench_S: wrench of the load (weight and inertia), Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
-        - load_wrench_B: part of wrench_B from weight and inertia of the load, zero for sigma = 0
+        - load_wrench_B: part of wrench_B from weight and inertia of the load
 
     Args:
         config: initial scales.
@@ -307,11 +301,8 @@ class ForceScaling(LeafSystem):
     ) -> None:
         """Change the scales, beginning now, on a minimum-jerk ramp of `duration` [s].
 
-        The ramp starts at the present scales, also during an earlier change. `sigma_weight` is the
-        share of the weight of both parts; without it the other sigmas scale weight and inertia.
-
-        Raises:
-            DrakeTeleopError: for a scale or duration that is negative or not finite.
+        `sigma_weight` is the share of the weight of both parts; without it the other sigmas scale
+        weight and inertia. A negative or infinite value raises a DrakeTeleopError.
         """
         both = sigma_gripper, sigma_object
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)

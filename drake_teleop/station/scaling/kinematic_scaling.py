@@ -36,17 +36,14 @@ class KinematicScalingConfig:
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
-    """Return the quaternion of the rotation about the same axis by `scale` times the angle.
-
-    For a scale that is not an integer the result jumps where the angle passes 180 degrees.
-    """
+    """Return the quaternion of the rotation about the same axis by `scale` times the angle."""
     v = logarithm(rotation)
     return exponential((scale * v[0], scale * v[1], scale * v[2]))
 
 
 @njit(cache=True)
 def scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out):
-    """Write the commanded pose X_WS (7,) of the slave into `out`.
+    """Write the commanded pose X_WS (7,) of the slave into `out`, which may be `command`.
 
         p_WS = p_command + translation_scale R_WB (p_BE - p_master)
         R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
@@ -56,7 +53,6 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         master: (7,) pose X_BE when the clutch was closed.
         command: (7,) commanded X_WS when the clutch was closed.
         alignment: (4,) quaternion of R_WB.
-        out: (7,) written; the quaternion has norm 1. It may be `command` itself.
     """
     R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
     offset = rotate(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
@@ -83,9 +79,8 @@ def _command_into(pose, references, alignment, translation_scale, rotation_scale
 class KinematicScaling(DoubleOnly, LeafSystem):
     """Scaling of the master's motion into the slave's commanded pose, with a clutch.
 
-    While the clutch is open the command is constant. When it closes, the master's present pose is
-    the new reference, so the command does not jump. The clutch keeps its state while the master's
-    pose is not finite.
+    While the clutch is open, or the master's pose is not finite, the command is constant. Then the
+    master's present pose is the new reference, so the command does not jump.
 
     .. pydrake_system::
 
