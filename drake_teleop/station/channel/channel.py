@@ -71,10 +71,7 @@ class Channel(NetworkConfig):
     )
 
     def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
-        """Return the networks of both directions: forward (master to slave) and backward.
-
-        A preset that is combined with other fields raises a DrakeTeleopError.
-        """
+        """Return the networks of both directions: forward (master to slave) and backward."""
         names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
         if self.network == "custom":
@@ -174,7 +171,6 @@ def channel_step(
         T: time between steps [s].
         timeout: time without packets before the safe state [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
-        forward_parameters, backward_parameters: results of `network.parameters`.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
         ports: (PORTS,) port energies, updated; times without packets, written.
@@ -206,7 +202,7 @@ def master_end(
     """Run one step of the master's end; arguments are those of `channel_step`.
 
     `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
-    hand is added to `work` (2,) [J], and the packet to the slave is written into `packet`.
+    hand is added to `work` (2,) [J].
     """
     before, held = ends[_POSE_M], ends[_WRENCH_M]
     watch, memory = ends[_WATCH_M], ends[MEMORY_M]
@@ -239,11 +235,7 @@ def slave_end(
     steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
-    """Run one step of the slave's end; arguments are those of `channel_step`.
-
-    `received` is the master's newest packet, `fresh` is True if it is new. The packet to the master
-    is written into `packet`.
-    """
+    """Run one step of the slave's end; arguments are those of `channel_step` and `master_end`."""
     before, held = ends[_POSE_S], ends[_WRENCH_S]
     watch, memory, work = ends[_WATCH_S], ends[MEMORY_S], ports[_WORK_S]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
@@ -324,9 +316,9 @@ def _to_master(wrench, frame, out):
 class TeleopChannel(LeafSystem):
     """Network with a passivity method at both ends; a packet takes at least one period.
 
-    Both ends have a safe state for silence and faults. While the wrist sensor is saturated, the
-    last valid wrench is used. The rendered wrench depends on the inputs without delay, so that
-    wrench times increment of the command is the work at the device.
+    While the wrist sensor is saturated, the last valid wrench is used. The rendered wrench depends
+    on the inputs without delay, so that wrench times increment of the command is the work at the
+    device.
 
     .. pydrake_system::
 
@@ -352,7 +344,6 @@ class TeleopChannel(LeafSystem):
         scales: (2,) scale of translation and rotation, slave over master.
         force_scale: scale of the contact force (force scale times gamma), slave to master.
         start: (7,) pose X_WS of the slave at the start.
-        period: time between packets [s].
     """
 
     __slots__ = ONE_DICT
@@ -439,10 +430,8 @@ class TeleopChannel(LeafSystem):
     ) -> None:
         """Start in a running station, without packets in transit and with a constant slave command.
 
-        Args:
-            command: (7,) present command X_WS of the slave; the master's command must be equal.
-            slave: (7,) actual pose X_WS of the slave.
-            fills: time with open clutch [s], in which the slave of method `wave` keeps its command.
+        `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
+        time in which the slave of method `wave` keeps its command.
         """
         ends = initial_ends(*self._initial_arguments, command)
         ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills

@@ -64,7 +64,6 @@ class NetworkConfig:
     )
 
     def check(self, where: str = "network") -> None:
-        """Check all fields except the trace; raise a DrakeTeleopError for an invalid one."""
         check_ranges(self, where)
         if self.loss > self.burst_loss:
             raise DrakeTeleopError(
@@ -120,9 +119,6 @@ def parameters(
         least: smallest delay of a packet [steps].
         delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace;
             repeated after its end.
-
-    Raises:
-        DrakeTeleopError: for an invalid value or trace.
     """
     config.check()
     trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)

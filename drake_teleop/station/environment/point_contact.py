@@ -75,7 +75,6 @@ def ContactPairs(
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
-        plant: finalized plant.
         tool: shapes of the tool -> poses of their bodies in S.
         slip: slip speed of full friction [m/s]; the plant's stiction tolerance.
         moving: indices of the bodies of a `JointTable`, row by row.
@@ -184,7 +183,6 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 
     Args:
         pair: (28,) row of `Pairs.known`.
-        p_WS, R_WS: (3,) position [m] and (3, 3) rotation of the sensor frame S in W.
         deflection: deflection of the sheet spring [m].
         normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
@@ -231,12 +229,8 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    It is the largest gap along an edge of either box (Gottschalk 1996, without the cross products).
-
-    Args:
-        pair: (40,) row of `Pairs.watched`, for the tool's box.
-        box: (28,) this row with the present pose of the other box.
-        p_WS, R_WS, deflection: as for `indentation`.
+    `pair` (40,) is a row of `Pairs.watched`, for the tool's box; `box` (28,) is this row with the
+    present pose of the other box. The bound is the largest gap along an edge of either box.
     """
     R, between = rows(R_WS), minus(three(p_WS, 0), three(box, 13))
     between = plus(between, apply(R, three(pair, 0)))
@@ -271,11 +265,8 @@ def _friction(static: float, dynamic: float, slip: float) -> float:
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
     """Write the contact force on a sphere in its box into `force` (3,) [N].
 
-    Args:
-        pair: (28,) row of `Pairs.known`.
-        x: depth [m].
-        normal: (3,) direction out of the box.
-        velocity: (3,) velocity of the sphere at the point of contact, relative to the box [m/s].
+    `pair` (28,) is a row of `Pairs.known`, `x` the depth [m], `normal` the direction out of the
+    box, `velocity` that of the sphere at the contact, relative to the box [m/s].
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)

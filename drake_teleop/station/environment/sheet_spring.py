@@ -1,7 +1,4 @@
-"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits.
-
-The first bending mode is one degree of freedom.
-"""
+"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits."""
 
 from dataclasses import dataclass
 from xml.etree import ElementTree
@@ -51,12 +48,11 @@ class SheetSpring(Environment):
 
     @property
     def effective_mass(self) -> float:
-        """Mass of the mode, 33/140 of the leaf's mass [kg] (Rayleigh, static deflection shape)."""
+        """Mass of the first bending mode, 33/140 of the leaf's mass [kg] (Rayleigh)."""
         return 33 / 140 * self.density * self.length * self.width * self.thickness
 
     @property
     def damping(self) -> float:
-        """Viscous damping of the bending mode [N s/m]."""
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
 
     @property
@@ -66,7 +62,6 @@ class SheetSpring(Environment):
 
     @property
     def moving_part(self) -> tuple[float, float, float]:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of the leaf's end."""
         return self.effective_mass, self.stiffness, self.damping
 
     @property
@@ -97,7 +92,6 @@ class SheetSpring(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude contact of the sheet's deep collision shape with all bodies except the tool."""
         leaf = plant.GetBodyByName("leaf")
         tool_bodies = BodiesOfTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]

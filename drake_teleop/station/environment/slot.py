@@ -61,7 +61,6 @@ class Slot(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     @property
@@ -79,10 +78,7 @@ class Slot(Environment):
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the slot, fixed in the world, and the tool's second ball to a plant, before Finalize.
-
-        The ball has no mass. Without a scene graph there are no shapes.
-        """
+        """Add the slot and the tool's second ball, without mass, to a plant before Finalize."""
         body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
         if not plant.geometry_source_is_registered():
@@ -98,7 +94,6 @@ class Slot(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Assign the slot's contact material to the tool's balls."""
         source = plant.get_source_id()
         for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
             scene_graph.AssignRole(source, ball, _material(self), RoleAssign.kReplace)

@@ -37,8 +37,8 @@ _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 class Surface(Environment):
     """Object with a contact surface; Drake combines it with the surface of the other object.
 
-    Stiffnesses are springs in series, k1 k2 / (k1 + k2). Friction is the harmonic mean,
-    2 mu1 mu2 / (mu1 + mu2). The tool's ball has stiffness 4e5 N/m and friction 0.2.
+    Stiffnesses are springs in series, k1 k2 / (k1 + k2). Friction is the harmonic mean, 2 mu1 mu2 /
+    (mu1 + mu2). The tool's ball has stiffness 4e5 N/m and friction 0.2.
     """
 
     stiffness: float = quantity(
@@ -53,11 +53,9 @@ class Surface(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     def material(self) -> ProximityProperties:
-        """Return the surface properties for Drake's point contact."""
         return ContactMaterial(self.stiffness, self.dissipation, self.friction)
 
 
@@ -75,7 +73,6 @@ class Box(Surface):
     size: list[float] = quantity([0.3, 0.3, 0.1], "m", 1e-3, 4.0, "lengths of its edges")
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the box to the plant, fixed in the world."""
         X_WBox = RigidTransform(RollPitchYaw(self.rotation), self.position)
         AddFixedBox(plant, "box", X_WBox, self.size, self)
 
@@ -85,11 +82,7 @@ def AddFixedBox(
 ) -> None:
     """Weld a box to the world; without a scene graph it has no shape.
 
-    Args:
-        plant: not finalized.
-        name: name of body and model instance, numbered if it exists.
-        X_WBox: pose of the box.
-        size: (3,) lengths of its edges [m].
+    `name` is numbered if it exists, X_WBox is the pose, `size` (3,) the edges [m].
     """
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
@@ -113,7 +106,6 @@ class Wall(Surface):
     size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "of its face; it is 0.1 m thick")
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the normal is zero."""
         if np.linalg.norm(self.normal) < 1e-3:
             raise DrakeTeleopError(
                 "has no direction",
@@ -145,7 +137,6 @@ class Block(Surface):
     )
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the table is smaller than the block."""
         if 0.0 < min(self.table) < max(self.size[:2]):
             raise DrakeTeleopError(
                 "the table is smaller than the block",
@@ -155,13 +146,11 @@ class Block(Surface):
 
     @property
     def stand(self) -> Stand | None:
-        """Box that a 3D replay shows below the block's table; None without a table."""
         x, y, top = self.position
         across = 0.6 * min(self.table)
         return Stand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add block and table to the plant; without a scene graph they have no shapes."""
         if min(self.table) > 0.0:
             below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS / 2]
             AddFixedBox(

@@ -69,7 +69,7 @@ def update_flag(memory, sample, estimate, acceleration, settings):
 
 
 class ContactDetection(LeafSystem):
-    """Detector of contact between slave and environment.
+    """Detector of contact between slave and environment, for a noise `floor` fitted at its rate.
 
     The flag keeps its value while the wrist sensor is saturated or the sensor's low-pass recovers.
 
@@ -81,13 +81,6 @@ class ContactDetection(LeafSystem):
         - load_estimate: (16,) load estimate of Eq. (7), [offsets; phi]
         output_ports:
         - contact: (1,) 1 in contact, else 0
-
-    Args:
-        floor: noise floor in free motion, fitted at the rate of this block.
-        period: time between samples [s].
-
-    Raises:
-        DrakeTeleopError: if the floor was not fitted to a motion.
     """
 
     __slots__ = ONE_DICT

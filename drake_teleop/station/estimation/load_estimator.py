@@ -59,7 +59,6 @@ class LoadEstimatorConfig:
     )
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the method's covariance is too small for `watch`."""
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
                 f"the covariance of '{self.method}' is too small to notice a change by",
@@ -84,14 +83,9 @@ class LoadEstimator(LeafSystem):
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
         motion_std: (9,) standard deviations of specific force [m/s^2], angular velocity [rad/s] and
             angular acceleration [rad/s^2], for "rtls" and for `watch`.
-        period: sampling period [s].
-        sample_size: length of the sample.
         initial: (16,) initial estimate.
         covariance: (16, 16) covariance of `initial`; with it, monitoring begins at once.
         fallback: (10,) phi to use after a change of load.
-
-    Raises:
-        DrakeTeleopError: for `watch` without `enabled` and without a covariance.
     """
 
     __slots__ = ONE_DICT

@@ -1,7 +1,4 @@
-"""Haptic devices by name: the paper's Phantom, and others by data sheets.
-
-A comment above the table has the sources of the numbers. Grippers and buttons are not modelled.
-"""
+"""Haptic devices by name: the paper's Phantom, and others by data sheets."""
 
 import copy
 import dataclasses
@@ -152,8 +149,7 @@ class Master:
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
         """Return the dynamics of the device with the hand's mass [kg] and inertia about E [kg m^2].
 
-        Raises:
-            DrakeTeleopError: if the model of a leader arm cannot be used, see `Leader.device`.
+        A leader arm whose model cannot be used raises a DrakeTeleopError.
         """
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
@@ -175,11 +171,12 @@ class Master:
 
     @property
     def leads_joints(self) -> bool:
-        """True if the master is a leader arm that commands the slave's joints."""
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError if a leader arm commands joints; `what`: name of the caller."""
+        """Raise a DrakeTeleopError if a leader arm commands joints; `what` is the name of the
+        caller.
+        """
         if self.leads_joints:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",
@@ -200,7 +197,7 @@ class Master:
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction(self) -> "Master":
-        """Return a copy with a linear device: no Coulomb friction, no encoder steps."""
+        """Return a copy without Coulomb friction and encoder steps, a linear device."""
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -212,7 +209,6 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":
-        """Return a copy in which the file paths of a leader arm are resolved from `folder`."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))
@@ -221,7 +217,6 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError for invalid combinations of fields; `where` is their path."""
         if self.model == PHANTOM and self.figures is not None:
             raise DrakeTeleopError(
                 "the Phantom's own dynamics are used, not a data sheet's",

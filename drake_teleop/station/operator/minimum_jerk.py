@@ -42,7 +42,7 @@ def add_plan_into(memory, time, pose, twist):
 
 @njit(cache=True)
 def plan_move(memory, time, length, change, end_speed):
-    """Plan a minimum-jerk motion by the displacement `change` (3,) [m] in the time `length` [s].
+    """Plan a minimum-jerk motion by `change` (3,) [m] in the time `length` [s].
 
     It continues the present motion and ends with the velocity `end_speed` (3,), without
     acceleration.
@@ -61,7 +61,7 @@ def plan_move(memory, time, length, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
-    """Plan a stop of the hand within `STOP` seconds, from `time` [s] on."""
+    """Plan a stop of the hand within `STOP` seconds."""
     plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]

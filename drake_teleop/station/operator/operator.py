@@ -106,7 +106,7 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
     """Return the segments of the intended motion as an array (n, 12) for compiled functions.
 
     Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
-    (3), rotation (3). A minimum-jerk move has no ramp out and the factor sin(pi / 2).
+    (3), rotation (3).
     """
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
@@ -136,8 +136,8 @@ def _ramp(time, length):
 def intent_into(packed, start, t, pose, twist):
     """Write the intended pose X_BE (7,) and twist [v; omega] (6,) of the hand at time t [s].
 
-    `packed` is from `pack_intent`, `start` (7,) is X_BE before the first segment. Translations add;
-    rotations apply in the order of the list, each about axes of B.
+    `start` (7,) is X_BE before the first segment. Translations add; rotations apply in the order of
+    the list, each about axes of B.
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
@@ -166,8 +166,7 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write the pose (7,) with unit quaternion into `out`; return whether pose and twist are valid.
-    """
+    """Write the pose (7,) with unit quaternion into `out`; return whether the input is valid."""
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -193,14 +192,10 @@ def _limit(vector, limit):
 
 @njit(cache=True)
 def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
-    """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
+    """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B, at most 60 N and 2 N m.
 
-    f = K (x_intent - x) + B (v_intent - v); tau likewise. Both are limited to 60 N and 2 N m.
-
-    Args:
-        impedance: (4,) [K, B, rotational K, rotational B].
-        intent_pose, pose: (7,) intended and actual pose X_BE.
-        intent_twist, twist: (6,) intended and actual twist [v; omega] of E in B.
+    f = K (x_intent - x) + B (v_intent - v); tau likewise. `impedance` (4,) is [K, B, rotational K,
+    rotational B].
     """
     wanted = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
     error = logarithm(multiply(wanted, conjugate((pose[0], pose[1], pose[2], pose[3]))))
@@ -276,10 +271,8 @@ class Operator(LeafSystem):
         - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold of
           the rendered force [N], trust (with a task)
 
-    Args:
-        start: (7,) X_BE to which the intent is relative.
-        training, arm, tip: required for a task: station properties, the slave's arm, and the
-            position of the tool's tip in S and at the start in W (6,) [m].
+    The intent is relative to `start` (7,), X_BE. A task requires training, the slave's arm, and
+    `tip` (6,), the position of the tool's tip in S and at the start in W [m].
     """
 
     __slots__ = ONE_DICT

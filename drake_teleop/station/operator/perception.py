@@ -1,8 +1,7 @@
 """Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
-The expected force is m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). A Kalman
-filter estimates m, b, c, u_0 without contact. Contact is a force beyond the expected one that
-reaches the absolute threshold and the Weber fraction.
+A Kalman filter estimates the expected force m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 without
+contact (`docs/operator.md`). A larger force beyond the threshold is contact.
 """
 
 import math
@@ -59,7 +58,6 @@ class Perception:
 
 
 def initial_memory() -> Array:
-    """Return the memory (MEMORY_SIZE,) of the force perception at the start."""
     memory = np.zeros(MEMORY_SIZE)
     memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
     return memory
@@ -71,7 +69,6 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
 
     Args:
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
-        parameters: (4,) from `Perception.parameters`.
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
         hand_force, velocity: (3,) force of the hand on the stylus [N], its velocity [m/s].
         attentive: if false, update only the expectation and detect no contact.
@@ -155,17 +152,13 @@ def perceive(
 
     Args:
         t: (N,) evenly spaced times [s].
-        hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s], in the
-            same axes.
+        hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s].
         hand_mass: mass of the hand that moves with the stylus [kg].
         attentive: start time of detection [s]; before, only the expectation is updated.
 
     Returns:
         (N, 5) force on the hand beyond the expected one (3) [N], threshold [N], 1 while contact is
             detected.
-
-    Raises:
-        DrakeTeleopError: for arrays of wrong shape, or values that are not finite.
     """
     rows = {"hand_force": (hand_force, 3), "velocity": (velocity, 3)}
     _, (force, speed) = checked_rows(**rows)

@@ -105,9 +105,8 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Raise a DrakeTeleopError if the target is too near to the tool's start.
-
-    The least distance is the target's radius or the standoff. `where` is the block's path.
+    """Raise a DrakeTeleopError if the target is nearer to the start than its radius or the
+    standoff.
     """
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:

@@ -74,8 +74,7 @@ class Ledger:
 
     Attributes:
         stored: energy that this end may still release, for translation and rotation.
-        received: energy received from the other end so far.
-        sent: energy sent so far.
+        received, sent: energy received from, and sent to, the other end so far.
         lost: energy removed from the loop (damper, overflow, withheld work).
     """
 

@@ -13,7 +13,6 @@ class Slots:
         self._size, self._next = size, first
 
     def number(self) -> int:
-        """Reserve one place and return its index."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:

@@ -202,7 +202,6 @@ class PassivityConfig(Methods, _CommonConfig):
     """
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError for invalid parameters of a registered method."""
         METHODS.check(self.method, f"{where}.method")
         self.of_method(where)
 
@@ -362,10 +361,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 def command_sent(steps, requested, command, pose, twist, p, memory):
     """Update the method's memory if the safe state changed the method's command.
 
-    Args:
-        steps, p, memory: as for `master_step`.
-        requested: (7,) command X_WS of the method.
-        command: (7,) command after the safe state; the method may change it.
-        pose, twist: (7,) and (6,) actual pose and twist of the slave, in W.
+    `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
+    the method may change.
     """
     _command_sent(steps[2], requested, command, pose, twist, p, memory)

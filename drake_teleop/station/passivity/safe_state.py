@@ -51,10 +51,7 @@ def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.
 
 
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the silence monitor (SLAVE_WATCH,) of the slave before the first packet.
-
-    `pose` (7,) is the command X_WS until then.
-    """
+    """Return the silence monitor (SLAVE_WATCH,) of the slave; `pose` (7,) is its first command."""
     watch = np.zeros(SLAVE_WATCH)
     watch[SILENT] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
@@ -72,17 +69,12 @@ def _update_silence(alive, fault, T, watch):
 
 @njit(cache=True)
 def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
-    """Write the limits of the rendered wrench for this step; they fall to zero during silence.
+    """Write the limits (2,) of the rendered wrench [N, N m]; they fall to zero during silence.
 
-    Args:
-        alive: whether a new packet of a healthy slave came at this step.
-        fault: whether the hand's data are not finite, or a new packet reports this of the slave.
-        T: time between steps [s].
-        timeout: time without packets until the end is silent [s].
-        full: (2,) the device's limits [N, N m].
-        held: (6,) wrench displayed since the last step [N, N m].
-        watch: (MASTER_WATCH,) silence monitor, updated.
-        limits: (2,) written: largest force and torque [N, N m].
+    `alive` means that a new packet of a healthy slave came; `fault` that data of the hand or the
+    slave are not finite. `timeout` [s] is the time without packets until the end is silent, `full`
+    (2,) the device's limits, `held` (6,) the displayed wrench. `watch` is the silence monitor,
+    updated.
     """
     _update_silence(alive, fault, T, watch)
     connected = watch[SILENT] <= timeout
@@ -104,15 +96,10 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
 
 @njit(cache=True)
 def slave_command_into(alive, fault, T, timeout, requested, watch, command):
-    """Write the command that is sent to the slave at this step; during silence the slave stops.
+    """Write the command X_WS (7,) that is sent to the slave; during silence the slave stops.
 
-    Args:
-        alive: whether a new packet of a healthy master came at this step.
-        fault: whether the slave's data are not finite, or a new packet reports this of the hand.
-        T, timeout: as for `master_limits_into`.
-        requested: (7,) pose X_WS from the passivity method.
-        watch: (SLAVE_WATCH,) silence monitor, updated.
-        command: (7,) written: commanded pose X_WS.
+    `requested` (7,) is the pose from the passivity method; other arguments as for
+    `master_limits_into`.
     """
     _update_silence(alive, fault, T, watch)
     last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]

@@ -308,7 +308,6 @@ def _account_command(command, sign, memory):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Correct the energy balance for a command that the safe state changed."""
     for i in range(7):
         if command[i] != requested[i]:
             _account_command(requested, -1.0, memory)

@@ -176,7 +176,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Store the servo's wrench for a command that the safe state changed."""
     spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, spring)
     for i in range(6):

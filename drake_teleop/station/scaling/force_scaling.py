@@ -58,7 +58,6 @@ class Scales(NamedTuple):
 
     @property
     def shares(self) -> tuple[float, float, float, float]:
-        """Shares of the inertias and weights."""
         return self.sigma_gripper, self.sigma_object, self.weight_gripper, self.weight_object
 
 
@@ -86,11 +85,7 @@ class ForceScalingConfig:
     )
 
     def scales(self, where: str = "force_scaling") -> Scales:
-        """Return the scales of gripper, object and contact.
-
-        An eta that does not fit the other fields raises a DrakeTeleopError; `where` is the block's
-        path.
-        """
+        """Return the scales of gripper, object and contact; raise for an eta that does not fit."""
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
             weights, inertias = weight_and_inertia_scales(self.sigma, self.sigma, *separate)
@@ -124,16 +119,16 @@ def wrench_to_master(
     force_scale: float,
     torque_scale: float,
 ) -> NDArray[np.float64]:
-    """Return the wrench to render for a wrench at the slave's sensor: its reaction, scaled.
+    """Return the wrench to render (..., 6) for a wrench at the slave's sensor: its reaction,
+    scaled.
+
+    It is F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
 
     Args:
         wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
         R_WS: (..., 3, 3) orientation of the sensor.
         R_WB: (3, 3) alignment of the master's base B with the world.
         force_scale, torque_scale: value at the master over value at the slave.
-
-    Returns:
-        (..., 6) F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
     """
     R_BS = np.swapaxes(R_WB, -1, -2) @ R_WS
     force = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., :3])
@@ -145,10 +140,7 @@ def wrench_to_master(
 def scales_at(change, time, scales):
     """Write the six scales at `time` [s]: a minimum-jerk blend from old to new scales.
 
-    Args:
-        change: (14,) old scales (6), new scales (6), start of the change [s], duration [s].
-        scales: (6,) written: sigma_gripper, sigma_object (of the inertia), gamma, force scale,
-            shares of the weight of gripper and object.
+    `change` (14,) contains old scales (6), new scales (6), start of the change [s], duration [s].
     """
     u = min(max((time - change[12]) / change[13], 0.0), 1.0) if change[13] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
@@ -178,10 +170,7 @@ def _scaled_into(sample, estimate, gripper, arm, scales, out):
 def fault_of(sample, estimate, time, valid_range):
     """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
-    Args:
-        sample: sample of the wrist sensor, see `drake_teleop.load.regressor`.
-        estimate: (16,) [offsets; phi].
-        valid_range: (7,) largest wrench [N, N m], largest age [s].
+    `valid_range` (7,) contains the largest wrench [N, N m] and age [s].
     """
     if not abs(time - sample[TIME]) <= valid_range[6]:
         return _STALE
@@ -238,7 +227,7 @@ class ForceScaling(LeafSystem):
         - scaled_wrench_S: scaled wrench F' of Fig. 2
         - contact_wrench_S: contact wrench F_c of Eq. (13)
         - fault: `Fault` of sample or estimate
-        - scaled_contact_and_fault: the three above in one vector, for a log
+        - scaled_contact_and_fault: the three above in one vector
         - non_contact_wrench_S: wrench of the load (weight and inertia), Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
         - load_wrench_B: part of wrench_B from weight and inertia of the load

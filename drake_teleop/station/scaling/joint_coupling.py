@@ -29,13 +29,7 @@ class JointCoupling(LeafSystem):
         - leader_joints: (n,) commanded joint positions of the slave [rad]
         - pose_command: (7,) X_WS for these joints
 
-    Args:
-        start: (n,) joints of the slave when the leader is at `home` [rad].
-        home: (n,) joints of the leader [rad].
-        period: sampling period of the clutch [s].
-
-    Raises:
-        DrakeTeleopError: if the numbers of joints differ.
+    The slave has the joints `start` when the leader is at `home`, (n,) [rad].
     """
 
     __slots__ = ONE_DICT

@@ -1,9 +1,8 @@
 """Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
 
-The wrench is the reaction of the weld, the motion that of the sensor frame S. Both come from the
-plant's output ports, so joints, contact and controllers are arbitrary. With sampled output ports
-(Drake's default for discrete plants) reaction and acceleration belong to the state before a step,
-pose and velocity to the state after it; the block holds pose and velocity to pair the four.
+The wrench is the reaction of the weld, from the plant's output ports. With sampled output ports,
+reaction and acceleration belong to the state before a step, pose and velocity to the state after
+it; the block holds pose and velocity to pair the four.
 """
 
 from __future__ import annotations
@@ -140,8 +139,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
     """Sensor of force, torque and motion of S at a weld of a plant, see `AddWristSensor`.
 
     The outputs hold the last sample, which belongs to the instant `sample_time`. The angular
-    velocity is that of an ideal gyroscope on the path of the joint encoders: their low-pass, delay
-    and rounding, no noise. Faster paths wait for the slowest one.
+    velocity is that of an ideal gyroscope with the encoders' low-pass, delay and rounding.
 
     .. pydrake_system::
 
@@ -384,10 +382,7 @@ def _joints(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
-    """Return the arm's body at the weld, and all bodies of the load.
-
-    The load is on the side of the weld that is not connected to the world.
-    """
+    """Return the arm's body at the weld, and all bodies on the other side, the load."""
     neighbours: dict[BodyIndex, list[BodyIndex]] = {}
     for joint in _joints(plant):
         if joint.index() != weld.index():

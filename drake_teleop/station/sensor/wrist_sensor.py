@@ -100,9 +100,7 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     Args:
         arm: `ArmModel.table` of an arm with n joints.
         phi: (10,) inertial parameters of the tool.
-        q, v, vdot: (n,) joint positions, speeds and accelerations.
-        contact_W: (6,) wrench of the environment on the tool about the world's origin, in W, which
-            is subtracted from that of Eqs. (1)-(2).
+        contact_W: (6,) wrench of the environment on the tool about the world's origin, in W.
         motion: (21,) scratch.
     """
     sensor_motion(arm, q, v, vdot, motion)
@@ -201,7 +199,6 @@ def sample_step(
             acceleration by gravity; `JointTable` of other moving bodies, wrenches from Drake).
         sensor: (chain's constants, estimator's constants, start of its memory, start of the tail,
             ideal).
-        period: sampling period [s].
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         around: present [deflection and rate of the sheet, plant's state if other bodies move].
@@ -209,11 +206,10 @@ def sample_step(
         applied_W: (6,) additional wrench on the tool, see `environment_wrench`.
         memory: [last two samples (16 + n each) | chain's | estimator's | tail: samples taken,
             length of the queue, time and x of each step's end in it].
-        touching_W: (6,) contact wrench on the tool now, from the plant, about the world's origin,
-            in W; or (0,) to calculate it with `physics`.
+        touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
+            calculate it with `physics`.
         scratch: (9, 2 n + 6 + size of the plant's state).
-        result: written: [last sample before now (16 + n) | its time [s] | memory with now's end as
-            the only queue entry].
+        result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
     size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
@@ -293,19 +289,10 @@ class WristSensor(LeafSystem):
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
-        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | its time [s] |
-          memory]
+        - step: [the last sample before now (16 + n) | its time [s] | memory]
 
-    Args:
-        slave: the plant; source of the tool's true inertial parameters and contact shapes.
-        period: sampling period [s].
-        held: duration for which the motors hold a torque, or its rate [s].
-        q_start: (n,) joint angles at rest before the first sample [rad].
-        ramps: True if the motors hold a rate.
-
-    Raises:
-        DrakeTeleopError: during simulation, if a force that the sensor does not receive moves the
-            arm, because its samples would be wrong.
+    The motors hold a torque, or with `ramps` its rate, for the duration `held` [s]. A force that
+    the sensor does not receive raises a DrakeTeleopError during simulation.
     """
 
     __slots__ = ONE_DICT
@@ -399,12 +386,12 @@ class WristSensor(LeafSystem):
 
     @property
     def contact_pairs(self) -> Array:
-        """Table (k, 28) of pairs of shapes that can touch, see `Pairs`; a view."""
+        """Table (k, 28) of pairs of shapes that can touch, see `Pairs`."""
         return self._physics[2]
 
     @property
     def beyond(self) -> str:
-        """Reason why contact is outside the compiled contact law, or "", see `Contact`."""
+        """Reason why contact is outside the compiled contact law, or ""."""
         return self._beyond_contact_law
 
     @property
@@ -415,10 +402,7 @@ class WristSensor(LeafSystem):
 
     @property
     def remembered(self) -> NDArray[np.intp]:
-        """Indices of the numbers in the discrete state that depend on the motion.
-
-        Counters, flags, random walks and the sample before the last one are excluded.
-        """
+        """Indices of the numbers in the discrete state that depend on the motion."""
         _, _, chain_end, end, _ = self._sensor
         size = sample_size(self._n)
         before_and_walks = range(size, 2 * size + FILTERED)
@@ -588,13 +572,10 @@ def AddCompiledWristSensor(
     *,
     ramps: bool = False,
 ) -> dict[str, OutputPort]:
-    """Add the block "wrist_sensor", its noise source, and demultiplexers of its output.
+    """Add the block "wrist_sensor", its noise source, and demultiplexers; return the ports by name.
 
-    Arguments as for `WristSensor`. The caller must connect state, acceleration and torque of the
-    arm.
-
-    Returns:
-        The output ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
+    The ports are "sample", each of its parts (`sample_parts`), and "sample_time". The caller must
+    connect state, acceleration and torque of the arm.
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
