@@ -165,7 +165,6 @@ def channel_step(
     """Run one step of both ends and of both directions of the network.
 
     Args:
-        steps: result of `methods.steps_of(method)`.
         pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
             `TeleopChannel`.
         T: time between steps [s].
@@ -316,9 +315,7 @@ def _to_master(wrench, frame, out):
 class TeleopChannel(LeafSystem):
     """Network with a passivity method at both ends; a packet takes at least one period.
 
-    While the wrist sensor is saturated, the last valid wrench is used. The rendered wrench depends
-    on the inputs without delay, so that wrench times increment of the command is the work at the
-    device.
+    While the wrist sensor is saturated, the last valid wrench is used.
 
     .. pydrake_system::
 
@@ -342,7 +339,7 @@ class TeleopChannel(LeafSystem):
     Args:
         R_WB: (3, 3) alignment of the master's base with the world.
         scales: (2,) scale of translation and rotation, slave over master.
-        force_scale: scale of the contact force (force scale times gamma), slave to master.
+        force_scale: scale of the contact force, slave to master.
         start: (7,) pose X_WS of the slave at the start.
     """
 

@@ -240,8 +240,7 @@ def initial_state(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
-    `p` is from `parameters`; `neutral` (N,) contains the values at the receiver before the first
-    packet. Only the first N numbers of a packet are transmitted.
+    `neutral` (N,) contains the values at the receiver before the first packet.
     """
     slots = int(p[_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
@@ -250,10 +249,7 @@ def initial_state(
 
 @njit(cache=True)
 def send(p, state, k, packet):
-    """Send the packet of step `k`; steps count from 0 without gaps.
-
-    `p` is from `parameters`; `state`, from `initial_state`, is updated.
-    """
+    """Send the packet of step `k` and update `state`; steps count from 0 without gaps."""
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
     receiver[_BAD], first, second = _advance_chain(p, k, receiver[_BAD])
@@ -271,8 +267,7 @@ def send(p, state, k, packet):
 def receive(p, state, k, packet):
     """Write the newest packet (N,) at step `k` into `packet`, after `send` of the same step.
 
-    Return the step at which it was sent, or -1, and True if it is new. If it is not new, the policy
-    `silence` changes it.
+    Return the step at which it was sent, or -1, and True if it is new.
     """
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET

@@ -33,8 +33,7 @@ class Stand(NamedTuple):
 class Environment(ABC):
     """Object that the tool can touch; subclasses are dataclasses.
 
-    Its bodies may be fixed or move, with any shape that Drake supports. The wrist sensor's own
-    contact law is faster; it supports boxes and a single `moving_part`.
+    Its bodies may be fixed or move, with any shape that Drake supports.
     """
 
     @property
@@ -111,7 +110,6 @@ class Several(Environment):
 
 
 def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
-    """Add a model instance with this name, numbered if the name exists."""
     number, free = 2, name
     while plant.HasModelInstanceNamed(free):
         free, number = f"{name}_{number}", number + 1
@@ -133,7 +131,7 @@ def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
 def ToolShapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[GeometryId]]:
-    """Return the shapes with contact properties for each body of the tool, also welded ones."""
+    """Return the shapes with contact properties for each body welded to the tool."""
     properties = scene_graph.model_inspector().GetProximityProperties
     return {
         index: [

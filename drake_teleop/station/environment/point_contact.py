@@ -1,10 +1,8 @@
 """Drake's compliant point contact between the tool's spheres and boxes, compiled.
 
-Normal force f_n and friction f_t (Hunt and Crossley 1975; regularised Coulomb friction) are
+With depth x, stiffness k, dissipation d, slip velocity v_t and slip speed v_s of full friction::
 
     f_n = k x (1 + d x') >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
-
-with depth x, stiffness k, dissipation d, slip velocity v_t, slip speed v_s of full friction.
 """
 
 from __future__ import annotations
@@ -51,9 +49,8 @@ class Pairs(NamedTuple):
         known: (k, 28), pairs of a sphere of the tool and a box: 0-2 centre of the sphere in S [m],
             3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead of W if
             the body moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
-            moves in W (zero if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25
-            static and dynamic friction, 26 slip speed v_s of full friction [m/s], 27 row of the
-            body in a `JointTable`, or -1.
+            moves in W (zero if fixed), 22 stiffness [N/m], 23 dissipation [s/m], 24 and 25 static
+            and dynamic friction, 26 slip speed [m/s], 27 row of the body in a `JointTable`, or -1.
         watched: (l, 40), bounding boxes of all other pairs. As above, with 0-2 the centre of the
             tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
         unknown: reason why the first of the other pairs is not in `known`.

@@ -70,10 +70,7 @@ class SheetSpring(Environment):
         return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the leaf to a plant that is registered with a scene graph, before Finalize.
-
-        The joint "bending" is the deflection of the leaf's end along z_W [m], 0 at rest.
-        """
+        """Add the leaf to a plant; the joint "bending" is its end's deflection along z_W [m]."""
         tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
         # Drake fixes a body's mass when it parses it, so the mass is written into the text.
         tree.find(".//link[@name='leaf']/inertial/mass").text = repr(self.effective_mass)  # type: ignore[union-attr]

@@ -78,7 +78,6 @@ class Slot(Environment):
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the slot and the tool's second ball, without mass, to a plant before Finalize."""
         body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
         if not plant.geometry_source_is_registered():

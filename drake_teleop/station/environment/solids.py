@@ -1,7 +1,4 @@
-"""Solids with Drake's point contact: fixed wall and box, movable block on a table.
-
-The block stands on balls in its corners, because a contact of two boxes is a single point.
-"""
+"""Solids with Drake's point contact: fixed wall and box, movable block on a table."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -37,8 +34,8 @@ _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 class Surface(Environment):
     """Object with a contact surface; Drake combines it with the surface of the other object.
 
-    Stiffnesses are springs in series, k1 k2 / (k1 + k2). Friction is the harmonic mean, 2 mu1 mu2 /
-    (mu1 + mu2). The tool's ball has stiffness 4e5 N/m and friction 0.2.
+    Stiffnesses are springs in series; friction is the harmonic mean. The tool's ball has stiffness
+    4e5 N/m and friction 0.2.
     """
 
     stiffness: float = quantity(
@@ -80,10 +77,7 @@ class Box(Surface):
 def AddFixedBox(
     plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
 ) -> None:
-    """Weld a box to the world; without a scene graph it has no shape.
-
-    `name` is numbered if it exists, X_WBox is the pose, `size` (3,) the edges [m].
-    """
+    """Weld a box with edges `size` (3,) [m] to the world; without a scene graph it has no shape."""
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
     if plant.geometry_source_is_registered():
@@ -114,7 +108,6 @@ class Wall(Surface):
             )
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the wall as a box behind its face, with z along the normal."""
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
         behind = RigidTransform([0.0, 0.0, -_THICKNESS / 2])

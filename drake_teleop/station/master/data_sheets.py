@@ -147,10 +147,7 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """Return the dynamics of the device with the hand's mass [kg] and inertia about E [kg m^2].
-
-        A leader arm whose model cannot be used raises a DrakeTeleopError.
-        """
+        """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
         numbers = np.zeros(NUMBERS)
@@ -174,8 +171,8 @@ class Master:
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError if a leader arm commands joints; `what` is the name of the
-        caller.
+        """Raise a DrakeTeleopError in the name of the caller `what` if a leader arm commands
+        joints.
         """
         if self.leads_joints:
             raise DrakeTeleopError(
@@ -197,7 +194,7 @@ class Master:
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction(self) -> "Master":
-        """Return a copy without Coulomb friction and encoder steps, a linear device."""
+        """Return a copy without Coulomb friction and encoder steps."""
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -255,5 +252,4 @@ _MAX_PITCH_RAD = 1.5  # rad
 
 
 def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    """Return the data sheet of the device that a scenario's block `master` names, or None."""
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

@@ -83,7 +83,6 @@ def AddDevice(
     device: HapticDevice | LeaderDevice,
     q_initial: NDArray[np.float64],
 ) -> tuple[LeafSystem, LeafSystem]:
-    """Add, connect and return the blocks "master_device" and "force_display" of a haptic device."""
     check_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):
         block: LeafSystem = LeaderArm(period, device, q_initial)

@@ -63,7 +63,7 @@ def step(state, hand_wrench, motor, device, period, work, stages):
     """Advance `state` (12,) [q; v] in place by one Runge-Kutta step of `period` [s].
 
     `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `motor` (6,) are the motor
-    torques or forces at the joints; `work` and `stages` are scratch.
+    torques or forces at the joints.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
     put(stage, 0, state, 0, 12)
@@ -117,7 +117,6 @@ class HapticDevice(DisplayDevice):
 
     @property
     def friction_field(self) -> str:
-        """Name of the scenario field that contains the friction."""
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -128,7 +127,7 @@ class HapticDevice(DisplayDevice):
         return not self.numbers[IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the joint positions (6,) for a stylus pose X_BE (7,); raise if out of reach."""
+        """Return the joint positions (6,) for a stylus pose X_BE (7,)."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
         return task_space.inverse_kinematics(pose, self.numbers)
@@ -140,7 +139,6 @@ class HapticDevice(DisplayDevice):
         return pose
 
     def check_limits(self, q: NDArray[np.float64]) -> None:
-        """Raise a DrakeTeleopError if a joint position is outside its limits."""
         if self.is_phantom:
             phantom.check_limits(q)
         else:
@@ -153,7 +151,6 @@ class HapticDevice(DisplayDevice):
         return task_space.at_an_end(q, self.numbers)
 
     def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B."""
         J = np.empty((6, 6))
         jacobian_into(q, self.numbers, J)
         return J

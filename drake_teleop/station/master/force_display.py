@@ -44,7 +44,6 @@ def _peak_wrench(numbers):
 
 
 def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the force display's input (27,) for the first period, at joint positions q (6,)."""
     display = np.zeros(_WATCH.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
     display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
@@ -85,8 +84,7 @@ def motor_torque_into(displayed, q, numbers, J, torque):
 def display_into(wrench, device, numbers, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
-    `device` (27,) is the port `for_display` of `MasterDevice`; `drive` (27,) is written: its input,
-    with the displayed wrench and a `Fault`.
+    `device` (27,) is the port `for_display` of `MasterDevice`; `drive` (27,) is written.
     """
     q, fault = device[_POSITIONS], _NO_FAULT
     put(drive, 6, device, 6, _WATCH.stop - 6)
@@ -127,8 +125,7 @@ def _fade(device, numbers, period, drive):
 class DeviceBlock(LeafSystem):
     """Base class of haptic devices as blocks, at rest at `q_initial` at the start.
 
-    The compiled function `advance` of `constants`, the four states, hand wrench, drive and period
-    writes the states after one period.
+    `advance` writes the states after one period.
     """
 
     __slots__ = ONE_DICT

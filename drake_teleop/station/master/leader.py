@@ -1,8 +1,6 @@
-"""Leader arm: any serial arm that the operator holds as a haptic device.
+"""Leader arm: any serial arm that the operator holds at E as a haptic device.
 
-    M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
-
-The hand holds the arm at E, whose axes equal those of the base frame B at home.
+M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
 """
 
 from __future__ import annotations
@@ -58,8 +56,7 @@ _STOP_HZ = 12.0
 def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
     """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
 
-    `arm` is `ArmModel.table` with the hand's mass, `joints` (8, n) that of `LeaderDevice`,
-    `applied` (6,) the hand's wrench minus its weight [f; tau] on E, in B.
+    `applied` (6,) is the hand's wrench minus its weight [f; tau] on E, in B.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -123,8 +120,8 @@ def step_leader(
 ):  # fmt: skip
     """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    `bare` and `arm` are `ArmModel.table` without and with the hand; `hand_weight` [N] is carried by
-    the operator. Other arguments are those of the ports of `LeaderArm`.
+    `bare` and `arm` are `ArmModel.table` without and with the hand, whose weight `hand_weight` [N]
+    the operator carries.
     """
     n = joints.shape[1]
     put(display, 6, drive, 6, drive.shape[0] - 6)
@@ -203,7 +200,6 @@ class LeaderDevice(DisplayDevice):
 
     @property
     def constants(self) -> tuple[Array, Array, Array]:
-        """Tables of the arm without and with the hand, and `joints`, for compiled functions."""
         return self.bare.table, self.arm.table, self.joints
 
     def display_axes(self, q: Array) -> Array:
@@ -211,7 +207,7 @@ class LeaderDevice(DisplayDevice):
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """Return joint positions (n,) for X_BE (7,), searched from home; raise if out of reach."""
+        """Return joint positions (n,) for X_BE (7,), searched from home."""
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
@@ -257,10 +253,11 @@ class LeaderDevice(DisplayDevice):
 def joint_parameters(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
-    """Return the array (8, n) `LeaderDevice.joints`; end stops scale with the inertia at home.
+    """Return `LeaderDevice.joints` (8, n) from vectors (n,); end stops scale with the inertia at
+    home.
 
-    Vectors are (n,): start `home` [rad], friction `coulomb` [N m], `viscous` damping in addition to
-    the model's [N m s/rad], torque `limit` [N m]. `carried` is the compensated share of the weight.
+    `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
+    the model's [N m s/rad], `carried` the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]

@@ -97,10 +97,7 @@ class Leader:
         )
 
     def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
-        """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world.
-
-        A model that cannot be read raises a DrakeTeleopError.
-        """
+        """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world."""
         X_BBase = RigidTransform(RollPitchYaw(self.base_rotation), np.zeros(3))
         X_WBase = X_BBase if X_Table is None else X_Table @ X_BBase
         packages = tuple(map(Path, self.package_paths))

@@ -1,9 +1,8 @@
 """The Phantom Premium 1.5 HighForce/6DoF: kinematics and dynamics in closed form.
 
-B: base frame at the intersection of yaw and shoulder axis, z_B up, x_B towards the operator. E:
-stylus frame at the gimbal point. q (6,) [rad]: yaw; inner link up from the horizontal; outer link
-from the downward vertical towards x_B (absolute: q2 rotates only the inner link); wrist yaw, pitch,
-roll.
+B: base frame at the intersection of yaw and shoulder axis, z up, x towards the operator. E: stylus
+frame at the gimbal point. q (6,) [rad]: yaw; inner link up from the horizontal; outer link from the
+downward vertical towards x_B (absolute); wrist yaw, pitch, roll.
 
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
     R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
@@ -121,10 +120,7 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
-    """Write the mass matrix (6, 6) with wrist, hand and reflected motors into M; J is the Jacobian.
-
-    Wrist links and hand are point masses at the stylus with equal moments of inertia.
-    """
+    """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
     _main_mass_matrix_into(q, M)
     M[0, 0] += _MOTOR_1
     M[1, 1] += _MOTOR_2
@@ -269,7 +265,6 @@ def mass_matrix(
 
 
 def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the torque (6,) [N m] that compensates the weight of device and wrist."""
     torque = np.empty(6)
     gravity_torque_into(q, torque)
     return torque
@@ -282,10 +277,7 @@ def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees.
-
-    A pose out of reach or beyond a joint limit raises a DrakeTeleopError.
-    """
+    """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees."""
     x, y, z = pose[4:7]
     reach = math.hypot(x, y)
     # Two-link arm whose second link points along q3 - 90 degrees; elbow = q2 - (q3 - 90 degrees).
@@ -309,10 +301,7 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6).
-
-    Its third joint is relative to the inner link; the device's q3 is absolute.
-    """
+    """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6)."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial

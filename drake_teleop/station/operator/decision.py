@@ -1,7 +1,6 @@
 """Decisions of the simulated operator during a task, from vision and perceived force.
 
 The hand moves by planned displacements, and waits until their effect is visible (Ferrell 1965).
-`docs/operator.md` lists assumptions and sources.
 """
 
 from __future__ import annotations

@@ -38,12 +38,8 @@ def update_fit(sums, force_change, displacement, speed_change, keep):
 def smooth_slip(displayed, component, explained, share, max_slip):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
-    Args:
-        displayed: result of the last step [N].
-        component: measured force along the mean direction of the contact, at least 0 [N].
-        explained: change of this force that depth and speed explain [N].
-        share: share of the unexplained change that is rendered in this step.
-        max_slip: largest unexplained change that a slip can cause [N].
+    `component` [N] is the measured force. Its changes that depth and speed explain (`explained`)
+    are rendered at once; of the others only a `share`, up to the size `max_slip`.
     """
     displayed += explained
     displayed += min(share, 1.0) * (component - displayed)

@@ -1,8 +1,4 @@
-"""Energy through a port of the station, computed from recorded wrenches f and poses x.
-
-The work of step k uses the wrench `held` f_(k-1) (exact for hand and motors), `backward` f_k (the
-balance of TDPA and wave variables) or their `mean` (contact).
-"""
+"""Energy through a port of the station, computed from recorded wrenches f and poses x."""
 
 from __future__ import annotations
 
@@ -74,7 +70,7 @@ class Ledger:
 
     Attributes:
         stored: energy that this end may still release, for translation and rotation.
-        received, sent: energy received from, and sent to, the other end so far.
+        received, sent: total energy received from, and sent to, the other end.
         lost: energy removed from the loop (damper, overflow, withheld work).
     """
 

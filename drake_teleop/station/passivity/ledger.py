@@ -1,7 +1,6 @@
-"""Passivity method "ledger", master's end: an energy balance at the slave's actual motion.
+"""Master's end of the passivity method "ledger", whose energy balance is at the slave's motion.
 
-docs/theory.md, "The energy ledger", explains the equations, the constants, and the steps M1 to M7
-(master) and S1 to S6 (slave, in `ledger_slave`).
+docs/theory.md, "The energy ledger", has its equations and the steps M1 to M7 and S1 to S6.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -337,14 +336,13 @@ def _add_friction(T, size, force, received, dx, p, memory, wrench):
 
 @njit(cache=True)
 def _friction_stiffness(g, p):
-    """Return k_h of (T68) for translation (g = 0) [N/m] or rotation (g = 1) [N m/rad]."""
+    """Return k_h of (T68) for translation [N/m] or rotation [N m/rad]."""
     factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
     return factor * _MAX_STIFFNESS / max(p[METRIC][g], _LEAST_METRIC)
 
 
 @njit(cache=True)
 def _remove_normal(wrench, p, memory):
-    """Remove the component of `wrench` (6,) along the direction of the contact."""
     normal = memory[NORMAL]
     component = component_along(wrench, normal, p)
     for i in range(6):

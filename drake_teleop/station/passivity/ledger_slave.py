@@ -120,7 +120,6 @@ def smooth_velocity(twist, share, memory):
 
 @njit(cache=True)
 def is_contact(wrench, p):
-    """Return whether force or torque of the wrench exceeds the contact threshold."""
     threshold = p[CONTACT_THRESHOLD]
     return length(wrench, 0) > threshold[0] or length(wrench, 1) > threshold[1]
 
@@ -163,7 +162,7 @@ def find_direction(wrench, round_trip, T, p, memory):
 
 @njit(cache=True)
 def receive(g, received, memory):
-    """Add newly received energy to this end's balance for group `g`; return this energy [J]."""
+    """Add newly received energy to this end's balance for group `g`; return it [J]."""
     new = new_energy(g, received, memory)
     memory[LEDGER][g] += new
     return new
@@ -455,7 +454,6 @@ def _step_servo_model(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Limit the motors' energy for a command that the safe state changed."""
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_motor_energy(command, pose, twist, p, memory):

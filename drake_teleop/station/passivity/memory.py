@@ -16,14 +16,13 @@ class Slots:
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
-        """Reserve `length` places and return their slice; raise IndexError if fewer remain."""
+        """Reserve `length` places and return their slice."""
         first, self._next = self._next, self._next + length
         if self._next > self._size:
             raise IndexError(f"{self._next} numbers do not fit into {self._size}")
         return slice(first, self._next)
 
     def rest(self) -> slice:
-        """Reserve all remaining places and return their slice."""
         return self.vector(self._size - self._next)
 
 
@@ -62,10 +61,9 @@ _METHOD = _parameters.rest()
 
 
 def own_memory() -> Slots:
-    """Return an allocator for a method's own part of the memory; this part starts with zeros."""
+    """Return an allocator for a method's own part of the memory, which starts with zeros."""
     return Slots(MEMORY, _OWN.start)
 
 
 def own_parameters() -> Slots:
-    """Return an allocator for a method's own part of the parameter vector."""
     return Slots(PARAMETERS, _METHOD.start)

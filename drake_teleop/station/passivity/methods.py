@@ -80,8 +80,7 @@ class PassivityMethod(NamedTuple):
         balance_at_motors: the energy balance is at the slave's motors, not at its command.
         needs_arm_mass: `slave_mass` and servo are by default those of the arm at the start.
         needs_load_apart: the ends need the load's part of the wrench, `load_wrench_B`.
-        speed_limit: `speed_limit(config, slave_mass)` returns the slave's largest speed (2,)
-            [m/s, rad/s]; a run warns above it.
+        speed_limit: function of config and slave mass: largest speed of the slave [m/s, rad/s].
     """
 
     master_step: Any
@@ -251,8 +250,7 @@ def initial_memory(
 ) -> NDArray[np.float64]:
     """Return the memory (MEMORY,) of one end of the channel before its first step.
 
-    `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives. An
-    unknown method raises a DrakeTeleopError.
+    `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives.
     """
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(MEMORY)
@@ -273,7 +271,6 @@ _master_step, _slave_step, _command_sent = map(
 
 
 def steps_of(method: str) -> tuple[int, int, int]:
-    """Return the addresses of a method's `master_step`, `slave_step` and `command_sent`."""
     return _addresses(*METHODS[method][:3])
 
 
@@ -305,7 +302,6 @@ def master_step(
     """Compute the wrench to render at the hand and the packet of one step at the master's end.
 
     Args:
-        steps: result of `steps_of(method)`.
         received: (PACKET_SIZE,) newest packet of the slave; zeros before the first.
         fresh: True if the packet is new.
         pose: (7,) commanded pose X_WS, after kinematic scaling, before the channel.
@@ -314,8 +310,7 @@ def master_step(
         hand: (6,) wrench of the hand on the device, in W; only `four_channel` uses it.
         limits: (2,) largest force and torque [N, N m].
         T: time between steps [s].
-        p: (PARAMETERS,) result of `parameters`.
-        memory: (MEMORY,) memory of this end, updated.
+        p, memory: parameters and memory of this end; memory is updated.
         wrench: (6,) written: wrench to render; 0 if an input is not finite.
         packet: (PACKET_SIZE,) written: packet to send.
     """
@@ -336,10 +331,8 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
     """Compute the slave's command and the packet of one step at the slave's end.
 
     Args:
-        steps, received, fresh, T, p, memory, packet: as for `master_step`, with the master's
-            packet.
-        pose: (7,) actual pose X_WS of the slave.
-        twist: (6,) actual twist of the slave [v; omega], in W.
+        received, fresh, T, p, memory, packet: as for `master_step`, with the master's packet.
+        pose, twist: (7,) and (6,) actual pose X_WS and twist [v; omega] of the slave, in W.
         dx: (6,) increment of this pose since the last step, in W.
         wrench: (6,) wrench on the slave from contact, with sigma > 0 also from the load, in W.
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not

@@ -1,7 +1,4 @@
-"""Passivity method "none": wrench and pose are passed on unchanged.
-
-Delay or loss creates energy in this channel. It is the baseline for comparisons.
-"""
+"""Passivity method "none": wrench and pose are passed on unchanged, a baseline for comparisons."""
 
 from __future__ import annotations
 

@@ -65,21 +65,18 @@ def fill(pose, twist, wrench, packet):
 
 @njit(cache=True)
 def dot(a, b, g):
-    """Return the scalar product of group `g` of two vectors (6,)."""
     i = 3 * g
     return a[i] * b[i] + a[i + 1] * b[i + 1] + a[i + 2] * b[i + 2]
 
 
 @njit(cache=True)
 def length(a, g):
-    """Return the norm of group `g` of the vector `a` (6,)."""
     i = 3 * g
     return math.hypot(math.hypot(a[i], a[i + 1]), a[i + 2])
 
 
 @njit(cache=True)
 def scale(a, g, s):
-    """Multiply group `g` of the vector `a` (6,) by `s`."""
     for i in range(3 * g, 3 * g + 3):
         a[i] *= s
 
@@ -94,7 +91,6 @@ def limit(a, g, most):
 
 @njit(cache=True)
 def finite(a):
-    """Return whether every number of the vector is finite."""
     rest = 0.0
     for x in a:
         rest += x - x  # NaN if any x is not finite

@@ -1,7 +1,6 @@
 """Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
-A spring pulls each end to a set position, which is as near to the requested one as the stored
-energy permits. The balance holds if K and D of the servo are configured correctly.
+A spring pulls each end to a set position, as near to the requested one as the energy permits.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

@@ -1,7 +1,7 @@
 """Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
 An end is *silent* without new packets of a healthy sender for `timeout` seconds, or if data of
-either end are not finite or beyond 1e6 in SI units. Both ends begin silent.
+either end are not finite or beyond 1e6 in SI units.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _LAST_COMMAND, _PREVIOUS_COMMAND = (
 def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the silence monitor (MASTER_WATCH,) of the master before the first packet.
 
-    With `full` (2,), the device's limits [N, N m], it is the state of normal operation.
+    With `full` (2,), the device's limits [N, N m], it is that of normal operation.
     """
     watch = np.zeros(MASTER_WATCH)
     if full is None:
@@ -137,8 +137,7 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 def retreat(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released hand stays slow.
 
-    For hand speeds along the wrench between `RETREAT` and twice this, it falls to 0. While the hand
-    decelerates, the slave's inertial force remains.
+    It falls to 0 for hand speeds along the wrench between `RETREAT` and twice this.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)
     for i in range(6):

@@ -1,8 +1,7 @@
 """Time-domain passivity approach (TDPA) of a delayed two-port, docs/theory.md, (T31), (T32), (T44).
 
-Passivity is guaranteed at the hand and at the slave's *command*, for the `backward` work of module
-`energy`. `charged_tdpa` adds a drag on the hand that stores energy (Franken et al. 2011) and a
-filter of the slave's wrench.
+`charged_tdpa` adds a drag on the hand that stores energy (Franken et al. 2011) and a filter of the
+slave's wrench.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

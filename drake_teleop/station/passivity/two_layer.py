@@ -1,7 +1,6 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-The tank of each end covers the energy that the wrench can use until the next step, if hand and
-walls accelerate less than `acceleration` and if servo and mass are configured correctly.
+The tank of each end covers the energy that the wrench can use until the next step.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

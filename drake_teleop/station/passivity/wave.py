@@ -1,7 +1,7 @@
 """Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991), theory.md (T33) to (T36).
 
-The receiver filters the integral of the wave within the received energy (Niemeyer and Slotine
-2004). So jitter and loss create no energy at the hand and at the slave's *command*.
+The receiver filters the integral of the wave within the received energy, so jitter and loss create
+no energy.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

@@ -291,7 +291,7 @@ class ForceScaling(LeafSystem):
         """Change the scales, beginning now, on a minimum-jerk ramp of `duration` [s].
 
         `sigma_weight` is the share of the weight of both parts; without it the other sigmas scale
-        weight and inertia. A negative or infinite value raises a DrakeTeleopError.
+        weight and inertia.
         """
         both = sigma_gripper, sigma_object
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)

@@ -17,7 +17,7 @@ class JointCoupling(LeafSystem):
     """Coupling of the slave's joint positions to those of the leader arm, with a clutch.
 
     While the clutch is open the commanded joints are constant. When it closes they follow the
-    leader again with a jump; `JointFollower` limits the speed.
+    leader again with a jump.
 
     .. pydrake_system::
 

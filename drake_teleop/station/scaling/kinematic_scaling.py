@@ -48,11 +48,8 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         p_WS = p_command + translation_scale R_WB (p_BE - p_master)
         R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
 
-    Args:
-        pose: (7,) present pose X_BE of the master.
-        master: (7,) pose X_BE when the clutch was closed.
-        command: (7,) commanded X_WS when the clutch was closed.
-        alignment: (4,) quaternion of R_WB.
+    `pose` is the present X_BE of the master, `master` and `command` are X_BE and X_WS when the
+    clutch was closed, `alignment` is the quaternion of R_WB.
     """
     R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
     offset = rotate(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
@@ -79,8 +76,8 @@ def _command_into(pose, references, alignment, translation_scale, rotation_scale
 class KinematicScaling(DoubleOnly, LeafSystem):
     """Scaling of the master's motion into the slave's commanded pose, with a clutch.
 
-    While the clutch is open, or the master's pose is not finite, the command is constant. Then the
-    master's present pose is the new reference, so the command does not jump.
+    While the clutch is open the command is constant. When it closes, the master's present pose is
+    the new reference, so the command does not jump.
 
     .. pydrake_system::
 

@@ -1,6 +1,6 @@
 """Estimated motion of the sensor frame S (long: each source with its delay and noise).
 
-It is specific force s of the origin So, angular velocity omega and acceleration alpha. Sources:
+Sources of specific force s of So, angular velocity omega and acceleration alpha:
 
 - `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
 - `accelerometer` (default, as in the paper): measured s and alpha, omega from encoders.
@@ -97,9 +97,7 @@ class MotionEstimationConfig:
 class Delays:
     """Delays of the signal paths at low frequencies [s].
 
-    Args:
-        wrench, acceleration, encoders: delay of each path before it waits for slower ones.
-        sample: delay of a sample, equal to that of the slowest path in use.
+    `sample` is the delay of the slowest path in use, for which the others wait.
     """
 
     wrench: float
@@ -219,7 +217,6 @@ def _accelerometer_std(
 def motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return constants and initial memory of `estimate_into` for an arm with n joints."""
     delays = path_delays(config, sensor, period)
     paths = np.array([delays.wrench, delays.acceleration, delays.encoders])
     used = np.array([True, config.source != "encoders", True])
@@ -274,7 +271,6 @@ def estimate_into(constants, memory, arm, reading, sample):
 
     Args:
         constants, memory: results of `motion_estimator`; memory is updated.
-        arm: `ArmModel.table` of an arm with n joints.
         reading: (13 + n,) output of `sensor_chain.read_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """

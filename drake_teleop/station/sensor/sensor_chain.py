@@ -163,10 +163,7 @@ class WristSensorConfig:
         )
 
     def largest_wrench(self) -> NDArray[np.float64]:
-        """Return the largest plausible readings (6,) of force and torque [N, N m].
-
-        They are 1.5 ranges for a sensor that saturates, else 10.
-        """
+        """Return the largest plausible readings (6,) of force and torque [N, N m]."""
         share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
 
@@ -176,10 +173,7 @@ class WristSensorConfig:
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> NDArray[np.float64]:
-        """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2].
-
-        Causes are noise and quantisation; the angular velocity omega counts as exact.
-        """
+        """Return standard deviations of s [m/s^2], omega (exact) and alpha [rad/s^2], (9,)."""
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
@@ -196,10 +190,7 @@ class WristSensorConfig:
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
     def delays(self, period: float) -> NDArray[np.float64]:
-        """Return the delays (3,) of wrench, acceleration and encoder readings [s].
-
-        They include the low-pass's group delay at zero frequency.
-        """
+        """Return the delays (3,) of wrench, acceleration and encoder readings [s]."""
         delays = self.latencies(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
             for b0, b1, b2, a1, a2 in butterworth_sections(self.bandwidth_hz, 1 / period):
@@ -281,7 +272,7 @@ def calibration_matrices(
     """Return matrices that multiply true values by the calibration errors, drawn with seed `unit`.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
-    in A: (1 + gains + cross-talk) times the rotation of the misalignment.
+    in A.
     """
     random = np.random.default_rng(config.unit)
     gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
@@ -489,10 +480,7 @@ def _convert(constants, first, end, channels):
 
 @njit(cache=True)
 def low_pass(sections, memory, values):
-    """Apply second-order sections in series to `values` (n,) in place.
-
-    `sections` (5 k,) contains [b0, b1, b2, a1, a2] of each; `memory` (2 k n,) is updated.
-    """
+    """Apply the second-order `sections` (5 k,) in series to `values` (n,) in place."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):
         b0, b1, b2 = sections[5 * k], sections[5 * k + 1], sections[5 * k + 2]

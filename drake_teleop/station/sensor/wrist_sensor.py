@@ -97,11 +97,8 @@ _USE_CONTACT_LAW = np.zeros(0)
 def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     """Write the true wrench and motion [f, tau, s, omega, alpha] of S into `out` (15,).
 
-    Args:
-        arm: `ArmModel.table` of an arm with n joints.
-        phi: (10,) inertial parameters of the tool.
-        contact_W: (6,) wrench of the environment on the tool about the world's origin, in W.
-        motion: (21,) scratch.
+    `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
+    `phi` (10,) are the tool's inertial parameters.
     """
     sensor_motion(arm, q, v, vdot, motion)
     put(out, MOTION.start, motion, 0, 9)
@@ -181,7 +178,7 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 
 @njit(cache=True)
 def _torque_at(held, after, torque):
-    """Write the motor torque (n,) at the time now + `after` [s]; `held` as in `sample_step`."""
+    """Write the motor torque (n,) at the time now + `after` [s]."""
     put(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -203,12 +200,11 @@ def sample_step(
         state: (2 n,) present state [q; v] of the arm.
         around: present [deflection and rate of the sheet, plant's state if other bodies move].
         held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
-        applied_W: (6,) additional wrench on the tool, see `environment_wrench`.
+        applied_W: (6,) additional wrench on the tool.
         memory: [last two samples (16 + n each) | chain's | estimator's | tail: samples taken,
             length of the queue, time and x of each step's end in it].
         touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
             calculate it with `physics`.
-        scratch: (9, 2 n + 6 + size of the plant's state).
         result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
@@ -386,7 +382,6 @@ class WristSensor(LeafSystem):
 
     @property
     def contact_pairs(self) -> Array:
-        """Table (k, 28) of pairs of shapes that can touch, see `Pairs`."""
         return self._physics[2]
 
     @property
@@ -410,7 +405,6 @@ class WristSensor(LeafSystem):
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
-        """Take the samples due before the present time and store the resulting discrete state."""
         seen = self._states(context)
         self._sample(
             context, seen, self._contact_level(*seen), False, _USE_CONTACT_LAW, self._result
@@ -572,10 +566,9 @@ def AddCompiledWristSensor(
     *,
     ramps: bool = False,
 ) -> dict[str, OutputPort]:
-    """Add the block "wrist_sensor", its noise source, and demultiplexers; return the ports by name.
+    """Add the block "wrist_sensor" with its noise source; return the ports by name.
 
-    The ports are "sample", each of its parts (`sample_parts`), and "sample_time". The caller must
-    connect state, acceleration and torque of the arm.
+    The caller must connect state, acceleration and torque of the arm.
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
