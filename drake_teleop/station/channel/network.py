@@ -173,8 +173,8 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     time = table.numbers(["time"], 1, str(path))[:, 0]
     delay = table.single("delay", str(path))
     if len(delay) != len(time):
-        what = f"has {len(delay)} rows, and time {len(time)}"
-        raise DrakeTeleopError(what, where=f"{path}:delay")
+        what = f"has {len(delay)} values, the column time has {len(time)}"
+        raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
     lost, age = np.isnan(delay), time - time[0]
     for column, bad, what in (
         ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),

@@ -161,7 +161,7 @@ def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[fl
     for shape in (ball, box):
         if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
             raise DrakeTeleopError(
-                "has no stiffness or no dissipation",
+                "the contact material has no stiffness or no dissipation",
                 where="drake:proximity_properties",
                 remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
             )

@@ -102,7 +102,7 @@ class Wall(Surface):
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:
             raise DrakeTeleopError(
-                "has no direction",
+                "is the zero vector, which has no direction",
                 where=f"{where}.normal",
                 remedy="point it to where the tool comes from, such as [0, 0, 1]",
             )

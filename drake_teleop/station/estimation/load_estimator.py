@@ -61,7 +61,7 @@ class LoadEstimatorConfig:
     def check(self, where: str) -> None:
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
-                f"the covariance of '{self.method}' is too small to notice a change by",
+                f"the covariance of '{self.method}' is too small to detect a change of load",
                 where=f"{where}.method",
                 remedy="set method: rtls, or watch: false",
             )
@@ -104,7 +104,7 @@ class LoadEstimator(LeafSystem):
         super().__init__()
         if config.watch and not config.enabled and covariance is None:
             raise DrakeTeleopError(
-                "there is no load to watch",
+                "there is no load to monitor: none is estimated or given with a covariance",
                 where="load_estimator.watch",
                 remedy="set load_estimator.enabled, or pass load_estimate with load_covariance",
             )

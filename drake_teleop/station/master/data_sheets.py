@@ -216,19 +216,19 @@ class Master:
     def check(self, where: str) -> None:
         if self.model == PHANTOM and self.figures is not None:
             raise DrakeTeleopError(
-                "the Phantom's own dynamics are used, not a data sheet's",
+                "the model of the Phantom is fixed and has no data sheet",
                 where=f"{where}.figures",
                 remedy="leave them out, or choose another model, such as custom",
             )
         if self.model != PHANTOM and self.friction != JointFriction():
             raise DrakeTeleopError(
-                "these are the joints of a Phantom",
+                f"only the Phantom has joint friction, not '{self.model}'",
                 where=f"{where}.friction",
                 remedy="leave it out, and set figures.friction and figures.damping",
             )
         if (self.leader is None) == (self.model == LEADER):
             raise DrakeTeleopError(
-                "a leader arm and `model: leader` belong together",
+                "a leader arm requires `model: leader`, and this model a leader arm",
                 where=f"{where}.leader",
                 remedy="give both, with leader.file and leader.hand_frame, or none",
             )
@@ -236,13 +236,14 @@ class Master:
             self.leader.check(f"{where}.leader")
             if self.figures is not None:
                 raise DrakeTeleopError(
-                    "a leader arm has its own dynamics",
+                    "the dynamics of a leader arm are from its model file, not a data sheet",
                     where=f"{where}.figures",
                     remedy="leave them out",
                 )
         if self.figures is not None and self.figures.turn[1] > _MAX_PITCH_RAD:
             raise DrakeTeleopError(
-                f"a pitch of {self.figures.turn[1]:g} rad: there yaw and roll are the same",
+                f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "
+                "where the axes of yaw and roll are parallel",
                 where=f"{where}.figures.turn",
                 remedy=f"choose at most {_MAX_PITCH_RAD:g} rad",
             )

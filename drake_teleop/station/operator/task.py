@@ -111,7 +111,7 @@ def check_task(task: Task, where: str) -> None:
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:
         raise DrakeTeleopError(
-            f"the target is {task.distance:g} m away, not more than {least:g} m",
+            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m",
             where=f"{where}.translation",
-            remedy="set the target farther from where the tool starts",
+            remedy="choose a target farther from the tool's start",
         )

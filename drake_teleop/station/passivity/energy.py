@@ -31,12 +31,12 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     """
     if pair not in PAIRS:
         raise DrakeTeleopError(
-            f"there is no pair '{pair}'", where="pair", remedy=f"choose one of {', '.join(PAIRS)}"
+            f"'{pair}' is unknown", where="pair", remedy=f"choose one of {', '.join(PAIRS)}"
         )
     wrench, pose = np.ascontiguousarray(wrench, float), np.ascontiguousarray(pose, float)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or pose.shape != (len(wrench), 7):
         raise DrakeTeleopError(
-            f"wrench {wrench.shape} and pose {pose.shape} do not fit",
+            f"wrench has the shape {wrench.shape} and pose {pose.shape}",
             where="wrench, pose",
             remedy="give (N, 6) and (N, 7)",
         )
@@ -87,7 +87,7 @@ def ledger(memory: Array) -> Ledger:
     """
     if memory.shape[-1] != MEMORY:
         raise DrakeTeleopError(
-            f"memory {memory.shape} is not one", where="memory", remedy=f"give (..., {MEMORY})"
+            f"has the shape {memory.shape}", where="memory", remedy=f"give (..., {MEMORY})"
         )
     stored, received, sent, lost = (
         memory[..., places].copy() for places in (LEDGER, RECEIVED, SENT, LOST)

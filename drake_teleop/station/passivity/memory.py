@@ -19,7 +19,7 @@ class Slots:
         """Reserve `length` places and return their slice."""
         first, self._next = self._next, self._next + length
         if self._next > self._size:
-            raise IndexError(f"{self._next} numbers do not fit into {self._size}")
+            raise IndexError(f"the vector has {self._size} places, {self._next} are required")
         return slice(first, self._next)
 
     def rest(self) -> slice:

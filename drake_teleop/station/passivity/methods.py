@@ -209,8 +209,11 @@ class PassivityConfig(Methods, _CommonConfig):
         schema = METHODS[self.method].config
         if schema is None:
             if self.registered:
-                what = f"'{self.method}' has its own fields, or no parameters"
-                raise DrakeTeleopError(what, where=f"{where}.registered")
+                raise DrakeTeleopError(
+                    f"'{self.method}' is no registered method",
+                    where=f"{where}.registered",
+                    remedy="leave it out; a shipped method has its own block of parameters",
+                )
             return getattr(self, _FIELDS[self.method]) if self.method in _FIELDS else None
         for name in self.registered:
             check_name(schema, name, f"{where}.registered.{name}")

@@ -46,9 +46,7 @@ _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
 
 
 class Scales(NamedTuple):
-    """Scales of a wrench: sigma is kept of a part's inertia, weight of its weight, gamma of
-    contact.
-    """
+    """Factors of the wrench's parts: sigma for inertia, weight for weight, gamma for contact."""
 
     sigma_gripper: float
     sigma_object: float
@@ -93,7 +91,7 @@ class ForceScalingConfig:
         alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
         if not alone or self.gripper_phi is None:
             raise DrakeTeleopError(
-                "eta works on the object alone",
+                "eta cannot be combined with these fields, because it scales the object alone",
                 where=f"{where}.eta",
                 remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper), and leave "
                 "sigma_weight and sigma_inertia out",
@@ -119,8 +117,7 @@ def wrench_to_master(
     force_scale: float,
     torque_scale: float,
 ) -> NDArray[np.float64]:
-    """Return the wrench to render (..., 6) for a wrench at the slave's sensor: its reaction,
-    scaled.
+    """Return the wrench to render (..., 6): the scaled reaction to the sensor's wrench.
 
     It is F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
 

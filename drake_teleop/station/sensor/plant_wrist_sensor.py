@@ -344,7 +344,7 @@ def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple
     expect((Joint, Frame), joint_or_frame, f"{_WHERE}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         raise DrakeTeleopError(
-            f"'{joint_or_frame.name()}' is of another plant",
+            f"'{joint_or_frame.name()}' belongs to another plant",
             where=f"{_WHERE}: joint_or_frame",
             remedy="pass a joint or frame of this plant",
         )

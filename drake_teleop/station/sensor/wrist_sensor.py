@@ -539,7 +539,7 @@ class WristSensor(LeafSystem):
             1.0 + np.abs(vdot).max()
         ):
             raise DrakeTeleopError(
-                f"at {context.get_time():g} s an unknown force moves the slave",
+                f"at {context.get_time():g} s the slave is moved by a force that is not connected",
                 where="wrist_sensor.applied_wrench_W",
                 remedy="connect every wrench on the tool to this port",
             )
