@@ -39,13 +39,25 @@ class Surface(Environment):
     """
 
     stiffness: float = quantity(
-        1e4, "N/m", 1e2, 1e7, "of its surface, in series with that of the other object (E)"
+        1e4,
+        "N/m",
+        1e2,
+        1e7,
+        "stiffness of its surface, in series with that of the other object (E)",
     )
     dissipation: float = quantity(
-        1.0, "s/m", 0.0, 100.0, "of its surface, by Hunt and Crossley: damping k x d (E)"
+        1.0,
+        "s/m",
+        0.0,
+        100.0,
+        "Hunt-Crossley dissipation d of its surface: damping k x d at depth x (E)",
     )
     friction: float = quantity(
-        0.2, "1", 0.0, 2.0, "of its surface, at rest and in motion; tool and surface average (E)"
+        0.2,
+        "1",
+        0.0,
+        2.0,
+        "friction coefficient of its surface; its mean with that of the tool applies (E)",
     )
 
     @property
@@ -95,9 +107,11 @@ class Wall(Surface):
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, the middle of its face, in W"
     )
     normal: list[float] = quantity(
-        [0.0, 0.0, 1.0], "1", -1.0, 1.0, "out of the wall, in W; its length does not matter"
+        [0.0, 0.0, 1.0], "1", -1.0, 1.0, "direction out of the wall, in W, of any length"
     )
-    size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "of its face; it is 0.1 m thick")
+    size: list[float] = quantity(
+        [0.4, 0.4], "m", 1e-3, 4.0, "lengths of its face; the wall is 0.1 m thick"
+    )
 
     def check(self, where: str) -> None:
         if np.linalg.norm(self.normal) < 1e-3:
@@ -122,9 +136,9 @@ class Block(Surface):
     position: list[float] = quantity(
         [0.6, 0.0, 0.2], "m", -2.0, 2.0, "the middle of its underside at the start, in W"
     )
-    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "of the block about z_W at the start")
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the block about z_W at the start")
     size: list[float] = quantity([0.1, 0.1, 0.1], "m", 0.01, 1.0, "lengths of its edges")
-    mass: float = quantity(0.5, "kg", 0.01, 100.0, "of the block, evenly distributed")
+    mass: float = quantity(0.5, "kg", 0.01, 100.0, "mass of the block, evenly distributed")
     table: list[float] = quantity(
         [0.5, 0.5], "m", 0.0, 4.0, "size of the table below it, of the same surface; 0: none"
     )

@@ -197,8 +197,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     f = K (x_intent - x) + B (v_intent - v); tau likewise. `impedance` (4,) is [K, B, rotational K,
     rotational B].
     """
-    wanted = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
-    error = logarithm(multiply(wanted, conjugate((pose[0], pose[1], pose[2], pose[3]))))
+    intended = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
+    error = logarithm(multiply(intended, conjugate((pose[0], pose[1], pose[2], pose[3]))))
     for k in range(3):
         wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
@@ -218,17 +218,17 @@ def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
 
 
 @njit(cache=True, borrows=True)
-def _wrench_now(
-    packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
+def _hand_wrench_at(
+    packed, start, moving, memory, time, impedance, intent_pose, intent_twist, pose, twist, wrench
 ):  # fmt: skip
-    _intended_motion_into(packed, start, moving, memory, time, wanted, wanted_twist)
-    hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
+    _intended_motion_into(packed, start, moving, memory, time, intent_pose, intent_twist)
+    hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench)
 
 
 @njit(cache=True)
-def _look_feel_decide(
+def _perceive_and_decide(
     task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
-    memory, feelings, sights, touches,
+    memory, force_memory, seen_displacements, perceived_forces,
 ):  # fmt: skip
     step = int(memory[0])
     R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -237,15 +237,27 @@ def _look_feel_decide(
         displacement[i] = p_WS[i] - tip[3 + i]
         for k in range(3):
             displacement[i] += R_WS[i, k] * tip[k]
-    decision.look_into(person, step, displacement, sights[step % sights.shape[0]])
+    decision.look_into(
+        person, step, displacement, seen_displacements[step % seen_displacements.shape[0]]
+    )
     # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE] > decision.MOVING
-    felt = touches[step % touches.shape[0]]
+    felt = perceived_forces[step % perceived_forces.shape[0]]
     perceive_into(
-        feelings, senses, decision.PERIOD, hand_mass, hand_wrench[:3], twist[:3], attentive, felt
+        force_memory,
+        senses,
+        decision.PERIOD,
+        hand_mass,
+        hand_wrench[:3],
+        twist[:3],
+        attentive,
+        felt,
     )
     # The next entry to be overwritten is the oldest.
-    seen, felt = sights[(step + 1) % sights.shape[0]], touches[(step + 1) % touches.shape[0]]
+    seen, felt = (
+        seen_displacements[(step + 1) % seen_displacements.shape[0]],
+        perceived_forces[(step + 1) % perceived_forces.shape[0]],
+    )
     decision.decide(task, person, time, seen, felt, task_state, memory)
 
 
@@ -322,8 +334,10 @@ class Operator(LeafSystem):
     ) -> DependencyTicket:
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
-        self._sights = _ring_buffer(senses.vision_delay + training.backward, np.zeros(3))
-        self._touches = _ring_buffer(senses.reaction_time, nothing_felt)
+        self._seen_displacements = _ring_buffer(
+            senses.vision_delay + training.backward, np.zeros(3)
+        )
+        self._perceived_forces = _ring_buffer(senses.reaction_time, nothing_felt)
         self._task_parameters = (
             decision.pack_task(task),
             decision.pack_person(training, senses, config.movement),
@@ -338,8 +352,8 @@ class Operator(LeafSystem):
             np.zeros(decision.STATE),
             decision.initial_memory(),
             feeling.initial_memory(),
-            self._sights.ravel(),
-            self._touches.ravel(),
+            self._seen_displacements.ravel(),
+            self._perceived_forces.ravel(),
         )
         self._groups = [self.DeclareDiscreteState(part) for part in state]
         self.DeclareStateOutputPort("task_state", self._groups[0])
@@ -348,9 +362,9 @@ class Operator(LeafSystem):
 
     def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = [discrete_state.get_mutable_value(group) for group in self._groups]
-        state[3] = state[3].reshape(self._sights.shape)
-        state[4] = state[4].reshape(self._touches.shape)
-        _look_feel_decide(
+        state[3] = state[3].reshape(self._seen_displacements.shape)
+        state[4] = state[4].reshape(self._perceived_forces.shape)
+        _perceive_and_decide(
             *self._task_parameters,
             context.get_time(),
             self._wrench.Eval(context),
@@ -379,7 +393,7 @@ class Operator(LeafSystem):
         return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        _wrench_now(
+        _hand_wrench_at(
             *self._intention(context),
             self._memory(context),
             context.get_time(),

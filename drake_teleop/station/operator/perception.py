@@ -46,9 +46,15 @@ class Perception:
     bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "bandwidth of perceived force and motion")
     reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "from a force to the hand's reaction")
     vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "from vision to the hand's reaction")
-    vision_noise: float = quantity(0.5e-3, "m", 0.0, 0.1, "of a perceived position, at the tool")
-    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "of the perceived distance of a surface")
-    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of the perceived position of a slot, lateral")
+    vision_noise: float = quantity(
+        0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
+    )
+    depth_error: float = quantity(
+        2e-3, "m", 0.0, 0.1, "standard deviation of the perceived distance of a surface"
+    )
+    aim_error: float = quantity(
+        1e-3, "m", 0.0, 0.1, "standard deviation of the perceived lateral position of a slot"
+    )
 
     def parameters(self, dt: float) -> Array:
         """Return (4,) Weber fraction, threshold [N], and decay and smoothing factors per step."""

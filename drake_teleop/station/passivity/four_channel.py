@@ -50,14 +50,24 @@ class FourChannelConfig:
         "N/m, N m/rad",
         0.0,
         1e6,
-        "of C_m, between the hand and the received pose of the slave",
+        "stiffness of C_m, the spring between the hand and the received pose of the slave",
     )
-    damping: list[float] = quantity([10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "of C_m")
+    damping: list[float] = quantity(
+        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damping of C_m, likewise"
+    )
     slave_feedback: float = quantity(
-        0.0, "1", -1.0, 10.0, "C5: the slave's own contact force; 1 + C5 is C3, the hand's force"
+        0.0,
+        "1",
+        -1.0,
+        10.0,
+        "C5, gain of the contact force at the slave; that of the hand's force is C3 = 1 + C5",
     )
     hand_feedback: float = quantity(
-        0.0, "1", -1.0, 10.0, "C6: the hand's own force; 1 + C6 is C2, the contact force"
+        0.0,
+        "1",
+        -1.0,
+        10.0,
+        "C6, gain of the hand's force at the master; that of the contact force is C2 = 1 + C6",
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:

@@ -124,7 +124,7 @@ class LedgerConfig:
         "J",
         0.0,
         1e3,
-        "E_0, energy in both ledgers at the start; drag earns the rest of the reserves",
+        "E_0, energy of both ends together at the start; the drag adds the rest of the reserves",
     )
     reserve: list[float] = quantity(
         [0.1, 0.01],

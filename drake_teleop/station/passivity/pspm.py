@@ -54,9 +54,13 @@ _OFFSET, _REQUESTED = _places.vector(6), _places.vector(6)
 class PspmConfig:
     """Parameters of the passive set-position modulation."""
 
-    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "E at the start")
+    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
-        [0.015, 3e-4], "J", 0.0, 1e6, "largest E; the rest is sent to the slave, which discards it"
+        [0.015, 3e-4],
+        "J",
+        0.0,
+        1e6,
+        "largest E; the master sends the rest to the slave, the slave discards it",
     )
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"

@@ -91,7 +91,11 @@ class TdpaConfig:
     """Parameters of the time-domain passivity approach."""
 
     release: float = quantity(
-        0.02, "s", 0.0, 10.0, "time in which a shortened wrench may come back (force-jump filter)"
+        0.02,
+        "s",
+        0.0,
+        10.0,
+        "time in which a reduced wrench returns to its full value (force-jump filter)",
     )
     drain_rate: float = quantity(
         200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may use in a second"

@@ -62,11 +62,17 @@ class WaveConfig:
     """Parameters of the wave variables."""
 
     impedance: list[float] = quantity(
-        [10.0, 0.05], "N s/m, N m s/rad", 1e-6, 1e6, "b of the line, translation and rotation"
+        [10.0, 0.05],
+        "N s/m, N m s/rad",
+        1e-6,
+        1e6,
+        "wave impedance b, for translation and rotation",
     )
-    filter: float = quantity(0.003, "s", 0.0, 10.0, "time constant of the filter of either wave")
+    filter: float = quantity(
+        0.003, "s", 0.0, 10.0, "time constant of the filter of the received wave, at both ends"
+    )
     matching: float = quantity(
-        1.0, "1", 0.0, 100.0, "damper at the slave's end over b; 1: no reflection"
+        1.0, "1", 0.0, 100.0, "damping at the slave's end divided by b; at 1 it reflects no wave"
     )
     patience: float = quantity(
         0.03,

@@ -96,8 +96,8 @@ class ForceScalingConfig:
                 remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper), and leave "
                 "sigma_weight and sigma_inertia out",
             )
-        gripper, thing, gamma = scales_from_eta(self.eta)
-        return Scales(gripper, thing, gamma, gripper, thing)
+        gripper, grasped, gamma = scales_from_eta(self.eta)
+        return Scales(gripper, grasped, gamma, gripper, grasped)
 
 
 @njit(cache=True)
