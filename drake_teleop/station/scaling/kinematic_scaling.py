@@ -77,7 +77,8 @@ class KinematicScaling(DoubleOnly, LeafSystem):
     """Scaling of the master's motion into the slave's commanded pose, with a clutch.
 
     While the clutch is open the command is constant. When it closes, the master's present pose is
-    the new reference, so the command does not jump.
+    the new reference, so the command does not jump. The clutch keeps its state while the
+    master's pose is not finite.
 
     .. pydrake_system::
 
