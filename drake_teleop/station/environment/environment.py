@@ -33,15 +33,14 @@ class Stand(NamedTuple):
 class Environment(ABC):
     """Object that the tool can touch; subclasses are dataclasses.
 
-    Its bodies may be fixed or move, with any shape that Drake supports.
+    Its bodies may be fixed or move, with any shape that Drake supports. The wrist sensor's own
+    contact law is faster; it supports boxes and a single `moving_part`.
     """
 
     @property
     @abstractmethod
     def slip(self) -> float:
-        """Slip speed at which friction is fully developed [m/s]; the smallest of all objects
-        applies.
-        """
+        """Slip speed of full friction [m/s]; the smallest one applies to all objects."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
@@ -68,10 +67,9 @@ class Environment(ABC):
 
     @property
     def moving_part(self) -> tuple[float, float, float] | None:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a sprung prismatic joint, or
-        None.
+        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a sprung joint, or None.
 
-        The joint's position is 0 at rest.
+        The joint is prismatic; its position is 0 at rest.
         """
         return None
 
@@ -131,7 +129,7 @@ def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
 def ToolShapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[GeometryId]]:
-    """Return the shapes with contact properties for each body welded to the tool."""
+    """Return the shapes with contact properties for each body of the tool, also welded ones."""
     properties = scene_graph.model_inspector().GetProximityProperties
     return {
         index: [

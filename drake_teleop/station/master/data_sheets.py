@@ -171,9 +171,7 @@ class Master:
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError in the name of the caller `what` if a leader arm commands
-        joints.
-        """
+        """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
         if self.leads_joints:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",

@@ -253,11 +253,10 @@ class LeaderDevice(DisplayDevice):
 def joint_parameters(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
-    """Return `LeaderDevice.joints` (8, n) from vectors (n,); end stops scale with the inertia at
-    home.
+    """Return `LeaderDevice.joints` (8, n); the end stops scale with the inertia at home.
 
     `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
-    the model's [N m s/rad], `carried` the compensated share of the weight.
+    the model's [N m s/rad], each (n,); `carried` is the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]

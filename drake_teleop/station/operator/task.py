@@ -105,9 +105,7 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Raise a DrakeTeleopError if the target is nearer to the start than its radius or the
-    standoff.
-    """
+    """Raise a DrakeTeleopError if the target's radius or standoff contains the tool's start."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:
         raise DrakeTeleopError(

@@ -138,10 +138,9 @@ def work_along(wrench, displacement):
 
 @njit(cache=True)
 def find_direction(wrench, round_trip, T, p, memory):
-    """Update the contact's mean direction, a unit wrench; return the component of `wrench` along it
-    [N].
+    """Update the contact's mean direction; return the component of `wrench` (6,) along it [N].
 
-    A much larger or opposite wrench replaces the mean at once.
+    The direction is a unit wrench. A much larger or opposite wrench replaces the mean at once.
     """
     mean, normal = memory[MEAN_WRENCH], memory[NORMAL]
     rate = 1.0
