@@ -301,7 +301,6 @@ class Session:
         return SimulationResult(t, values, parts[0].specs)
 
     def close(self) -> None:
-        """Complete the record; remove it if no time was simulated."""
         record, self._record = self._record, None
         try:
             if record is not None:

@@ -209,7 +209,6 @@ class Procedure:
             self.phase = READY
 
     def view(self) -> dict[str, Any]:
-        """Return the state that the participant may see."""
         number = self.number - (self.phase == FEEDBACK)  # FEEDBACK belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
