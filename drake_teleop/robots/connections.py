@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -176,17 +175,52 @@ def _pose(sensor_pose: tuple[float, ...] | None) -> Array:
     return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
 
 
-def _imported(module: str, name: str) -> Callable[..., Any]:
-    """Return a function that imports a class of this package and makes an instance of it."""
-    return lambda *arguments: getattr(import_module(f"drake_teleop.robots.{module}"), name)(
-        *arguments
-    )
+def _open_rtde(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.rtde import RtdeSource
+
+    return RtdeSource(address)
 
 
 def _open_netft(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
     from drake_teleop.robots.netft import NetFtSource
 
     return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
+
+
+def _open_zenoh(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.ros2_zenoh import ZenohSource
+
+    return ZenohSource(address, _period(rate_hz, address), joints)
+
+
+def _open_ros2(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
+    from drake_teleop.robots.ros2 import Ros2Source
+
+    return Ros2Source(address, _period(rate_hz, address), joints)
+
+
+def _open_zenoh_sink(address: str) -> Sink:
+    from drake_teleop.robots.ros2_zenoh import ZenohSink
+
+    return ZenohSink(address)
+
+
+def _open_ros2_sink(address: str) -> Sink:
+    from drake_teleop.robots.ros2 import Ros2Sink
+
+    return Ros2Sink(address)
+
+
+def _open_foxglove(address: str) -> Sink:
+    from drake_teleop.robots.foxglove import FoxgloveSink
+
+    return FoxgloveSink(address)
+
+
+def _open_mcap(address: str) -> Sink:
+    from drake_teleop.robots.foxglove import McapSink
+
+    return McapSink(Path(address))
 
 
 SOURCES: Registry[Callable[[str, float], Source[Reading]]] = Registry(
@@ -197,14 +231,10 @@ PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource
     "source of parts",
     {
         "posed": lambda address, hz, joints: PosedSource(address, _period(hz, address)),
-        "rtde": lambda address, hz, joints: _imported("rtde", "RtdeSource")(address),
+        "rtde": _open_rtde,
         "netft": _open_netft,
-        "zenoh": lambda address, hz, joints: _imported("ros2_zenoh", "ZenohSource")(
-            address, _period(hz, address), joints
-        ),
-        "ros2": lambda address, hz, joints: _imported("ros2", "Ros2Source")(
-            address, _period(hz, address), joints
-        ),
+        "zenoh": _open_zenoh,
+        "ros2": _open_ros2,
     },
 )
 """Sources of wrench and motion apart, called with address, rate [Hz] or None, and joint names."""
@@ -213,12 +243,12 @@ SINKS: Registry[Callable[[str], Sink]] = Registry(
     {
         "-": lambda address: LineSink(sys.stdout),
         "udp": UdpSink,
-        "zenoh": _imported("ros2_zenoh", "ZenohSink"),
-        "ros2": _imported("ros2", "Ros2Sink"),
-        "foxglove": _imported("foxglove", "FoxgloveSink"),
+        "zenoh": _open_zenoh_sink,
+        "ros2": _open_ros2_sink,
+        "foxglove": _open_foxglove,
         ".csv": lambda address: TableSink(Path(address)),
         ".parquet": lambda address: TableSink(Path(address)),
-        ".mcap": lambda address: _imported("foxglove", "McapSink")(Path(address)),
+        ".mcap": _open_mcap,
     },
 )
 """Sinks by the scheme or suffix of their address, called with the address."""
