@@ -64,7 +64,7 @@ def identified_load(
         folder: cache folder; None: `cache_folder()`.
 
     Raises:
-        DrakeTeleopError: for the reasons of `identify_load`; errors of cache files are ignored.
+        DrakeTeleopError: if `identify_load` fails; errors of cache files are ignored.
     """
     check_scenario(scenario)
     # Another seed: noise of identification and run must be independent.
@@ -84,7 +84,6 @@ def identified_load(
 
 
 def cache_folder() -> Path:
-    """Return the folder in the variable `CACHE_VARIABLE`, or the user's cache folder."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get(CACHE_VARIABLE) or user_cache_path("drake_teleop", appauthor=False))

@@ -36,7 +36,7 @@ _FINAL_FILES = (
 
 
 class RecordedDrive(Protocol):
-    """Recorded live session that can be simulated again, see `live.session.read_drive`."""
+    """Recorded live session that can be simulated again."""
 
     @property
     def folder(self) -> Path:
@@ -48,7 +48,7 @@ class RecordedDrive(Protocol):
 
     @property
     def load(self) -> IdentifiedLoad | None:
-        """Load with which the session's station was made; None: it was estimated online."""
+        """Load identified before the session; None if the load was estimated during the session."""
 
     def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
         """Simulate the recorded session again."""

@@ -53,7 +53,7 @@ class ScenarioRun:
 
     Attributes:
         identification: identified load, or None.
-        load_source: origin of the load, as in session.json.
+        load_source: origin of the load as text.
         real_time_factor: simulated time over elapsed time.
     """
 
@@ -65,7 +65,7 @@ class ScenarioRun:
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True in true contact; gaps below `FILTER_TAIL_S` are closed."""
+    """Return (N,) booleans: True in true contact; gaps shorter than `FILTER_TAIL_S` are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -73,11 +73,7 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return the contact wrench (N, 6) [N, N m] of Eq. (13), in S, with the final load estimate.
-
-    Raises:
-        DrakeTeleopError: if no load was identified.
-    """
+    """Return the contact wrench (N, 6) [N, N m] in S, calculated with the final load estimate."""
     estimate = result["load_estimate"][-1]
     check_identified("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)
@@ -85,7 +81,7 @@ def calculated_contact_wrench(result: SimulationResult) -> Array:
 
 
 def summarise(run: ScenarioRun) -> dict[str, Any]:
-    """Return the content of summary.json, except the scenario's name."""
+    """Return the content of summary.json without the scenario's name."""
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
     measured = result["measured_wrench_S"] - estimate[:6]

@@ -97,9 +97,9 @@ def analyze_command(
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | Stage = True
 ) -> tuple[dict[str, Any], Curves]:
-    """Analyse a scenario, without its passivity method, along the world's x, y or z axis.
+    """Analyse a scenario without its passivity method; return the summary and the report's curves.
 
-    Return the summary and the curves. `progress`: whether or where to show the progress.
+    `direction`: x, y or z axis of the world.
     """
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
@@ -182,7 +182,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
 
 
 def describe_wall(scenario: Scenario, is_known: bool) -> str:
-    """Return the source of the analysed wall stiffness as text."""
+    """Return the source of the analysed wall stiffness as text; `is_known`: from the scenario."""
     if scenario.leaf is not None:
         return "the leaf"
     surroundings = scenario.surroundings
@@ -194,7 +194,6 @@ def describe_wall(scenario: Scenario, is_known: bool) -> str:
 
 
 def sampling_of(scenario: Scenario) -> Sampling:
-    """Return the scenario's update rates and its sensor's low-pass."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     return Sampling(
         rates.hand_hz,
@@ -205,11 +204,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 
 def leaf_displacement(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in B, that presses the tip 5 mm into the leaf spring.
-
-    Raises:
-        DrakeTeleopError: if the translation scale is 0.
-    """
+    """Return the master's displacement [m], in B, that presses the tip 5 mm into the leaf."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -225,16 +220,15 @@ def leaf_displacement(scenario: Scenario) -> list[float]:
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
-    """Return the linear model with the loops of hand and network closed."""
     return close_network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
 def close_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Return the linear model with all loops closed, except the hand's along the direction.
+    """Return the model with all loops closed, except the loop of the hand along `along`.
 
-    If it is no axis of B, the hand's loop remains open in all directions.
+    Along no axis of B, the hand's loop remains open in all directions.
     """
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)

@@ -58,9 +58,9 @@ def with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest motion of the linearised Diagram.
+    """Return stability and slowest motion of the linearised Diagram and of the one-axis model.
 
-    Above `MAX_STATES` states only those of the one-axis model.
+    Above `MAX_STATES` states the Diagram is not analysed.
     """
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
@@ -87,9 +87,9 @@ def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
 
 
 def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest relative deviation of the Diagram's H from two one-axis models.
+    """Return the largest relative deviation of the Diagram's H up to 30 Hz from one-axis models.
 
-    `with_hand`: that H (n, 2, 2), hand's mass included, at `OMEGA`; compared up to 30 Hz.
+    `with_hand`: H (n, 2, 2) of the Diagram at `OMEGA`, hand's mass included.
     """
     compared = OMEGA <= COMPARISON_BAND
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
@@ -164,7 +164,7 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
     """Return displayed and ideal impedance in free motion and at the wall, and tracking figures.
 
-    `wall` is stiffness [N/m] and damping [N s/m].
+    `wall`: stiffness [N/m] and damping [N s/m].
     """
     fitted = OMEGA <= _FIT_BAND
     figures: dict[str, Any] = {}
@@ -195,7 +195,7 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
 
 
 def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the stiffest virtual walls that the device itself can render (Z-width)."""
+    """Return the stiffest virtual walls that the device itself can render."""
     damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
     passive = sampled_wall.passive_stiffness(axis.device_damping, damping, period)
     stable = sampled_wall.stable_stiffness(
@@ -224,7 +224,7 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measured_figures(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """Measure the impedance displayed in free motion, by simulation without Coulomb friction.
+    """Measure the impedance displayed in free motion in a simulation without Coulomb friction.
 
     Errors are relative to the linear model `system`.
     """

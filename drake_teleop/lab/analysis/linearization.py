@@ -87,7 +87,7 @@ class Linearization:
     ) -> Linearization:
         """Return the model with outputs fed back to inputs, u += z^-periods y; the inputs remain.
 
-        Outputs and inputs: a port or a list of components; other names raise DrakeTeleopError.
+        Outputs and inputs: a port or a list of components.
         """
         rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
         if periods > 0:
@@ -96,7 +96,7 @@ class Linearization:
         return dataclasses.replace(self, A=A)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return the response G(e^(j omega dt)) (n, outputs, inputs) at omega (n,) [rad/s]."""
+        """Return the response (n, outputs, inputs) at omega (n,) [rad/s]."""
         z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
         identity = np.eye(len(self.A))
         # Solve for each frequency: a chain of delays has no basis of eigenvectors.
@@ -113,8 +113,7 @@ class Linearization:
     def multipliers(self) -> Complex:
         """Eigenvalues over one period, largest first; stable if all magnitudes are below 1.
 
-        Above 800 states (with delays) only those near the unit circle up to 100 Hz; above 8000,
-        DrakeTeleopError.
+        Above 800 states only those near the unit circle up to 100 Hz; above 8000 an error.
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
         if size <= _MAX_DENSE_STATES:
@@ -224,7 +223,7 @@ def linearize(
 
     Args:
         scenario: its intended motion, network and passivity method have no effect.
-        load_estimate: (16,) as for `MakeTeleopStation`.
+        load_estimate: (16,) sensor offsets [N, N m], then phi.
         displacement: of the master from its start [m], in B; the slave follows.
 
     Raises:
@@ -257,9 +256,9 @@ def linearize_station(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Linearization:
-    """Return the linearised Diagram with all loops closed, over the scenario's constant delays.
+    """Return the linearised Diagram with all loops closed over the scenario's constant delays.
 
-    Arguments: see `linearize`. A passivity method is not linear and raises DrakeTeleopError.
+    Arguments: see `linearize`. A passivity method raises DrakeTeleopError.
     """
     check_scenario(scenario)
     if scenario.passivity.method != "none":
@@ -280,7 +279,7 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 
 def delays(scenario: Scenario) -> tuple[int, int]:
-    """Return the delays of pose and wrench over the network, in hand periods.
+    """Return the network delays of pose and wrench in hand periods.
 
     Both are 0 for an ideal network without a passivity method, otherwise at least 1.
     """
@@ -294,10 +293,10 @@ def delays(scenario: Scenario) -> tuple[int, int]:
 
 
 def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
-    """Return the hybrid matrix H (n, 2, 2) along one direction, at omega (n,) [rad/s], not zero.
+    """Return the hybrid matrix H (n, 2, 2) along one direction at omega (n,) [rad/s], not zero.
 
     `hand` and `tool` (6,): see `TaskDirection`. In `system` the hand's loop is cut in this
-    direction. H includes the hand's mass; the spectrum of held forces is divided out.
+    direction. H includes the hand's mass.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)

@@ -1,4 +1,4 @@
-"""Stability maps: stability and distortion of the sampled loop over two parameters."""
+"""Stability and distortion of the sampled loop over two parameters."""
 
 from __future__ import annotations
 
@@ -48,7 +48,6 @@ class StabilityMap:
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Booleans (ny, nx): True where the loop is stable."""
         return self.unstable == 0
 
 
@@ -66,10 +65,6 @@ def stability_map(
         x_name, y_name: fields of `OneAxis`, "low_pass_hz", or "rate": the hand's rate [Hz], with
             the other rates in proportion.
         x, y: increasing values (nx,), (ny,).
-
-    Raises:
-        DrakeTeleopError: for another name, values that do not increase, or the reasons of
-            `cut_loop`.
     """
     xs, ys = _increasing(x_name, x), _increasing(y_name, y)
 
@@ -103,7 +98,7 @@ def stability_map(
 def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
     """Return the largest relative error (...) of the operator's force over `frequency` [rad/s].
 
-    The force moves hand and device against the displayed force; reference: `ideal_impedance`.
+    The error is relative to the force with the ideal displayed impedance.
     """
     shape = np.broadcast_shapes(
         loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))

@@ -48,10 +48,9 @@ def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
 
 
 def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the matrix over one hand period, for the loop cut at the received force.
+    """Return the model's matrix over one hand period, with the loop cut at the received force.
 
-    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force; it has no
-    delay.
+    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
 
     Raises:
         DrakeTeleopError: for an ideal servo, if the rate of servo or sensor is no whole multiple of
@@ -92,10 +91,10 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
 
 
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
-    """Return the two-port H (N, 2, 2) of the sampled station, without hand and wall.
+    """Return the two-port H (N, 2, 2) of the sampled station without hand and wall.
 
-    The spectrum of held forces is divided out; the delay is rounded to hand periods. `frequency`
-    (N,) [rad/s]: positive, below half the hand's rate.
+    The delay is rounded to hand periods. `frequency` (N,) [rad/s]: positive, below half the hand's
+    rate.
     """
     bare = replace(
         axis,
@@ -125,7 +124,6 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
 
 
 def _samples(sampling: Sampling, name: str) -> int:
-    """Return the number of samples of servo or sensor in a hand period."""
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))

@@ -60,7 +60,6 @@ class Curves:
 
 
 def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
-    """Write report.html and its pictures into `out`."""
     pictures = {
         "bode": draw_bode(curves, summary["measured"]),
         "nyquist": draw_nyquist(curves),
@@ -287,7 +286,6 @@ def _draw_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """Print margins and verdict to the terminal; `out` is the folder of the written report."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape

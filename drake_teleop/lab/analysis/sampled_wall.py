@@ -1,11 +1,9 @@
 """Z-width of a sampled device: the stiffest virtual wall that it can render.
 
-The device moves continuously; its position x is sampled every Ts [s]. The wall of stiffness K [N/m]
-and damping B [N s/m] responds with the held force
+The device's position x is sampled every Ts [s]. The wall of stiffness K [N/m] and damping B [N s/m]
+responds with the held force
 
     f_k = K x_k + B (x_k - x_(k-1)) / Ts.
-
-Invalid signs raise DrakeTeleopError.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ _HALVINGS = 60
 
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
-    """Return the largest stiffness [N/m] of a passive wall; 0 if there is none (T62).
+    """Return the largest stiffness [N/m] of a passive wall, 0 if there is none (T62).
 
     Dampings in N s/m; `period`: sample time [s].
     """
@@ -67,10 +65,7 @@ def sampled_poles(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Complex:
-    """Return the closed loop's multipliers (..., 3) over a sample.
-
-    `stiffness` is the wall's [N/m]; for the other arguments see `stable_stiffness`.
-    """
+    """Return the closed loop's eigenvalues (..., 3) over a sample; `stiffness`: wall [N/m]."""
     mass, damping, K, B, hand = np.broadcast_arrays(
         mass, damping, stiffness, wall_damping, hand_stiffness
     )

@@ -1,7 +1,6 @@
 """Parameters of the one-axis model along a task direction, from the scenario's true models.
 
-One axis represents the station if a contact force causes no rotation, as along the tool; otherwise
-use `linearization`.
+One axis represents the station if a contact force causes no rotation, as along the tool.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class TaskDirection:
 
 
 def OneAxisFromScenario(scenario: Scenario, direction: Sequence[float]) -> OneAxis:
-    """Return the one-axis parameters of a scenario along a direction in W; see `task_direction`."""
+    """Return the one-axis parameters of a scenario along a direction (3,) in W."""
     return task_direction(scenario, direction).axis
 
 
@@ -57,10 +56,8 @@ def task_direction(
 ) -> TaskDirection:
     """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
 
-    Masses are effective, 1 / (n' J M^-1 J' n). The delay is the mean of both ways.
-
     Args:
-        load_estimate: (16,) as for `MakeTeleopStation`; default: no error.
+        load_estimate: (16,) sensor offsets [N, N m], then phi; default: no error.
         displacement: of the master from its start [m], in B; the slave follows.
 
     Raises:
