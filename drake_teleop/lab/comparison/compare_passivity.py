@@ -2,23 +2,7 @@
 
 Three studies use the same channel: the whole station presses on leaf springs (`delayed_contact`);
 in one degree of freedom, a hand lets go and taps (`release_and_taps`), and the longest stable round
-trip is found for three walls (`one_dof`). `summary.json` contains
-
-========= ======================================================================================
-decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_N for each leaf;
-          leaked_J. If unstable, these are empty or null
-station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with the energy between
-          hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
-          left_behind [m]; leaked [J]; fast_force, rms above 5 Hz in the hold [N]. A run that is
-          not at rest in its hold ends there (left_behind and drift are null); `error` says why a
-          run ended early (others are null)
-hands     list: method, network, fields of `release_and_taps.ReleaseAndTaps`
-one_dof   list: method, wall_N_per_m, jitter, loss; longest_s, up to which all round trips of
-          grid_s were stable (0: none)
-covering  list: sigma, round_trip_s, wall_N_per_m; injected_J, energy created in one run without
-          a method; damping_Ns_per_m of the device that prevents it
-networks, methods, scenario, seed  as requested
-========= ======================================================================================
+trip is found for three walls (`one_dof`).
 """
 
 from __future__ import annotations
@@ -103,7 +87,7 @@ def compare_command(
         quiet: True hides progress bars and tables; `progress` False only the bars.
 
     Returns:
-        The content of summary.json; the module lists it.
+        The content of summary.json (docs/delay.md).
     """
     for name in networks:
         if name not in PRESETS:
@@ -156,10 +140,7 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none.
-
-    `seeds` are those of a network with jitter or packet loss.
-    """
+    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none."""
     longest = 0.0
     for round_trip in ROUND_TRIPS:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -186,7 +167,7 @@ def station_run(
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     """Run the whole station once with a leaf spring; return its table row and its traces.
 
-    `estimate` (16,) is the load estimate: sensor offsets [N, N m], then phi.
+    `estimate` (16,): sensor offsets [N, N m], then phi.
     """
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]

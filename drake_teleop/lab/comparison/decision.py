@@ -37,7 +37,6 @@ class Cell:
 
     @property
     def words(self) -> str:
-        """Verdict as text, with the leaked energy."""
         if self.verdict != LEAKS or self.leaked is None:
             return self.verdict
         number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")

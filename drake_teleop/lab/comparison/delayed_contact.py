@@ -29,10 +29,7 @@ LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the times of the task for a round trip [s].
-
-    One round trip is added before the press, three to the hold, two to the final rest.
-    """
+    """Return the times of the task for a round trip [s]; waiting times increase with it."""
     return Task(
         swing=0.3,
         swung=1.8,
@@ -102,7 +99,7 @@ def delayed_contact(
 
 
 def thickness_of(stiffness: float) -> float:
-    """Return the thickness [m] of a leaf with this stiffness [N/m]."""
+    """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
     unit = SheetSpring(length=_LEAF_LENGTH, width=_LEAF_WIDTH, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 

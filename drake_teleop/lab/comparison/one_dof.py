@@ -1,4 +1,4 @@
-"""One degree of freedom of the station: plant, task and figures, for thousands of runs.
+"""One degree of freedom of the station: plant, task and measures, for thousands of runs.
 
 The station's own `channel_step` connects hand and slave along x at 1 kHz, with held forces.
 """
@@ -101,14 +101,10 @@ class OneDofRun:
     master's scale. In a passive station, HAND plus any other place never falls below
     -start_energy::
 
-        HAND      -sum f_(k-1) (x_k - x_(k-1))   held force, exact
-        COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port,
-                                                 its sign depends on the servo's lag
-        MOTOR     -integral k_f gamma f_m dx_s   servo's force, to half an integration step
-        ACTUAL     integral k_f gamma f_w dx_s   wall's force, exact for a spring
-
-    MOTOR and ACTUAL exclude the inertia that sigma leaves in f_e, which is no part of the
-    environment.
+        HAND      -sum f_(k-1) (x_k - x_(k-1))   held force
+        COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port
+        MOTOR     -integral k_f gamma f_m dx_s   servo's force
+        ACTUAL     integral k_f gamma f_w dx_s   wall's force
     """
 
     t: NDArray[np.float64]  #: s
@@ -123,10 +119,7 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least(self, place: int) -> float:
-        """Return the least value over time of E_0 plus the `accounts` of HAND and `place` [J].
-
-        With `place` HAND: of HAND alone. Negative: the station is active.
-        """
+        """Return the least initial energy plus energy at HAND and `place` [J]; negative: active."""
         other = 0.0 if place == HAND else self.accounts[:, place]
         return self.start_energy + float(np.nanmin(self.accounts[:, HAND] + other))
 
@@ -166,7 +159,7 @@ def run_one_dof(
     Args:
         passivity: configuration of the passivity method.
         forward, backward: networks from and to the master; backward default: as forward.
-        timeout: time without packets before the safe state (both ends come to rest) [s].
+        timeout: time without packets before both ends come to rest [s].
         intent: (N, 2) intended position [m] and velocity [m/s]; default: the task's.
         grip: (N, 3) mass, damping and stiffness of the hand [kg, N s/m, N/m], zeros after it let
             go; default: the model's.
@@ -243,7 +236,6 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
 
 
 def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
-    """Return the measures of a run of `run_one_dof`."""
     return figures_of(
         t=run.t,
         master=run.master,
@@ -304,10 +296,7 @@ def figures_of(
 
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
-    """Return the least device damping [N s/m] that makes the displayed impedance passive (T43).
-
-    `round_trip` in s.
-    """
+    """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
     return max(0.0, -float(_resistance(model, round_trip).min()))
 
 

@@ -54,7 +54,6 @@ Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
 
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
-    """Write report.html and its PNG pictures into `out`."""
     pictures = {
         "decision": draw_decision(summary),
         "hands": draw_hands(summary),
@@ -77,7 +76,6 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """Return the table cells of one run of the station, as text."""
     return [
         # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
@@ -86,7 +84,6 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def draw_decision(summary: Mapping[str, Any]) -> Figure:
-    """Draw the verdict of each method (a row) over each network (a column)."""
     methods, networks, table = summary["methods"], summary["networks"], decide(summary)
     with plot_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
@@ -240,7 +237,6 @@ def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """Print the decision table to the terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table

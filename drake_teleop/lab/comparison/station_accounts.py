@@ -3,10 +3,10 @@
 The balances are those of `one_dof.OneDofRun.accounts`, for translation and rotation separately,
 scaled to the master's power, positive inwards [J]. With c = k_f gamma over the kinematic scale::
 
-    HAND      -sum f_(k-1) . dx_k       held wrench, at every period of the channel: exact
-    COMMAND    sum w_k . dc_k           sent wrench along the command: exact; no physical port
+    HAND      -sum f_(k-1) . dx_k       held wrench, at every period of the channel
+    COMMAND    sum w_k . dc_k           sent wrench along the command; no physical port
     MOTOR     -integral c f_m . dx_s    motor torque minus weight, as a wrench at So
-    ACTUAL     integral c f_w . dx_s    true contact wrench at So; exact for a spring
+    ACTUAL     integral c f_w . dx_s    true contact wrench at So
 """
 
 from __future__ import annotations
@@ -39,12 +39,8 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the energy that entered the station at four places, up to each row of the log.
 
     Returns:
-        (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL`, by translation and rotation [J], zero
-            in the first row. Hand and command lack the last row's period. `MOTOR` is NaN if the log
-            is slower than the joint control.
-
-    Raises:
-        DrakeTeleopError: if the result lacks a signal.
+        (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL`, by translation and rotation [J].
+            `MOTOR` is NaN if the log is slower than the joint control.
     """
     if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
@@ -77,12 +73,9 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the displayed work of the slave's load (weight and inertia) along its actual motion.
+    """Return the displayed work (N, 2) of the slave's load, by translation and rotation [J].
 
     With sigma > 0 it belongs to the environment; `ACTUAL` excludes it.
-
-    Returns:
-        (N, 2) work by translation and rotation [J], zero in the first row.
     """
     arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)

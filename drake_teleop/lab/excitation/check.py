@@ -1,7 +1,4 @@
-"""Independent check of a trajectory against every limit at 1 kHz.
-
-Derivatives are finite differences; Drake's plant gives torques, accelerations and distances.
-"""
+"""Independent check of a trajectory against every limit at 1 kHz, with Drake's plant."""
 
 from __future__ import annotations
 
@@ -68,9 +65,7 @@ def check_motion(
 ) -> list[Use]:
     """Return the use of every limit by a sampled motion, largest first.
 
-    Args:
-        t: (T,) times [s].
-        q, qd, qdd: (T, n) joint positions, velocities and accelerations [rad, s].
+    `t` (T,) [s]; `q`, `qd`, `qdd` (T, n) joint positions, velocities, accelerations [rad, s].
     """
     names, limits = robot.arm.joint_names, robot.limits
     motion = _evaluate_bodies(robot, q, qd, qdd, progress)
@@ -157,7 +152,6 @@ def _evaluate_bodies(
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
-    """Return norms (T, 4) of force, torque, s, alpha in S (Newton-Euler)."""
     mass, com = M_S.get_mass(), M_S.get_com()
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))

@@ -109,7 +109,6 @@ def checked_excitation(
     trajectory: FourierTrajectory,
     uses: list[Use],
 ) -> Excitation:
-    """Return a checked trajectory with criteria, the load's predicted deviations and history."""
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,
@@ -128,11 +127,7 @@ def checked_excitation(
 def best_checked(
     robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
 ) -> tuple[FourierTrajectory, list[Use]]:
-    """Return the best trajectory that passes the check, and its use of the limits.
-
-    Raises:
-        DrakeTeleopError: if no trajectory passes.
-    """
+    """Return the best trajectory that passes the check, and its use of the limits."""
     worst: Use | None = None
     for trajectory in _candidates(found, robot):
         uses = check(robot, trajectory, progress)
@@ -171,7 +166,7 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
     """Yield trajectories within the limits at 1 kHz, best first.
 
-    A descent may end too close to a true shape, so the next candidate of this descent is worse by
+    If one is too close to a true shape, the next one of its descent is worse by
     `_CANDIDATE_RATIO`.
     """
     ranked = sorted(found, key=lambda iterate: iterate.value)

@@ -70,7 +70,7 @@ class Limits(NamedTuple):
 
 
 def sampled_half(q_half: Array) -> Array:
-    """Return the half ranges (n,) for random postures: half a turn without limits."""
+    """Return the half ranges (n,) for random postures [rad]: pi without limits."""
     return np.where(np.isfinite(q_half), q_half, np.pi)
 
 
@@ -375,5 +375,4 @@ def _segment_distance(first, second, nearest):
 
 
 def empty_motions(samples: int, joints: int) -> Array:
-    """Return an uninitialised array for the output of `motions_of`."""
     return np.empty((samples, joints + 1, MOTION_SIZE))

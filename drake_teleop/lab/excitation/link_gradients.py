@@ -1,7 +1,7 @@
-"""Gradients of functions of a serial arm's link motions in one sweep (T48, T49).
+"""Gradients of functions of a serial arm's link motions, by the adjoint recursion (T48, T49).
 
-The sweep is the adjoint of the recursion of `slave/arm.py`. Seeds are the derivatives of a scalar J
-by each link's motion ``[s, omega, alpha, p, R]`` in W; for R it is g of ``dJ = g . dtheta``.
+A seed contains the derivatives of a scalar J by a link's motion ``[s, omega, alpha, p, R]`` in W;
+for R it is g of ``dJ = g . dtheta``.
 """
 
 from __future__ import annotations
@@ -31,13 +31,11 @@ _S, _OMEGA, _ALPHA, _P, _THETA, _V, _W = 0, 3, 6, 9, 12, 15, 18
 
 @njit(cache=True)
 def to_world(motion, a):
-    """Return a triple `a` of the link's frame, in W; `motion` (21,) contains the rotation R."""
     return apply(nine(motion, 12), a)
 
 
 @njit(cache=True)
 def to_link(motion, a):
-    """Return a triple `a` of W, in the link's frame."""
     return apply(transposed(nine(motion, 12)), a)
 
 
@@ -58,12 +56,9 @@ def seed_point(motion, point, gradient, seed):
 
 @njit(cache=True)
 def seed_wrench(motion, phi, g_force, g_torque, seed):
-    """Add derivatives by the wrench of a load, Eqs. (1)-(2), about the link's origin to a seed.
+    """Add derivatives by the wrench of a load phi about the link's origin to `seed` (21,).
 
-    Args:
-        phi: (10,) parameters of the load.
-        g_force, g_torque: derivatives by force and torque, triples in the link's frame.
-        seed: (21,) the link's seed, added to.
+    `g_force` and `g_torque` are triples in the link's frame.
     """
     s = to_link(motion, three(motion, _S))
     w = to_link(motion, three(motion, _OMEGA))

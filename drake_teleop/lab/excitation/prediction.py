@@ -1,7 +1,7 @@
 """Predicted standard deviations of offsets and load after an excitation (T46).
 
 Assumptions: every sensor sample is used, the motion is slow, the load is known, quantisation is
-noise. Not included: gain errors, delay, thermal drift, rounding of encoders, products of noises.
+noise. Gain errors, delay, thermal drift and rounding of encoders are not included.
 """
 
 from __future__ import annotations
@@ -60,7 +60,6 @@ def sensor_noise(
 def predicted_deviations(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the standard deviations (16,) of offsets and phi, see `predicted_covariance`."""
     return np.sqrt(np.diag(predicted_covariance(s, omega, alpha, step, noise, phi)))
 
 

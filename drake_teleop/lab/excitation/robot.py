@@ -75,11 +75,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """Return the station's slave with tool, environment, and a table at z = 0.
-
-    Raises:
-        DrakeTeleopError: if the arm cannot reach the scenario's start.
-    """
+    """Return the station's slave with tool, environment, and a table at z = 0."""
     check_scenario(scenario)
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
@@ -198,7 +194,7 @@ def _make_robot(
 ) -> Robot:
     """Return the robot with its limits; `box` is middle and half size in W [m].
 
-    Shapes that touch in the `start` posture (n,), if known, may touch.
+    Shapes that touch in the `start` posture (n,) may always touch.
     """
     arm = scene.arm
     middle, half = arm.middle, (arm.upper - arm.lower) / 2

@@ -1,12 +1,12 @@
 """Shortest motion that identifies a load within tolerances: `excite --until`.
 
-The logarithm of the period T is one more unknown and is minimised; the tolerance is one more limit,
+The logarithm of the period T is an unknown and is minimised; the tolerance is one more limit,
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
 with standard deviations d_k after one period. With the factor z, all numbers are within their
-tolerances together in `RELIABLE` of the records (Sidak). The optimiser models white noise. A factor
-for each number, from `prediction.py`, adds random walks and filters; the search repeats with it.
+tolerances together in `RELIABLE` of the records. The optimiser models white noise; the search
+repeats with factors for random walks and filters.
 """
 
 from __future__ import annotations
@@ -90,7 +90,6 @@ def shortest(
 
     Args:
         harmonics: number N of harmonics in Eq. (9).
-        seed, progress: see `design`.
         starts: random starts of the first round.
 
     Raises:
@@ -147,7 +146,7 @@ def shortest(
 
 
 def reliable_factor(count: int) -> float:
-    """Return the factor z for `count` numbers, see `RELIABLE`."""
+    """Return the factor z (Sidak) with which `count` numbers are within tolerance together."""
     return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
 
 
@@ -175,7 +174,6 @@ class ShortestProblem(Problem):
         self._period, self._shortest = 1.0, task.harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        """Return the trajectory with the unknowns x."""
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
@@ -193,7 +191,7 @@ class ShortestProblem(Problem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return bounds around the unknowns x; only the log of the period, the last, is bounded."""
+        """Return bounds of the unknowns; only the last, the log of the period, is bounded."""
         shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
         around = (
             np.clip(x[-1] + step, shortest_period, largest)
@@ -290,9 +288,9 @@ class ShortestProblem(Problem):
 
 
 def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """Return the white noise densities (6, 6) of wrench and of motion times load.
+    """Return white noise densities (6, 6) of wrench and motion, over those of the wrench.
 
-    They are relative to the wrench's own densities, and do not include filters.
+    Filters are not included.
     """
     density = np.diag(noise.white[:6])
     if noise.filters is not None:

@@ -140,10 +140,7 @@ def ideal_motion(progress: Progress) -> IdealMotion:
 
 
 def ideal_values(run: IdealMotion) -> Values:
-    """Return the reaction minus V phi, by the elimination and by the regressor, by name.
-
-    All six components are compared; only rounding errors remain if V is correct.
-    """
+    """Return the reaction minus V phi, by the elimination and by the regressor, by name."""
     load = regressor(*run.motion) @ run.phi
     left = np.concatenate(
         [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]
@@ -157,12 +154,7 @@ def ideal_values(run: IdealMotion) -> Values:
 
 
 def free_values(run: FreeMotion, component: int, unit: str) -> Values:
-    """Return the values of Fig. 6 or Fig. 7 for one component of the wrench.
-
-    Args:
-        component: index 0 to 5 in the wrench.
-        unit: unit, as suffix of the values' names.
-    """
+    """Return the values of Fig. 6 or Fig. 7; `component`: index 0 to 5 in the wrench."""
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
     scale = run.scenario.force_scaling.force_scale
@@ -200,10 +192,7 @@ def contact_values(run: ContactMotion) -> Values:
 
 
 def raw_excess(run: ContactMotion) -> Array:
-    """Return how far f_x, f_y, f_z, |f| leave their contact-free range during contact (4,) [N].
-
-    The raw force is used; -inf without contact.
-    """
+    """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
         for raw in (run.raw[_contact_window(run)], run.raw_free)

@@ -36,8 +36,7 @@ def scaling_figure(
         t: (N,) times [s].
         values: for each sigma, the scaled component (N,) at the slave, in `unit`.
         symbol: matplotlib text of the component's symbol.
-        unit: "N" or "N m".
-        downscaling: force at the slave over force at the master, 17.5 in the paper.
+        downscaling: force at the slave over force at the master.
     """
     time, time_unit = _time(t)
     traces = [np.asarray(trace, float) for trace in values]

@@ -52,7 +52,6 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Verdict as text; "agrees" or "differs" only for found values that the paper reports."""
         if self.holds is None:
             return "for the record"
         words = _AS_SET if self.origin == "set" else _AGREES
@@ -153,7 +152,6 @@ def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def captions(summary: Mapping[str, Any]) -> dict[str, str]:
-    """Return the captions of fig6, fig7 and fig8 with the values of this run."""
     s = summary
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     threshold = "a threshold" if s["contact.raw_detectable"] else "no threshold"
@@ -187,10 +185,7 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
 def parameter_rows(
     true: ArrayLike, estimate: ArrayLike, deviation: ArrayLike
 ) -> list[ParameterRow]:
-    """Return the rows of the identification table.
-
-    Arguments (16,): true values, estimates and standard deviations of offsets and phi, Eq. (7), SI.
-    """
+    """Return the rows of the identification table from offsets and phi (16,), SI."""
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
     for (symbol, index, unit, scale), values in zip(_PARAMETERS, columns, strict=True):
@@ -204,7 +199,6 @@ def parameter_rows(
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the numerical libraries."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
 

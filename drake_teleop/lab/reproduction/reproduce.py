@@ -113,7 +113,6 @@ def reproduce_command(
 def draw(
     force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Values
 ) -> dict[str, Figure]:
-    """Draw Figs. 6, 7 and 8."""
     pictures = {
         name: scaling_figure(
             run.result.t,

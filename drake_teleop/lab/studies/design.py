@@ -68,11 +68,6 @@ class Factor:
         return [(value - low) / (high - low) if high > low else 0.0]
 
     def check(self, where: str) -> None:
-        """Check the factor's values without the scenario.
-
-        Raises:
-            DrakeTeleopError: if they are invalid; `where` is the place in the message.
-        """
         ranged = [self.low is not None, self.high is not None]
         lists = (self.values, self.words, self.flags, self.vectors)
         if [*map(bool, lists), any(ranged)].count(True) != 1 or any(ranged) != all(ranged):
@@ -129,11 +124,6 @@ class Study:
     force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "threshold of time_above_force_s")
 
     def check(self, where: str) -> None:
-        """Check the study without the scenario.
-
-        Raises:
-            DrakeTeleopError: if a field is invalid; `where` is the file in the message.
-        """
         check_ranges(self, where)
         for name in self.measures:
             if name not in MEASURES:
@@ -173,17 +163,12 @@ class Study:
             )
 
     def size(self) -> int:
-        """Return the number of points of the design."""
         if self.design == "factorial":
             return math.prod(len(factor.listed()) for factor in self.factors)
         return self.samples
 
     def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Refuse a study with too many runs, before its design is created.
-
-        Raises:
-            DrakeTeleopError: above `MAX_RUNS` runs, or above `MANY_RUNS` without consent (`yes`).
-        """
+        """Raise an error above `MAX_RUNS` runs, or above `MANY_RUNS` without consent (`yes`)."""
         runs = self.size() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
@@ -210,9 +195,7 @@ class Study:
     def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
         """Return the next points of an adaptive design; an empty list at its end.
 
-        Args:
-            points: the n evaluated points.
-            objective: (n,) values at these points; nan where the runs failed.
+        `objective` (n,): values at the evaluated points; nan where the runs failed.
         """
         count = min(self.batch, self.samples - len(points))
         if self.design != "adaptive" or count <= 0:
@@ -233,8 +216,7 @@ class Study:
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
         """Return one table row, still without measures, for each run of the points.
 
-        `first` is the number of the first point. Every second seed is reserved for the load
-        identification.
+        `first` is the number of the first point.
         """
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [

@@ -47,13 +47,9 @@ class Factorial:
     seen: Flags
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the levels of a factor, or the cells of two factors, that can be compared.
+        """Return the comparable levels of a factor, or cells of two factors, as `comparable` does.
 
-        They are compared over combinations of the other factors' levels at which all have a value.
-
-        Returns:
-            (rows,) True for compared levels or cells; (columns,) True for the used combinations;
-                (kept rows, n) matrix from point values to the means.
+        Also return a matrix (kept rows, n) from point values to the means.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
         (row, rows), (column, columns) = (
@@ -137,10 +133,10 @@ PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Means over seeds at n levels, with half widths of their intervals.
+    """Means over seeds at n levels.
 
     Attributes:
-        mean, half: (n,) mean and its half width.
+        mean, half: (n,) mean and half width of its interval.
         effect_half: (n,) half width of the difference from the mean of all n levels.
     """
 
@@ -197,10 +193,7 @@ class PairMeans:
 def estimated(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """Return the means of values (N,) at each of `count` levels, with intervals; nan is ignored.
-
-    `levels` and `seeds` (N,) are those of each value.
-    """
+    """Return the means of values (N,) at each of `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -367,7 +360,7 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (n,) booleans: True at complete points that no other complete point dominates.
+    """Return True at complete points (n,) that no other complete point dominates.
 
     The k columns of `values` (n, k) are minimised.
     """

@@ -34,8 +34,7 @@ def comparable(there: Flags) -> tuple[Flags, Flags]:
             factors (column).
 
     Returns:
-        (rows,) True for the rows of the block: the largest pattern, the most frequent if several;
-            (columns,) True for all columns with these rows.
+        (rows,) True for the rows of the block; (columns,) True for all columns with these rows.
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
@@ -122,11 +121,9 @@ class LevelModel:
     solve: Array
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the levels of a factor, or the cells of two factors, that can be compared.
+        """Return comparable levels or cells as `Factorial.compared`, from failed combinations.
 
-        Returns:
-            As `Factorial.compared`, but only with combinations of factors related to failures, and
-                a matrix (kept rows, p) from coefficients to means.
+        The matrix (kept rows, p) maps coefficients to means.
         """
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
@@ -215,8 +212,6 @@ def level_model(
     by_chance: bool = True,
 ) -> LevelModel | None:
     """Return a regression model that the points determine, or None.
-
-    The model with most terms that leaves half the points for residuals is preferred.
 
     Args:
         columns: for each factor, its values (n,) at the points.

@@ -74,7 +74,7 @@ def scaling_study_command(
 ) -> dict[str, Any]:
     """Run the remaining runs of the scaling studies; write the best scales and return the summary.
 
-    The arguments are those of `study_command`: jobs, cluster, repeats, yes, quiet, progress.
+    The arguments are those of `study_command`.
     """
     make_folder(out)
     rows = {}
@@ -107,9 +107,8 @@ def scaling_study_command(
 def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
     """Return merits, bootstrap intervals and failures for a selection of criteria.
 
-    Args:
-        tables: for each task, values (s, g, seeds) of each criterion (nan where failed) and of
-            "success".
+    `tables`: for each task, values (s, g, seeds) of each criterion (nan where failed) and of
+    "success".
     """
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}

@@ -1,14 +1,4 @@
-"""`drake-teleop study STUDY.yaml`: runs of one scenario over a design of its fields.
-
-============ =====================================================================================
-study.json   all inputs of the rows
-runs.parquet folder of parts, one table: run, point, repeat, seed, a column for each factor and
-             measure, and error: reason of a failed run
-summary.json number of runs and failed runs; mean, least and largest of each measure
-effects.csv  mean and effect of each level, with half widths of 95 % intervals
-pictures     main effects, interactions of two factors, Pareto front
-============ =====================================================================================
-"""
+"""`drake-teleop study STUDY.yaml`: runs of one scenario over a design of its fields."""
 
 from __future__ import annotations
 
@@ -60,7 +50,6 @@ class StationWork:
     threshold: float
 
     def scenario(self, values: Values, seed: int) -> Scenario:
-        """Return the scenario of one run: the base with the factors' values and the seed."""
         changes = values | {"simulation.seed": seed}
         return ScenarioFromData(_with_changes(self.data, changes), self.where)
 
@@ -144,11 +133,7 @@ def study_command(
 
 
 def LoadStudy(path: str | Path) -> Study:
-    """Load a study file and check everything that does not depend on the scenario.
-
-    Raises:
-        DrakeTeleopError: if it is invalid; with file and field.
-    """
+    """Load a study file and check everything that does not depend on the scenario."""
     path = shipped_file("study", path, studies_dir())
     study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))

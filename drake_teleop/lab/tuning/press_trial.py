@@ -1,8 +1,4 @@
-"""Trials of settings: a hand swings, presses on a wall and holds, in the whole station or one axis.
-
-Both trials are the work of a study (`lab.studies.runs`); the values of a run are the fields of
-`Settings`, a grip and a wall.
-"""
+"""Trials of settings, in the whole station or one axis: a hand swings, presses and holds."""
 
 from __future__ import annotations
 
@@ -68,14 +64,12 @@ class Settings:
     low_pass_hz: float
 
     def passivity(self, stated: StatedSet) -> PassivityConfig:
-        """Return the passivity method, for the hands of the set."""
         hand = GRIPS[stated.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged(), hand_stiffness=stiffness)
         return PassivityConfig(method=self.method, charged_tdpa=known)
 
     def apply(self, base: Scenario, stated: StatedSet) -> Scenario:
-        """Return the scenario with these settings."""
         sensor = base.wrist_sensor
         if not sensor.ideal:
             sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
@@ -93,7 +87,6 @@ class Settings:
 
 
 def settings_of(values: Values) -> Settings:
-    """Return the settings among the values of a run."""
     names = [entry.name for entry in dataclasses.fields(Settings)]
     return Settings(**{name: values[name] for name in names})  # type: ignore[arg-type]
 
@@ -104,7 +97,7 @@ class StationTrial:
 
     Args:
         given: scenario of the user, with its own passivity and scales.
-        base: the same, see `stated_set.base_of`.
+        base: the same without environment, task and passivity method.
         estimate: (16,) load estimate.
     """
 
@@ -114,7 +107,6 @@ class StationTrial:
     estimate: Array
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return `TRIAL_MEASURES` of one run."""
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         as_given = values["method"] == AS_GIVEN
         scenario = self.given if as_given else settings_of(values).apply(self.base, self.stated)
@@ -165,7 +157,7 @@ class StationTrial:
 class GammaSearch:
     """Work of a study: the largest gamma that is stable in one axis at all corners of the set.
 
-    `base`: scenario, see `stated_set.base_of`. `caps`: largest gamma by low-pass [Hz].
+    `caps`: largest gamma by low-pass [Hz].
     """
 
     base: Scenario
@@ -173,7 +165,6 @@ class GammaSearch:
     caps: dict[float, float]
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return `SEARCH_MEASURES` of one method, share of inertia and low-pass."""
         settings = settings_of(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
@@ -201,7 +192,7 @@ class GammaSearch:
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
     def _linear_limit(self, axis: Any, settings: Settings) -> float:
-        """Return the largest gamma without a method, from the Diagram's sampled one-axis loop."""
+        """Return the largest gamma without a method, from the sampled one-axis loop."""
         sampling = sampling_of(self.base)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)

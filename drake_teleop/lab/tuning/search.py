@@ -60,7 +60,7 @@ class Found:
 
 
 def search_settings(trial: StationTrial, execute: Execute) -> Found:
-    """Return the settings with the smallest detection threshold that the station holds.
+    """Return the stable settings with the smallest detection threshold.
 
     Raises:
         DrakeTeleopError: if no settings are stable in the whole set.
@@ -126,9 +126,9 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
 def _station_limit(
     settings: Settings, trial: StationTrial, execute: Execute
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma that the station holds with the margin, and its rows there.
+    """Return the largest gamma that is stable in the station with the margin, and its rows.
 
-    gamma is halved until the station holds, then bisected; no rows: it never held.
+    gamma is halved until the station is stable, then bisected; no rows: it never was.
     """
     margin, ends = trial.stated.aims.margin, [c[0] for c in trial.stated.corners]
     hands = list(dict.fromkeys(ends))
@@ -166,13 +166,13 @@ def _station_limit(
 
 
 def holds(row: Mapping[str, Any], margin: float = 1.0) -> bool:
-    """Return True if the station rests, quietly, and renders the contact force."""
+    """Return True if the station comes to rest, is quiet, and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
     return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)
 
 
 def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
-    """Return a function that runs a named study in a folder of `out`, or continues it."""
+    """Return a function that runs or continues a named study in a folder of `out`."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:

@@ -62,16 +62,11 @@ class StatedSet:
 
     @property
     def aims(self) -> TunedTask:
-        """Requirements of the task."""
         return TASKS[self.task]
 
 
 def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
-    """Return the set of these grips, walls [kN/m] and this task.
-
-    Raises:
-        DrakeTeleopError: for an unknown name or a stiffness outside 0.1 to 60 kN/m.
-    """
+    """Return the set of these grips, walls [kN/m] and this task."""
     for what, names, known in (("hands", hands, tuple(GRIPS)), ("task", (task,), tuple(TASKS))):
         for name in names:
             if name not in known:
@@ -96,11 +91,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
 
 
 def base_of(scenario: Scenario, network: str | None) -> Scenario:
-    """Return the scenario over this network, without environment, task and passivity method.
-
-    Raises:
-        DrakeTeleopError: for an unknown network.
-    """
+    """Return the scenario over this network, without environment, task and passivity method."""
     if network is not None and network not in PRESETS:
         remedy = suggestion(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)

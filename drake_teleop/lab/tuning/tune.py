@@ -1,19 +1,4 @@
-"""`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
-
-`summary.json` contains
-
-============ =====================================================================================
-settings     method, gamma, sigma_weight, sigma_inertia, force_scale, low_pass_hz
-stated       hands, walls [N/m], network, task
-figures      share: rendered over scaled contact force, least of the set; threshold_N: smallest
-             contact force at the tool that the operator detects; given_threshold_N: the same with
-             the scenario's own settings, null if it fails; margin: factor of gamma that was stable;
-             fails_at: hand and wall [N/m] of the first failure beyond the set, or null
-sentences    the answer in sentences
-search       list: method, sigma_inertia, low_pass_hz, gamma_limit, linear_limit, share, threshold_N
-trials       list: rows of `press_trial.TRIAL_MEASURES` in the whole station
-============ =====================================================================================
-"""
+"""`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station."""
 
 from __future__ import annotations
 
@@ -68,7 +53,7 @@ def tune(
         quiet: True hides the sentences and progress bars; `progress` False only the bars.
 
     Returns:
-        The content of summary.json; the module lists it.
+        The content of summary.json (docs/choose.md).
 
     Raises:
         DrakeTeleopError: for an invalid set, or if no settings are stable.
