@@ -104,10 +104,7 @@ def true_load(scenario: Scenario) -> Array:
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """Return the shipped scenario "identification" with slave and sensor of `scenario`.
-
-    With contact detection the log has the estimator's rate.
-    """
+    """Return the shipped scenario "identification" with slave and sensor of `scenario`."""
     check_scenario(scenario)
     rates = scenario.rates
     if scenario.contact_detection is not None:
@@ -174,13 +171,7 @@ def identify_load(
 def batch_identification(
     scenario: Scenario, wrench: Array, s: Array, omega: Array, alpha: Array, rate_hz: float
 ) -> Identification:
-    """Identify load and sensor offsets by total least squares from samples in S.
-
-    Args:
-        wrench: (N, 6) samples of the wrist sensor [N, N m].
-        s, omega, alpha: (N, 3) specific force, angular velocity and angular acceleration.
-        rate_hz: rate of the samples.
-    """
+    """Identify load and sensor offsets by total least squares from N samples in S."""
     sensor, rates = scenario.wrist_sensor, scenario.rates
     motion = estimated_motion_std(
         scenario.motion_estimation, sensor, slave_arm(scenario).num_joints, 1 / rates.sensor_hz

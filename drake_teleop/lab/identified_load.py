@@ -58,13 +58,7 @@ def identified_load(
 ) -> IdentifiedLoad:
     """Return the load of a scenario from the cache, or identify and cache it.
 
-    Args:
-        progress: True shows progress bars; or a `Stage` that receives the progress.
-        fresh: True ignores the cached load.
-        folder: cache folder; None: `cache_folder()`.
-
-    Raises:
-        DrakeTeleopError: if `identify_load` fails; errors of cache files are ignored.
+    `fresh` ignores the cached load. Errors of cache files are ignored.
     """
     check_scenario(scenario)
     # Another seed: noise of identification and run must be independent.

@@ -64,21 +64,10 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run one scenario; write all results into `out` and delete those of an earlier run.
+    """Run one scenario or `drive`; write all results into `out` and delete those of an earlier run.
 
-    Args:
-        scenario: shipped name or YAML file.
-        drive: recorded live session that is simulated instead of `scenario`.
-        seed: replaces the scenario's seed.
-        fresh: True ignores the cached load.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The content of summary.json and session.json.
-
-    Raises:
-        DrakeTeleopError: for an unusable scenario, a joint outside its range, or a failed write.
-        KeyboardInterrupt: its message contains the number of recorded samples.
+    Return the content of summary.json and session.json. The message of a KeyboardInterrupt
+    contains the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
         raise DrakeTeleopError(

@@ -1,23 +1,4 @@
-"""Summary and overview picture of a run. `summary.json` contains, besides the scenario:
-
-=========================== =====================================================================
-peak_measured_force_N       largest measured |f| without offsets; also peak_measured_torque_Nm
-peak_contact_force_N        largest contact force from the final load estimate; also ..._torque_Nm
-residual_force_max_N        largest one outside contacts, or null; also residual_torque_max_Nm
-true_contact_s              [start, end] of each contact
-contact_noticed_ms          delay of each detection, or null; also contact_at_hand_ms
-false_contacts              number of detections without true contact
-success, task_time_s, ...   with a task, see `drake_teleop.station.task_measures`
-failure                     with a task: reason of its failure, or null
-peak_force_to_master_N      largest force that the device displayed
-joint_speed_use             largest share of a joint's speed limit; also joint_torque_use
-mass_error_percent          error of the final estimate; also com_error_mm
-assumed                     values that the models of arm and tool do not contain
-contact_by                  reason why Drake's slower contact results are used
-moved_mm                    displacement of each movable body at the end; also turned_deg
-warnings                    faults and their times, see `drake_teleop.station.run_warnings`
-=========================== =====================================================================
-"""
+"""Summary and overview picture of a run; docs/running.md lists the summary's fields."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Stability with any passive hand and environment, or with those in given ranges.
 
-H is the station's hybrid matrix (..., 2, 2) at frequencies omega [rad/s] (see `two_port`).
-h11 and h22 must have no pole in the right half plane.
+H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega [rad/s].
 """
 
 from __future__ import annotations
@@ -26,17 +25,14 @@ _ROUNDING = 1e-12  # relative to the terms that cancel in a criterion
 
 
 def llewellyn(H: Complex) -> Real:
-    """Return 2 Re h11 Re h22 - Re(h12 h21) - |h12 h21|; negative: not absolutely stable.
-
-    Source: Llewellyn, Proc. IRE 40 (1952) (T54).
-    """
+    """Return Llewellyn's criterion (Proc. IRE 40, 1952; T54); negative: not absolutely stable."""
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
     return 2 * h11.real * h22.real - product.real - np.abs(product)
 
 
 def llewellyn_parameter(H: Complex) -> Real:
-    """Return (2 Re h11 Re h22 - Re h12 h21) / |h12 h21|; absolute stability requires at least 1."""
+    """Return Llewellyn's parameter; absolute stability requires at least 1."""
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         return 1.0 + llewellyn(H) / product
@@ -54,10 +50,7 @@ def absolutely_stable(H: Complex) -> Flags:
 
 
 def required_damping(H: Complex) -> Real:
-    """Return the additional device damping [N s/m] for absolute stability per frequency.
-
-    The largest one counts; inf: no damping suffices.
-    """
+    """Return the additional device damping [N s/m] for absolute stability; inf: none suffices."""
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
     loss = product.real + np.abs(product)
@@ -68,10 +61,7 @@ def required_damping(H: Complex) -> Real:
 
 
 def raisbeck(H: Complex) -> Real:
-    """Return Raisbeck's criterion 4 Re h11 Re h22 - |h12 + conj(h21)|^2; negative: not passive.
-
-    Source: Raisbeck, J. Appl. Phys. 25 (1954) (T55).
-    """
+    """Return Raisbeck's criterion (J. Appl. Phys. 25, 1954; T55); negative: not passive."""
     h11, h12, h21, h22 = entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
 
@@ -95,9 +85,9 @@ def scattering_norm(S: Complex) -> Real:
 def structured_singular_value(
     S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
 ) -> Real:
-    """Return mu of the scattering matrix S; `hand`, `environment`: largest reflection factors.
+    """Return mu of S for loads with these largest reflection factors (T56).
 
-    With factors of 1 (any passive load), mu <= 1 means absolutely stable (T56).
+    With factors of 1 (any passive load), mu <= 1 means absolutely stable.
     """
     s11, s12, s21, s22 = entries(S)
     r1, r2 = np.asarray(hand), np.asarray(environment)
@@ -133,10 +123,7 @@ class WorstLoads(NamedTuple):
 
 
 def worst_loads(H: Complex) -> WorstLoads:
-    """Return the lossless loads closest to oscillation; Re h22 must not be 0.
-
-    A negative resistance proves that the station is not absolutely stable.
-    """
+    """Return the lossless loads closest to oscillation; Re h22 must not be 0."""
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
     size = np.abs(product)
@@ -186,7 +173,6 @@ class ImpedanceRange:
 
 
 def range_of_grips() -> ImpedanceRange:
-    """Return the range of hand impedances from the light to the firm grip."""
     from drake_teleop.station.operator.operator import GRIPS
 
     mass, damping, stiffness = (
@@ -201,10 +187,9 @@ def range_of_grips() -> ImpedanceRange:
 def can_oscillate(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Flags:
-    """Return True at frequencies where some hand and environment of the ranges oscillate.
+    """Return True at frequencies where some hand and environment of the ranges oscillate (T57).
 
-    If all are False on a dense grid, the pairs are all stable or all unstable. Behind an ideal
-    servo, hand and device must be heavier than the displayed tool (T57).
+    If all are False on a dense grid, the pairs are all stable or all unstable.
     """
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
@@ -220,10 +205,7 @@ def can_oscillate(
 
 
 def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange) -> Real:
-    """Return per frequency the softest wall [N/m] with which some hand of the range oscillates.
-
-    Hands that are stable without a wall are stable with walls below the minimum over omega.
-    """
+    """Return per frequency the softest wall [N/m] with which some hand of the range oscillates."""
     h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
@@ -254,10 +236,7 @@ def _edge_crossings(
 def bounded_singular_value(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Real:
-    """Return mu per frequency; below 1 no hand and environment of the ranges can oscillate.
-
-    The condition is sufficient, not necessary.
-    """
+    """Return mu per frequency; below 1 no hand and environment of the ranges can oscillate."""
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))

@@ -66,10 +66,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
-    """Return the loop response (N, ...) with a one-way `delay` [s]; 1 is the stability limit.
-
-    `frequency`: (N,) [rad/s].
-    """
+    """Return the loop response (N, ...) with a one-way `delay` [s]; 1 is the stability limit."""
     dimensions = max(loop.period.ndim, np.ndim(delay))
     w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period)[..., None]
@@ -79,10 +76,7 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
 
 
 def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
-    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf.
-
-    `response`: (n,) of `loop_response` at increasing frequencies up to half the hand's rate.
-    """
+    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf."""
     if np.abs(response).max() < _MIN_LOOP_GAIN:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
@@ -104,10 +98,7 @@ def _interpolate(value: Array, fraction: Array) -> Array:
 
 
 def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
-    """Return the number (...) of closed-loop multipliers outside the unit circle.
-
-    `delay` is one way [s], not rounded to hand periods.
-    """
+    """Return the number of unstable multipliers of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period)[..., None]
     turns = (loop.phases - D * loop.angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
@@ -125,10 +116,7 @@ def delay_margin(loop: CutLoop) -> Array:
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
-    """Return the closed loop's multiplier of largest magnitude, with imaginary part >= 0.
-
-    `delay` is one way [s]; the result is exact at whole hand periods.
-    """
+    """Return the closed loop's multiplier of largest magnitude, with imaginary part >= 0."""
     shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
     n = loop.open.shape[-1]
     opened, closed = (np.broadcast_to(m, (*shape, n)) for m in (loop.open, loop.closed))

@@ -125,12 +125,7 @@ def measure_frequency_response(
 ) -> StationResponse:
     """Simulate the station with a multi-sine motion of the operator; return the spectra.
 
-    Args:
-        load_estimate: (16,) sensor offsets [N, N m], then phi.
-        approach: motions to the operating point before the multi-sine.
-
-    Raises:
-        DrakeTeleopError: if the multi-sine's period is no whole number of hand periods.
+    `approach` contains motions to the operating point before the multi-sine.
     """
     check_scenario(scenario)
     rate = scenario.rates.hand_hz

@@ -59,12 +59,9 @@ def stability_map(
     y_name: str,
     y: ArrayLike,
 ) -> StabilityMap:
-    """Return stability and distortion over a grid of two parameters.
+    """Return stability and distortion over increasing values of two parameters.
 
-    Args:
-        x_name, y_name: fields of `OneAxis`, "low_pass_hz", or "rate": the hand's rate [Hz], with
-            the other rates in proportion.
-        x, y: increasing values (nx,), (ny,).
+    Names are fields of `OneAxis`, "low_pass_hz", or "rate": all rates in proportion.
     """
     xs, ys = _increasing(x_name, x), _increasing(y_name, y)
 
@@ -96,10 +93,7 @@ def stability_map(
 
 
 def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
-    """Return the largest relative error (...) of the operator's force over `frequency` [rad/s].
-
-    The error is relative to the force with the ideal displayed impedance.
-    """
+    """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
     shape = np.broadcast_shapes(
         loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
     )

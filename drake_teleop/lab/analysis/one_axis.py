@@ -62,10 +62,7 @@ class OneAxis(Axis):
 
     @property
     def displayed_tool_mass(self) -> float:
-        """Tool mass displayed after elimination [kg]: sigma m_t + (sigma - gamma) dm.
-
-        m_t is the tool mass, dm its estimation error.
-        """
+        """Tool mass [kg] displayed after elimination with the estimated mass."""
         return self.sigma * self.tool_mass + (self.sigma - self.gamma) * self.mass_error
 
 

@@ -51,10 +51,6 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
     """Return the model's matrix over one hand period, with the loop cut at the received force.
 
     The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
-
-    Raises:
-        DrakeTeleopError: for an ideal servo, if the rate of servo or sensor is no whole multiple of
-            the hand's rate, or if the low-pass is not below half the sensor's rate.
     """
     if axis.ideal_servo:
         raise DrakeTeleopError(
@@ -93,8 +89,7 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
     """Return the two-port H (N, 2, 2) of the sampled station without hand and wall.
 
-    The delay is rounded to hand periods. `frequency` (N,) [rad/s]: positive, below half the hand's
-    rate.
+    `frequency` (N,) [rad/s]: positive, below half the hand's rate.
     """
     bare = replace(
         axis,

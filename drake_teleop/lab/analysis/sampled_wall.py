@@ -20,10 +20,7 @@ _HALVINGS = 60
 
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
-    """Return the largest stiffness [N/m] of a passive wall, 0 if there is none (T62).
-
-    Dampings in N s/m; `period`: sample time [s].
-    """
+    """Return the largest stiffness [N/m] of a passive wall, 0 if there is none (T62)."""
     b = _checked_positive(device_damping, "damping of the device")
     _checked_positive(period, "period")
     return np.maximum(2 * (b - np.abs(wall_damping)) / period, 0.0)
@@ -39,8 +36,7 @@ def stable_stiffness(
 ) -> Array:
     """Return the wall stiffness [N/m] at which the loop becomes unstable; 0: unstable with any.
 
-    `mass` [kg], `damping` [N s/m] and `hand_stiffness` [N/m]: device and hand together; `period`:
-    sample time [s].
+    Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device and hand together.
     """
     _, held = _sampled_device(mass, damping, hand_stiffness, period)
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.

@@ -56,13 +56,8 @@ def task_direction(
 ) -> TaskDirection:
     """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
 
-    Args:
-        load_estimate: (16,) sensor offsets [N, N m], then phi; default: no error.
-        displacement: of the master from its start [m], in B; the slave follows.
-
-    Raises:
-        DrakeTeleopError: for a zero direction, a pose out of reach, or different scales of gripper
-            and object.
+    `displacement` moves the master from its start [m], in B; the slave follows. Without
+    `load_estimate` (16,) the tool mass has no error.
     """
     check_scenario(scenario)
     n_W = checked("direction", direction, 3)

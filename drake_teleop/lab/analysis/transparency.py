@@ -55,10 +55,7 @@ class ZWidth(NamedTuple):
 
 
 def transmitted_width(H: Complex) -> ZWidth:
-    """Return the displayed impedances in free motion and at a rigid wall (infinite: ideal servo).
-
-    Source: Colgate and Brown, ICRA 1994; Hannaford, T-RA 5 (1989).
-    """
+    """Return the impedances displayed in free motion and at a rigid wall, which may be infinite."""
     h11, h12, h21, h22 = entries(H)
     with np.errstate(divide="ignore", invalid="ignore"):
         rigid = np.where(h22 == 0, np.inf, h11 - h12 * h21 / h22)
@@ -71,10 +68,7 @@ WEBER_FRACTION = 0.23
 
 
 def is_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
-    """Return True where a human can distinguish the displayed impedance from the ideal.
-
-    One Weber fraction applies to mass, damping and stiffness (Fu et al., T-HMS 48, 2018).
-    """
+    """Return True where a human can distinguish the displayed impedance from the ideal."""
     return np.abs(felt / ideal - 1) > WEBER_FRACTION
 
 
@@ -85,10 +79,7 @@ def smallest_stiffness_change(
     weber: float = WEBER_FRACTION,
     damping: ArrayLike = 0.0,
 ) -> Real:
-    """Return the smallest detectable increase of the environment's stiffness [N/m], or inf.
-
-    The hand explores with a motion at `omega`.
-    """
+    """Return the smallest detectable increase of the environment's stiffness [N/m], or inf."""
     if weber <= 0:
         raise DrakeTeleopError(
             f"is {weber:g}, must be positive", where="weber", remedy="give, say, 0.1"

@@ -39,9 +39,9 @@ def entries(H: Complex) -> tuple[Complex, Complex, Complex, Complex]:
 
 
 def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None = None) -> Complex:
-    """Return the hybrid matrix H (..., 2, 2) of the position-force station at s (T51).
+    """Return the hybrid matrix H (..., 2, 2) of the position-force station at s [rad/s] (T51).
 
-    `servo` replaces the axis' servo response C/(Z_s + C) and admittance 1/(Z_s + C).
+    `servo` replaces the axis' servo response and admittance.
     """
     response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
     delay_factor = np.exp(-s * axis.delay)
@@ -56,9 +56,9 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
 
 
 def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
-    """Return the scattering matrix S, which maps the waves F + b V to F - b V (slave: V = -V_s).
+    """Return the scattering matrix S for reference impedances b [N s/m] of both ports.
 
-    `reference`: b [N s/m] of both ports.
+    S maps the waves F + b V to F - b V.
     """
     h11, h12, h21, h22 = entries(H)
     b1, b2 = np.asarray(reference[0]), np.asarray(reference[1])
@@ -77,10 +77,7 @@ def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) 
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return the reference impedances b [N s/m] of master and slave port for `scattering`.
-
-    Master: hand damping; slave: hand damping / (k_f l_p).
-    """
+    """Return the reference impedances b [N s/m] of master and slave port for `scattering`."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(

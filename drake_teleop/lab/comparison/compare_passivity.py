@@ -77,17 +77,10 @@ def compare_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
+    """Compare all or these methods; write summary, runs, report and pictures into `out`.
 
-    Args:
-        networks, methods: names of networks and passivity methods; None: all methods.
-        scenario: shipped name or YAML file; its rates, integrator and environment are not used.
-        seed: seed of sensor noise and networks.
-        jobs: number of processes; -1: one for each core.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The content of summary.json (docs/delay.md).
+    Rates, integrator and environment of the scenario are not used. Return the content of
+    summary.json (docs/delay.md).
     """
     for name in networks:
         if name not in PRESETS:
@@ -165,10 +158,7 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """Run the whole station once with a leaf spring; return its table row and its traces.
-
-    `estimate` (16,): sensor offsets [N, N m], then phi.
-    """
+    """Run the whole station once with a leaf spring; return its table row and its traces."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]

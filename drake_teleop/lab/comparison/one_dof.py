@@ -157,15 +157,11 @@ def run_one_dof(
     """Simulate one run in one degree of freedom.
 
     Args:
-        passivity: configuration of the passivity method.
-        forward, backward: networks from and to the master; backward default: as forward.
         timeout: time without packets before both ends come to rest [s].
         intent: (N, 2) intended position [m] and velocity [m/s]; default: the task's.
-        grip: (N, 3) mass, damping and stiffness of the hand [kg, N s/m, N/m], zeros after it let
-            go; default: the model's.
-        wall: (N, 2) position [m], linear in between, and stiffness [N/m]; default: the model's.
-        delays: forward and backward, periods of travel of each packet, -1 if lost; replace those of
-            the network.
+        grip: (N, 3) mass, damping and stiffness of the hand, zeros after it let go.
+        wall: (N, 2) position [m] and stiffness [N/m]; default: the model's.
+        delays: forward and backward, periods of travel of each packet, -1 if lost.
     """
     scale = model.force_scale
     passivity = dataclasses.replace(
@@ -258,10 +254,9 @@ def figures_of(
     task: Task,
     turned: NDArray[np.float64] | None = None,
 ) -> Figures:
-    """Return the measures of a run of the task; all arrays (N,), equidistant.
+    """Return the measures of a run of the task from equidistant arrays (N,).
 
     Args:
-        t: times [s].
         master, slave: positions in the direction of pressing [m].
         felt: force on the hand [N].
         pressed: force of the environment, scaled to the hand [N].

@@ -122,7 +122,6 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_hands(summary: Mapping[str, Any]) -> Figure:
-    """Draw the results of letting go and taps: a row for each method, a mark for each network."""
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
@@ -161,8 +160,6 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw the displayed force over time: a row for each method, a column for each network."""
-
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
@@ -210,7 +207,6 @@ def _draw_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str)
 
 
 def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the longest stable round trip of each method: a panel for each wall."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     walls = sorted({row["wall_N_per_m"] for row in rows})
     with plot_style():

@@ -36,11 +36,9 @@ _REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energy that entered the station at four places, up to each row of the log.
+    """Return the energies (N, 4, 2) [J] by place and by translation and rotation.
 
-    Returns:
-        (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL`, by translation and rotation [J].
-            `MOTOR` is NaN if the log is slower than the joint control.
+    `MOTOR` is NaN if the log is slower than the joint control.
     """
     if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
@@ -73,10 +71,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the displayed work (N, 2) of the slave's load, by translation and rotation [J].
-
-    With sigma > 0 it belongs to the environment; `ACTUAL` excludes it.
-    """
+    """Return the displayed work (N, 2) of the slave's load, by translation and rotation [J]."""
     arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))

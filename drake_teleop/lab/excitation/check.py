@@ -63,10 +63,7 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Use]:
-    """Return the use of every limit by a sampled motion, largest first.
-
-    `t` (T,) [s]; `q`, `qd`, `qdd` (T, n) joint positions, velocities, accelerations [rad, s].
-    """
+    """Return the use of every limit by a motion of T samples and n joints, largest first."""
     names, limits = robot.arm.joint_names, robot.limits
     motion = _evaluate_bodies(robot, q, qd, qdd, progress)
     uses = [

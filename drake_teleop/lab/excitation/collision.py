@@ -168,8 +168,8 @@ class Scene:
     ) -> tuple[dict[_Pair, Array], list[str]]:
         """Return pairs of shapes that may collide, and names of bodies that touch at the start.
 
-        The pairs have distances in each of the `postures` (T, n); inf: far. Excluded are pairs that
-        are on one link, always near, at a constant distance, or in contact in the posture `start`.
+        Excluded are pairs that are on one link, always near, at a constant distance, or in
+        contact in the posture `start`.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -217,10 +217,7 @@ class Scene:
     def capsules(
         self, candidates: dict[_Pair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
-        """Return links, ends, radii, pairs and minimum distances of the capsules, see `Limits`.
-
-        Capsules inside larger ones are excluded, and pairs that are always near.
-        """
+        """Return links, ends, radii, pairs and minimum distances of the capsules, see `Limits`."""
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
@@ -270,8 +267,7 @@ class Scene:
 def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
     """Return the minimum distance [m] of two capsules from (T,) distances in random postures.
 
-    Capsules are larger than their shapes, so the lower quartile of their excess near contact is
-    subtracted. At least 90 % of the free postures remain feasible.
+    Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     """
     touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
     excess = (

@@ -95,10 +95,7 @@ class Criterion:
         return float(np.exp(log_value) / np.sqrt(RATE * duration))
 
     def smooth(self, s: Array, omega: Array, alpha: Array, sharpness: float) -> tuple[float, Array]:
-        """Return the logarithm of the criterion and its gradient by V (T, 6, 10).
-
-        Log-sum-exps replace the extreme eigenvalues, whose gradients are not unique at an optimum.
-        """
+        """Return the logarithm of the criterion and its gradient by V (T, 6, 10)."""
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
@@ -113,7 +110,6 @@ class Criterion:
     def _log_criterion_and_gradient(
         self, eigenvalues: Array, vectors: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return log criterion and gradient by eigenvalues (A16: by the Gram matrix)."""
         if self.name == "D16":
             n = len(eigenvalues)
             return float(-0.5 * np.log(eigenvalues).mean()), -0.5 / (n * eigenvalues)

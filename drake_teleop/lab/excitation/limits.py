@@ -115,11 +115,8 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
 def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
     """Write the largest use of each of `LIMITS` over all samples, with gradients (T47).
 
-    Args:
-        q, qd, qdd: (T, n) joint positions, velocities and accelerations.
-        motions: (T, n+1, 21) from `motions_of`.
-        smooth, largest: (7,) outputs: smooth and exact maximum.
-        gradient: (7, 3, T, n) output: gradient of the smooth uses by q, qd, qdd.
+    Outputs: smooth and exact maximum (7,), and the gradient (7, 3, T, n) of the smooth one by
+    joint positions, velocities and accelerations.
     """
     gradient[:] = 0.0
     T, n = q.shape
@@ -342,7 +339,7 @@ def _is_far(first, second, enough):
 def _segment_distance(first, second, nearest):
     """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
 
-    Output `nearest` (5,): positions along the segments (0 to 1), unit vector from second to first.
+    `nearest` (5,): positions along the segments (0 to 1), unit vector from second to first.
     """
     dd = ee = de = dr = er = 0.0
     for i in range(3):

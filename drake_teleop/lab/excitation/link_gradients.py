@@ -56,10 +56,7 @@ def seed_point(motion, point, gradient, seed):
 
 @njit(cache=True)
 def seed_wrench(motion, phi, g_force, g_torque, seed):
-    """Add derivatives by the wrench of a load phi about the link's origin to `seed` (21,).
-
-    `g_force` and `g_torque` are triples in the link's frame.
-    """
+    """Add derivatives by the wrench of a load phi about the link's origin to `seed` (21,)."""
     s = to_link(motion, three(motion, _S))
     w = to_link(motion, three(motion, _OMEGA))
     h, inertia = three(phi, 1), symmetric(phi, 4)
@@ -80,10 +77,7 @@ def seed_wrench(motion, phi, g_force, g_torque, seed):
 def seed_joint_torque(table, motions, c, virtual, seeds):
     """Add the seeds of J = c . tau, with joint torques tau without rotor inertia and damping.
 
-    Args:
-        c: (n,) weights of the joint torques.
-        virtual: (n+1, 6) output: link velocities for joint velocities c, for `pull_back`.
-        seeds: (n+1, 21) seeds of the links, added to.
+    Write the link velocities for joint velocities c into `virtual` (n+1, 6).
     """
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)
@@ -118,10 +112,7 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
 def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
     """Add the gradients that belong to the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
 
-    Args:
-        motions: (n+1, 21), `link_motions` at (q, qd, qdd).
-        c, virtual: (n,), (n+1, 6) as in `seed_joint_torque`, or zeros.
-        seeds: (n+1, 21) seeds of the links.
+    `c` and `virtual` are those of `seed_joint_torque`, or zeros.
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)

@@ -186,11 +186,8 @@ def design(
 ) -> list[Iterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    Args:
-        seed: seed of the candidates; without `seconds` the result is reproducible.
-        starts: number of candidates from which a descent starts.
-        seconds: thread CPU time; replaces `starts`.
-        progress: called with completed share and best criterion.
+    `seconds` of thread CPU time replace the number of `starts`; the result is then not
+    reproducible.
     """
     search = _Search(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):

@@ -1,7 +1,6 @@
 """Predicted standard deviations of offsets and load after an excitation (T46).
 
-Assumptions: every sensor sample is used, the motion is slow, the load is known, quantisation is
-noise. Gain errors, delay, thermal drift and rounding of encoders are not included.
+Gain errors, delay, thermal drift and rounding of encoders are not included.
 """
 
 from __future__ import annotations
@@ -66,13 +65,7 @@ def predicted_deviations(
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the covariance (16, 16) of offsets and phi after the motion.
-
-    Args:
-        s, omega, alpha: (T, 3) samples of the motion, in S.
-        step: sample period [s].
-        phi: (10,) parameters of the load.
-    """
+    """Return the covariance (16, 16) of offsets and phi after the motion (T, 3) in S."""
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.weights[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)

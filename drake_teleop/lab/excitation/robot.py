@@ -117,14 +117,7 @@ def RobotFromModel(
 ) -> Robot:
     """Return a serial arm from a model; free bases are welded, joints beyond the sensor locked.
 
-    Args:
-        sensor_frame: frame or link at which the sensor measures.
-        package_paths: folders for `package://` addresses.
-        acceleration: limits [rad/s^2] if the model has none, one value or one for each joint.
-        payload: mass of the heaviest load [kg], if the model lacks it.
-
-    Raises:
-        DrakeTeleopError: if the model is unreadable or not a serial arm.
+    Acceleration limits [rad/s^2] and payload [kg] are used where the model has none.
     """
     missing: list[str] = []
     folders: list[TemporaryDirectory[str]] = []
@@ -192,10 +185,7 @@ def _make_robot(
     assumptions: list[str],
     folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
-    """Return the robot with its limits; `box` is middle and half size in W [m].
-
-    Shapes that touch in the `start` posture (n,) may always touch.
-    """
+    """Return the robot with its limits; `box` is middle and half size in W [m]."""
     arm = scene.arm
     middle, half = arm.middle, (arm.upper - arm.lower) / 2
     random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))

@@ -5,8 +5,7 @@ The logarithm of the period T is an unknown and is minimised; the tolerance is o
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
 with standard deviations d_k after one period. With the factor z, all numbers are within their
-tolerances together in `RELIABLE` of the records. The optimiser models white noise; the search
-repeats with factors for random walks and filters.
+tolerances together in `RELIABLE` of the records.
 """
 
 from __future__ import annotations
@@ -87,10 +86,6 @@ def shortest(
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> Shortest:
     """Design and check the shortest motion that reaches a tolerance.
-
-    Args:
-        harmonics: number N of harmonics in Eq. (9).
-        starts: random starts of the first round.
 
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
@@ -256,9 +251,8 @@ class ShortestProblem(Problem):
     def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
         """Return variances (k,) d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
 
-        e_k is a row of `errors`; G = sum of R^T R period / samples is the information of weighted
-        least squares; B = sum of R^T S R period / samples contains the noise densities S (sandwich,
-        White, Econometrica 1980).
+        G is the information of weighted least squares; B contains the noise densities; e_k is a row
+        of `errors` (sandwich, White, Econometrica 1980).
         """
         share, flat = period / len(rows), rows.reshape(-1, rows.shape[2])
         G = share * (flat.T @ flat)
@@ -271,10 +265,7 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
-        """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V.
-
-        With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), half of it in the use.
-        """
+        """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V."""
         rows = self._rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
         logs = 0.5 * np.log(variances)
@@ -288,10 +279,7 @@ class ShortestProblem(Problem):
 
 
 def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """Return white noise densities (6, 6) of wrench and motion, over those of the wrench.
-
-    Filters are not included.
-    """
+    """Return white noise densities (6, 6) of wrench and motion, over those of the wrench."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
         at_So = np.eye(6)

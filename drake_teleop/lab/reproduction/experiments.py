@@ -76,20 +76,14 @@ class ContactMotion:
 
 
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
-    """Simulate a free movement and calculate the scaled wrench for each sigma.
-
-    `estimate` (16,): sensor offsets, then phi.
-    """
+    """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
     scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
 def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
-    """Simulate the contact transition with and without the leaf spring.
-
-    `estimate` (16,): sensor offsets, then phi.
-    """
+    """Simulate the contact transition with and without the leaf spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
     free = _simulate(without_sheet(scenario), estimate, free_stage)
@@ -108,10 +102,7 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
 
 
 def ideal_motion(progress: Progress) -> IdealMotion:
-    """Simulate a free movement that moves and rotates the tool about all axes.
-
-    The reaction of the tool's weld comes from Drake's plant and does not use the regressor V.
-    """
+    """Simulate a free movement that moves and rotates the tool about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
     )
@@ -170,7 +161,6 @@ def free_values(run: FreeMotion, component: int, unit: str) -> Values:
 
 
 def contact_values(run: ContactMotion) -> Values:
-    """Return the values of Fig. 8 by name."""
     t, force_norm = run.touched.t, _force_norm(run.calculated)
     detected = force_norm > run.threshold
     window = _contact_window(run)

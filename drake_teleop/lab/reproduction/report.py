@@ -90,10 +90,7 @@ class ParameterRow:
 
 
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
-    """Return the rows of the table that compares paper and reproduction.
-
-    `summary`: values by full name, such as "free_force.peak_raw_N".
-    """
+    """Return the rows of the table that compares paper and reproduction."""
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     share = s["contact.peak_contact_N"] / s["contact.peak_inertial_N"]
@@ -212,13 +209,7 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures; equal runs give equal pages.
-
-    Args:
-        setup: description of the run: name -> text.
-        summary: values by full name.
-        replay: file name of the 3D replay beside the page, if any.
-    """
+    """Write the HTML page with embedded figures; equal runs give equal pages."""
     page = render(
         "drake_teleop.lab.reproduction",
         "report.html.j2",

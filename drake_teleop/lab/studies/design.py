@@ -54,10 +54,7 @@ class Factor:
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: Value) -> list[float]:
-        """Return a value as coordinates from 0 to 1.
-
-        A number has one. A word, flag or vector has one indicator (0 or 1) per listed value.
-        """
+        """Return a number, or one indicator (0 or 1) per listed value of a word, flag or vector."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:
@@ -193,10 +190,7 @@ class Study:
         return self._sobol(1 << (first - 1).bit_length(), self.seed)[: self.samples]
 
     def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
-        """Return the next points of an adaptive design; an empty list at its end.
-
-        `objective` (n,): values at the evaluated points; nan where the runs failed.
-        """
+        """Return the next points of an adaptive design; an empty list at its end."""
         count = min(self.batch, self.samples - len(points))
         if self.design != "adaptive" or count <= 0:
             return []
@@ -214,10 +208,7 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """Return one table row, still without measures, for each run of the points.
-
-        `first` is the number of the first point.
-        """
+        """Return one table row, still without measures, for each run of the points."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values

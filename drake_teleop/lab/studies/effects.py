@@ -208,7 +208,7 @@ def estimated(
 
 
 def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects on all measures as a table: one row per measure, factor and level."""
+    """Return the main effects on all measures: one row per measure, factor and level."""
     import polars as pl
 
     table = [
@@ -233,7 +233,6 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
-    """Return the effect of each factor on a measure: field -> effect."""
     data = _MeasureData(study, rows, measure)
     return (
         {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
@@ -241,7 +240,6 @@ def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, Ma
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
-    """Return the means of a measure at all pairs of levels, for each pair of factors."""
     data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
     return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
@@ -333,10 +331,7 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return all points with their means of the `PARETO` measures; None if the study lacks one.
-
-    Only points with all three measures in every run can be on the front.
-    """
+    """Return all points with their means of the `PARETO` measures; None if the study lacks one."""
     import polars as pl
 
     if not set(PARETO) <= set(study.measures) or rows.is_empty():
@@ -360,10 +355,7 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return True at complete points (n,) that no other complete point dominates.
-
-    The k columns of `values` (n, k) are minimised.
-    """
+    """Return True at complete points that no other dominates; columns of `values` are minimised."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]
@@ -373,7 +365,6 @@ def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def varied(study: Study) -> list[Factor]:
-    """Return the factors with more than one value."""
     return [factor for factor in study.factors if len(factor.listed()) > 1]
 
 

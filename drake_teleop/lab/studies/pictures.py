@@ -54,7 +54,6 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
-    """Draw the mean of each measure at each level; bars are intervals of the effects."""
     factors, fitted, reasons = varied(study), False, set[str]()
     with plot_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
@@ -118,7 +117,6 @@ def _legend(figure: Figure, reasons: Iterable[str]) -> None:
 
 
 def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
-    """Draw the mean of a measure over pairs of factors; return None without such means."""
     maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None

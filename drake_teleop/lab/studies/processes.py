@@ -41,13 +41,9 @@ _PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 def processes(
     store: Store, jobs: int, cluster: str | None, executor: Executor | None
 ) -> Iterator[Processes]:
-    """Start the processes of a study for the duration of the context.
+    """Start `jobs` processes, a Dask cluster or a custom executor for the context.
 
-    Args:
-        store: where started chunks are marked.
-        jobs: number of processes as in joblib; 1 is this process.
-        cluster: address of a Dask scheduler, or "local".
-        executor: any `concurrent.futures.Executor`, which remains open.
+    `cluster` is the address of a Dask scheduler, or "local"; `executor` remains open.
     """
     if executor is not None:
         if not isinstance(executor, Executor):

@@ -59,12 +59,8 @@ def run_study(
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
-    Args:
-        work: picklable function that executes one run.
-        basis: JSON data of all inputs of the rows besides the study.
-        shard: "K/N" for the runs and rows of this shard only.
-        merge: True collects the rows of the shards in `out`, and runs nothing.
-        progress: whether to show a progress bar, or the `Stage` of the caller.
+    `basis` is JSON data of all inputs of the rows besides the study. `shard` "K/N" restricts runs
+    and rows to this shard; `merge` collects the rows of all shards and runs nothing.
     """
     part = None if shard is None else parse_shard(shard)
     if (part or merge) and study.design == "adaptive":

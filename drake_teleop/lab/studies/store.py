@@ -113,10 +113,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
 
 @contextmanager
 def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
-    """Lock the existing folder `out` for this process.
-
-    `identity` is JSON data of all inputs of its content; content of other inputs raises an error.
-    """
+    """Lock the existing folder `out`; raise an error if its content is from other inputs."""
     handle = os.open(out, os.O_RDONLY)
     try:
         _lock(handle, out)

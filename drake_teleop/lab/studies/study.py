@@ -79,21 +79,9 @@ def study_command(
 ) -> dict[str, Any]:
     """Run the remaining runs of a study; write summary, effects and pictures; return the summary.
 
-    Args:
-        path: study file, or the name of a shipped study.
-        jobs: number of processes; -1: one for each core.
-        cluster: address of a Dask scheduler, or "local".
-        executor: any `concurrent.futures.Executor` that executes the runs instead; stays open.
-        shard: "K/N" for every N-th group of runs, with a summary in the folder `shards/K-of-N`.
-        merge: True collects the rows of all shards in `out` and runs nothing.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-        repeats: replaces the value of the file.
-        yes: True permits more than 1e5 runs; or a function that asks the user.
-
-    Raises:
-        DrakeTeleopError: for a wrong file, too many runs, another study's folder, missing Dask, a
-            Dask worker of another version, or shards that are missing.
-        KeyboardInterrupt: its message contains the number of stored runs.
+    `shard` "K/N" is every N-th group of runs; `merge` collects the rows of all shards and runs
+    nothing; `yes` permits more than 1e5 runs, or asks the user. The message of a
+    KeyboardInterrupt contains the number of stored runs.
     """
     for first, second, both in (
         ("shard", "merge", shard and merge),

@@ -60,11 +60,7 @@ class Found:
 
 
 def search_settings(trial: StationTrial, execute: Execute) -> Found:
-    """Return the stable settings with the smallest detection threshold.
-
-    Raises:
-        DrakeTeleopError: if no settings are stable in the whole set.
-    """
+    """Return the stable settings with the smallest detection threshold."""
     base, stated = trial.base, trial.stated
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
@@ -115,7 +111,6 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
 
 
 def _best_of_each_method(search: list[Row]) -> list[Row]:
-    """Return the row of each method with the smallest threshold, the smallest first."""
     best: dict[str, Row] = {}
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
         if row["gamma"] > 0.0:
@@ -126,10 +121,7 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
 def _station_limit(
     settings: Settings, trial: StationTrial, execute: Execute
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma that is stable in the station with the margin, and its rows.
-
-    gamma is halved until the station is stable, then bisected; no rows: it never was.
-    """
+    """Return the largest gamma that is stable in the station with the margin, and its rows."""
     margin, ends = trial.stated.aims.margin, [c[0] for c in trial.stated.corners]
     hands = list(dict.fromkeys(ends))
     tries = 0
