@@ -30,13 +30,7 @@ FILTER_TAIL_S = 0.01
 
 @dataclass(frozen=True, eq=False)
 class ScenarioRun:
-    """Scenario and results of one run.
-
-    Attributes:
-        identification: identified load, or None.
-        load_source: origin of the load as text.
-        real_time_factor: simulated time over elapsed time.
-    """
+    """Scenario and results of one run; `identification` is the identified load, or None."""
 
     scenario: Scenario
     result: SimulationResult

@@ -85,7 +85,7 @@ def scattering_norm(S: Complex) -> Real:
 def structured_singular_value(
     S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
 ) -> Real:
-    """Return mu of S for loads with these largest reflection factors (T56).
+    """Return mu of the scattering matrix S for loads with at most these reflection factors (T56).
 
     With factors of 1 (any passive load), mu <= 1 means absolutely stable.
     """

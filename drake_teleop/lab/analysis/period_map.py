@@ -1,11 +1,7 @@
 """Sampled one-axis model of the station over a period of the hand.
 
-Order of events; all updates at one instant read earlier values:
-
-* The device advances by one hand period with held force; the other blocks read its prediction.
-* The servo reads the command and the slave's state; its force is held.
-* The sensor samples just before the servo's update; its low-pass is digital.
-* A channel with a delay of d hand periods returns its input of d periods ago (`cut_loop`).
+All updates at one instant read earlier values. Device and servo hold their forces; the sensor
+samples just before the servo's update.
 """
 
 from __future__ import annotations
@@ -216,7 +212,7 @@ class _Rows:
 
 
 def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
-    """Return the parts (..., 2) of (x, v) due to x, v and held u of x'' = u - b x' - k x."""
+    """Return the (..., 2) responses of x'' = u - b x' - k x to unit x, unit x' and held unit u."""
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t

@@ -78,7 +78,7 @@ def sampled_poles(
 def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
-    """Return the matrices Phi (..., 2, 2), Gamma (..., 2) of the device under held force."""
+    """Return state matrix (..., 2, 2) and input vector (..., 2) of the device over a sample."""
     from scipy.linalg import expm
 
     _checked_positive(mass, "mass of the device")

@@ -119,7 +119,10 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least(self, place: int) -> float:
-        """Return the least initial energy plus energy at HAND and `place` [J]; negative: active."""
+        """Return the least sum over time of start energy and `accounts` at HAND and `place` [J].
+
+        A negative sum means that the station is active.
+        """
         other = 0.0 if place == HAND else self.accounts[:, place]
         return self.start_energy + float(np.nanmin(self.accounts[:, HAND] + other))
 
@@ -258,8 +261,7 @@ def figures_of(
 
     Args:
         master, slave: positions in the direction of pressing [m].
-        felt: force on the hand [N].
-        pressed: force of the environment, scaled to the hand [N].
+        felt, pressed: forces on the hand and of the environment, at the hand's scale [N].
         energy: from both ends into the channel [J].
         turned: (N, 3) rotation vector of the slave's tool [rad], if it can rotate.
     """

@@ -1,12 +1,7 @@
 """Energy balances of a station's run, from its recorded signals.
 
-The balances are those of `one_dof.OneDofRun.accounts`, for translation and rotation separately,
-scaled to the master's power, positive inwards [J]. With c = k_f gamma over the kinematic scale::
-
-    HAND      -sum f_(k-1) . dx_k       held wrench, at every period of the channel
-    COMMAND    sum w_k . dc_k           sent wrench along the command; no physical port
-    MOTOR     -integral c f_m . dx_s    motor torque minus weight, as a wrench at So
-    ACTUAL     integral c f_w . dx_s    true contact wrench at So
+The balances are those of `one_dof.OneDofRun.accounts`, at the master's scale, positive inwards [J],
+by translation and rotation. MOTOR is from the motor torque minus weight, as a wrench at So.
 """
 
 from __future__ import annotations

@@ -88,15 +88,7 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
 
 @dataclass(frozen=True)
 class _Motion:
-    """Values of T samples of a motion.
-
-    Attributes:
-        torque: (T, n) joint torques.
-        sensor: (T, 4) norms of force, torque, s and alpha at the sensor.
-        workspace: (T, 3 P) use of the box by P points.
-        clearance: (T,) required clearance over distance.
-        nearest: names of the nearest bodies.
-    """
+    """Values of T samples of a motion; `clearance` is required clearance over distance."""
 
     torque: Array
     sensor: Array

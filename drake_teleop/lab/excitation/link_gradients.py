@@ -41,7 +41,7 @@ def to_link(motion, a):
 
 @njit(cache=True)
 def seed_vector(motion, place, gradient, seed):
-    """Add a derivative by s, omega or alpha (`place` 0, 3, 6), in the link's frame, to `seed`."""
+    """Add to `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in the link's frame."""
     g = to_world(motion, gradient)
     add_into(seed, place, g)
     add_into(seed, _THETA, cross(g, three(motion, place)))
@@ -49,14 +49,14 @@ def seed_vector(motion, place, gradient, seed):
 
 @njit(cache=True)
 def seed_point(motion, point, gradient, seed):
-    """Add a derivative, in W, by the position of a point (3,) fixed to the link to `seed`."""
+    """Add to `seed` a derivative, in W, by the position of a point (3,) fixed to the link."""
     add_into(seed, _P, gradient)
     add_into(seed, _THETA, cross(to_world(motion, point), gradient))
 
 
 @njit(cache=True)
 def seed_wrench(motion, phi, g_force, g_torque, seed):
-    """Add derivatives by the wrench of a load phi about the link's origin to `seed` (21,)."""
+    """Add to `seed` (21,) derivatives by the wrench of a load phi, both in the link's frame."""
     s = to_link(motion, three(motion, _S))
     w = to_link(motion, three(motion, _OMEGA))
     h, inertia = three(phi, 1), symmetric(phi, 4)
@@ -110,7 +110,7 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
 
 @njit(cache=True)
 def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
-    """Add the gradients that belong to the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
+    """Add to `g_q`, `g_qd`, `g_qdd` (n,) the gradients that follow from the seeds of all links.
 
     `c` and `virtual` are those of `seed_joint_torque`, or zeros.
     """

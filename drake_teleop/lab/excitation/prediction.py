@@ -65,7 +65,7 @@ def predicted_deviations(
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the covariance (16, 16) of offsets and phi after the motion (T, 3) in S."""
+    """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3)."""
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.weights[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)

@@ -57,7 +57,6 @@ class Robot:
         sensor_frame: frame S of the wrist sensor.
         home: (n,) start posture of the search [rad].
         assumptions: assumed values that the model lacks.
-        folders: temporary folders with converted meshes.
     """
 
     name: str

@@ -4,8 +4,7 @@ The logarithm of the period T is an unknown and is minimised; the tolerance is o
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
-with standard deviations d_k after one period. With the factor z, all numbers are within their
-tolerances together in `RELIABLE` of the records.
+with standard deviations d_k after one period and z of `reliable_factor`.
 """
 
 from __future__ import annotations
@@ -141,7 +140,7 @@ def shortest(
 
 
 def reliable_factor(count: int) -> float:
-    """Return the factor z (Sidak) with which `count` numbers are within tolerance together."""
+    """Return the factor z with which `count` numbers are within tolerance together (Sidak)."""
     return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
 
 
@@ -279,7 +278,7 @@ class ShortestProblem(Problem):
 
 
 def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """Return white noise densities (6, 6) of wrench and motion, over those of the wrench."""
+    """Return the white noise densities (6, 6) of wrench and motion, relative to the wrench's."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
         at_So = np.eye(6)

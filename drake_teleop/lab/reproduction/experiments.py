@@ -131,7 +131,7 @@ def ideal_motion(progress: Progress) -> IdealMotion:
 
 
 def ideal_values(run: IdealMotion) -> Values:
-    """Return the reaction minus V phi, by the elimination and by the regressor, by name."""
+    """Return the errors of the calculated load wrench, by elimination and by regressor."""
     load = regressor(*run.motion) @ run.phi
     left = np.concatenate(
         [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]

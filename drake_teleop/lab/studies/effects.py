@@ -47,9 +47,9 @@ class Factorial:
     seen: Flags
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the comparable levels of a factor, or cells of two factors, as `comparable` does.
+        """Return booleans of comparable levels (or cells of two factors) and of used combinations.
 
-        Also return a matrix (kept rows, n) from point values to the means.
+        The matrix (kept rows, n) maps point values to means.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
         (row, rows), (column, columns) = (
@@ -65,13 +65,11 @@ class Factorial:
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return per factor the effects and half widths (kept levels,) of values (n, seeds)."""
         means = [self.compared(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        """Return means and half widths (k,) of values (n, seeds) with `weights` (k, n)."""
         mean, half = interval(weights @ table)
         return mean, np.hypot(half, self._missing_seed_widths(table, weights))
 

@@ -114,10 +114,7 @@ class LevelModel:
     solve: Array
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return comparable levels or cells as `Factorial.compared`, from failed combinations.
-
-        The matrix (kept rows, p) maps coefficients to means.
-        """
+        """Return the same as `Factorial.compared`, with a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
         shape = [len(self.factors[factor].names) for factor in factors]
@@ -144,7 +141,6 @@ class LevelModel:
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
-        """Return means and half widths (kept levels,); `terms` is the matrix of `compared`."""
         seeds = table.shape[1]
         each = terms @ self.solve @ table
         if seeds == 1:

@@ -72,7 +72,7 @@ def scaling_study_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run the remaining runs of the scaling studies; write and return the best scales."""
+    """Run the remaining runs of the scaling studies; write results; return those of answer.json."""
     make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY):

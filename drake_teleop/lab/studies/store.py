@@ -133,7 +133,7 @@ def _lock(handle: int, out: Path) -> None:
 
 
 def check_identity(out: Path, identity: dict[str, Any]) -> None:
-    """Write the inputs of the rows into a new folder `out`, or compare them."""
+    """Write the inputs of the rows into a new folder `out`; another folder must have the same."""
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():

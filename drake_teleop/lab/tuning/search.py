@@ -45,10 +45,9 @@ class Found:
     """Result of the search.
 
     Attributes:
-        settings: chosen settings.
         search: rows of the search in one axis, with the predicted `threshold_N` and `gamma`.
         given: rows of the user's settings at the stiffest wall.
-        inside: rows of the chosen settings at the corners, at the gamma times the margin.
+        inside: rows of the chosen settings at the corners, with gamma times the margin.
         limits: rows at the chosen gamma, at the stiffest wall and beyond it.
     """
 
