@@ -204,7 +204,7 @@ def _design_trajectory(scenario: Scenario, stage: Stage) -> tuple[FourierTraject
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         raise DrakeTeleopError(
-            f"it moves {len(trajectory.q0)} joints, the arm has {robot.arm.num_joints}",
+            f"it has {len(trajectory.q0)} joints, the arm {robot.arm.num_joints}",
             where="trajectory",
             remedy="compute a trajectory for this arm",
         )

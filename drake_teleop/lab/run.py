@@ -25,7 +25,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-_DURING_RUN = "learnt while it ran"
+_DURING_RUN = "estimated during the run"
 _FINAL_FILES = (
     "sensor_log.parquet",
     "identification.json",
@@ -71,13 +71,15 @@ def run_command(
     """
     if drive is not None and (seed is not None or fresh):
         raise DrakeTeleopError(
-            "a drive has its own seed and load",
+            "a recorded drive contains its seed and load, which cannot be replaced",
             where="run --inputs",
             remedy="remove --seed and --fresh",
         )
     if drive is not None and out.resolve() == drive.folder.resolve():
         raise DrakeTeleopError(
-            "is the folder of the drive", where=str(out), remedy="give another --out"
+            "is the folder of the recorded drive, which the results would replace",
+            where=str(out),
+            remedy="give another --out",
         )
     from drake_teleop.station.replay import write_replay  # needs Matplotlib
 
@@ -176,7 +178,7 @@ def _repeat_drive(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioR
     result = drive.repeat(progress("Repeat the drive"), log)
     factor = drive.scenario.simulation.duration / (time.perf_counter() - start)
     identification = None if drive.load is None else drive.load.identification
-    return ScenarioRun(drive.scenario, result, identification, "of the drive", factor)
+    return ScenarioRun(drive.scenario, result, identification, "from the recorded drive", factor)
 
 
 def _describe_log(log: Path) -> str:

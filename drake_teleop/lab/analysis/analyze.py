@@ -173,7 +173,7 @@ def leaf_displacement(scenario: Scenario) -> list[float]:
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
         raise DrakeTeleopError(
-            "the slave does not move",
+            "is 0, so that the slave cannot press on the leaf spring",
             where="kinematic_scaling.translation_scale",
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )

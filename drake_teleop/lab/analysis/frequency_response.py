@@ -101,7 +101,7 @@ class StationResponse:
         low = self.omega <= _APPARENT_MASS_BAND
         if np.count_nonzero(low) < 3:
             raise DrakeTeleopError(
-                "fewer than three lines below 10 Hz",
+                "fewer than three frequencies are below 10 Hz",
                 where="MultiSine",
                 remedy="lower `lowest` or lengthen `period`",
             )

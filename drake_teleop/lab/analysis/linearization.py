@@ -117,7 +117,7 @@ class Linearization:
             values = np.linalg.eigvals(self.expanded().A)
         elif size > MAX_STATES:
             raise DrakeTeleopError(
-                f"{size} states, most of them of the delay, are too many",
+                f"{size} states are too many for eigenvalues; most of them represent the delay",
                 where="channel.delay",
                 remedy="count unstable multipliers of one axis instead (cut_loop)",
             )
@@ -168,9 +168,9 @@ class Linearization:
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
             raise DrakeTeleopError(
-                f"there is no {missing[0]}",
+                f"'{missing[0]}' is no port or component of this model",
                 where="close",
-                remedy=f"name one of {', '.join(ports)}, or a list of parts, as ['{known[0]}']",
+                remedy=f"name one of {', '.join(ports)}, or list components, as ['{known[0]}']",
             )
         return tuple(known.index(name) for name in parts)
 
@@ -517,7 +517,7 @@ class _Period:
             self._set(x)
             x = self._balance_hand()
         raise DrakeTeleopError(
-            f"the slave does not come to rest, {self.states[np.argmax(np.abs(moved))]} moves",
+            f"the slave does not come to rest (state {self.states[np.argmax(np.abs(moved))]})",
             where="displacement",
             remedy="choose another operating point",
         )

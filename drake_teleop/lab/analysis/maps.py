@@ -108,7 +108,7 @@ def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_
 def _increasing(name: str, values: ArrayLike) -> Array:
     if name not in _PARAMETERS:
         raise DrakeTeleopError(
-            f"there is no parameter '{name}' to draw a map of",
+            f"'{name}' is no parameter of a stability map",
             where="stability_map",
             remedy=f"choose one of {', '.join(sorted(_PARAMETERS))}",
         )

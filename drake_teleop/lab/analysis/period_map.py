@@ -50,9 +50,9 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
     """
     if axis.ideal_servo:
         raise DrakeTeleopError(
-            "an ideal servo has no sampled form",
+            "the sampled model does not include an ideal servo",
             where="axis.ideal_servo",
-            remedy="give it high gains, or use the continuous model",
+            remedy="set it to False with high gains, or use two_port.hybrid",
         )
     servo_samples, sensor_samples = (
         _samples(sampling, name) for name in ("joint_control_hz", "sensor_hz")
@@ -133,7 +133,7 @@ def _sections(sampling: Sampling) -> Array:
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
     if not (cutoffs < rates / 2).all():
         raise DrakeTeleopError(
-            "the low-pass lets half the sensor's rate pass",
+            "the cut-off frequency is not below half of the sensor's rate",
             where="sampling.low_pass_hz",
             remedy="choose less than half of sensor_hz",
         )

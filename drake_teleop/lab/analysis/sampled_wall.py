@@ -87,7 +87,9 @@ def _sampled_device(
     m, b, k = np.broadcast_arrays(mass, damping, stiffness)
     if not np.all(k >= 0):
         raise DrakeTeleopError(
-            "the stiffness of the hand is negative", remedy="give 0 or more [N/m]"
+            "the stiffness of the hand is negative",
+            where="hand_stiffness",
+            remedy="give 0 or more [N/m]",
         )
     rates = np.zeros((*m.shape, 3, 3))
     rates[..., 0, 1] = 1

@@ -152,7 +152,7 @@ def _slave_posture(slave: SlavePlant, moved: Array) -> Array:
         q, status = find_posture(arm, pose, slave.start)
     if status != IkStatus.OK:
         raise DrakeTeleopError(
-            f"the arm cannot follow by {moved} m ({IkStatus(status).name})",
+            f"the arm cannot reach this displacement of {moved} m ({IkStatus(status).name})",
             where="displacement",
             remedy="choose a smaller displacement or another start posture",
         )

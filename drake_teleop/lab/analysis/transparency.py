@@ -82,7 +82,9 @@ def smallest_stiffness_change(
     """Return the smallest detectable increase of the environment's stiffness [N/m], or inf."""
     if weber <= 0:
         raise DrakeTeleopError(
-            f"is {weber:g}, must be positive", where="weber", remedy="give, say, 0.1"
+            f"the Weber fraction is {weber:g}, must be positive",
+            where="weber",
+            remedy="give a fraction, such as 0.23",
         )
     _, h12, h21, h22 = entries(H)
     s = 1j * omega

@@ -37,7 +37,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     """
     if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
-            f"this result holds no {', '.join(missing)}",
+            f"the result lacks the signals {', '.join(missing)}",
             where="accounts",
             remedy="run a station over a network, or with a method",
         )

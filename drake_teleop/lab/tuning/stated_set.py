@@ -73,7 +73,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
                 remedy = suggestion(name, known, f"choose among {', '.join(known)}")
                 raise DrakeTeleopError(f"'{name}' is unknown", where=what, remedy=remedy)
     if not hands:
-        raise DrakeTeleopError("there is no grip", where="hands", remedy="give light, for instance")
+        raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
     limits = f"{_MIN_WALL / 1e3:g} to {_MAX_WALL / 1e3:g} kN/m"
     for wall in walls:
         if not (math.isfinite(wall) and _MIN_WALL <= 1e3 * wall <= _MAX_WALL):
@@ -84,7 +84,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
             )
     if not walls:
         raise DrakeTeleopError(
-            "there is no wall", where="walls", remedy="give kN/m, such as 0.5,20"
+            "no wall stiffness is given", where="walls", remedy="give kN/m, such as 0.5,20"
         )
     ordered = tuple(name for name in GRIPS if name in hands)
     return StatedSet(ordered, (1e3 * min(walls), 1e3 * max(walls)), task)
