@@ -63,7 +63,7 @@ _RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz
 _MAX_STEP = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
 #: needs 9,000 to 16,000 steps per second instead of 1,500.
-_SLIP_SPEED = 1e-3
+_SLIP_SPEED_M_S = 1e-3
 
 
 def compare_command(
@@ -165,7 +165,7 @@ def station_run(
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
-    setup = replace(setup, sheet_spring__slip=_SLIP_SPEED)
+    setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_to_end_or_hold(station, setup, task)

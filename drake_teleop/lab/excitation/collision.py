@@ -43,7 +43,7 @@ from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize
 
 # Vertices of the circumscribed polygon of a cylinder.
-_RIM = 24
+_NUM_RIM_POINTS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +90,11 @@ def _hull(shape: Shape) -> Array:
         corners = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, 8).T
         return corners * [shape.a(), shape.b(), shape.c()]
     if isinstance(shape, Cylinder):
-        angle = 2 * np.pi * np.arange(_RIM) / _RIM
-        radius = shape.radius() / np.cos(np.pi / _RIM)
+        angle = 2 * np.pi * np.arange(_NUM_RIM_POINTS) / _NUM_RIM_POINTS
+        radius = shape.radius() / np.cos(np.pi / _NUM_RIM_POINTS)
         rim = radius * np.column_stack([np.cos(angle), np.sin(angle)])
         half = shape.length() / 2
-        ends = [np.column_stack([rim, np.full(_RIM, z)]) for z in (-half, half)]
+        ends = [np.column_stack([rim, np.full(_NUM_RIM_POINTS, z)]) for z in (-half, half)]
         return np.concatenate(ends)
     hull = shape.GetConvexHull()
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])

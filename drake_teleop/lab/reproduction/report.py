@@ -28,9 +28,9 @@ _PARAMETERS = (
 
 _NOT_REPORTED = "not reported"
 # Pairs of verdicts: for an accepted value, for an unaccepted value.
-_AS_SET = ("as set", "not as set")
+_VERDICTS_OF_SET = ("as set", "not as set")
 _WITHIN_BOUND = ("within our bound", "beyond our bound")
-_AGREES = ("agrees", "differs")
+_VERDICTS_OF_FOUND = ("agrees", "differs")
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Comparison:
     def verdict(self) -> str:
         if self.holds is None:
             return "for the record"
-        words = _AS_SET if self.origin == "set" else _AGREES
+        words = _VERDICTS_OF_SET if self.origin == "set" else _VERDICTS_OF_FOUND
         if self.paper == _NOT_REPORTED:
             words = _WITHIN_BOUND
         return words[0] if self.holds else words[1]
@@ -130,7 +130,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
     ]  # fmt: skip
 
 
-def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return as text the rows whose values are outside the accepted range."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"

@@ -102,7 +102,7 @@ class Factorial:
         return quantile * np.sqrt(variance * np.maximum(spread, 0.0))
 
 
-def filled(values: Array) -> Array:
+def fill_missing(values: Array) -> Array:
     """Replace nan in values (n, seeds) by the least-squares sum of point and seed effect."""
     known = np.isfinite(values)
     if known.all():
@@ -245,7 +245,7 @@ def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans
 
 class _MeasureData:
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
-        self.factors = varied(study)
+        self.factors = varied_factors(study)
         points, values = _values_by_point_and_seed(rows, measure)
         seen = np.isfinite(values)
         self.runs = seen.sum(axis=1)
@@ -254,7 +254,7 @@ class _MeasureData:
         if self.is_empty:
             return
         used = np.ix_(known, seen.any(axis=0))
-        self.table = filled(values[used])
+        self.table = fill_missing(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [levels_of(f, c) for f, c in zip(self.factors, columns, strict=True)]
         self.model: Factorial | LevelModel | None
@@ -362,7 +362,7 @@ def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return found
 
 
-def varied(study: Study) -> list[Factor]:
+def varied_factors(study: Study) -> list[Factor]:
     return [factor for factor in study.factors if len(factor.listed()) > 1]
 
 

@@ -44,9 +44,9 @@ MIN_SHARE = 0.9
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
 _REST_S, _JUDGED_S = 1.5, 0.8  # s, from the press to the judged time; length of that time
-_CALM_S = 0.1  # s, from the end of the swing until the hand is at rest
+_HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_DEPTH, _DEVICE_SHARE = 0.02, 0.6  # m; share of the device's peak force that is used
-_SLIP_SPEED = 1e-3  # m/s, of the leaf; Drake's default
+_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _LOW_PASS_DELAY = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
 _MIN_GAMMA, _RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _LINEAR_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
@@ -86,7 +86,7 @@ class Settings:
         )
 
 
-def settings_of(values: Values) -> Settings:
+def settings_from_values(values: Values) -> Settings:
     names = [entry.name for entry in dataclasses.fields(Settings)]
     return Settings(**{name: values[name] for name in names})  # type: ignore[arg-type]
 
@@ -108,8 +108,9 @@ class StationTrial:
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
-        as_given = values["method"] == AS_GIVEN
-        scenario = self.given if as_given else settings_of(values).apply(self.base, self.stated)
+        scenario = self.given
+        if values["method"] != AS_GIVEN:
+            scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base.channel
         task = short_task(sum(line.delay for line in channel.lines()))
@@ -121,7 +122,7 @@ class StationTrial:
             task=task,
             depth=press_depth(self.base, grip),
         )
-        setup = replace(setup, sheet_spring__slip=_SLIP_SPEED)
+        setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
@@ -133,7 +134,7 @@ class StationTrial:
         gain = scaling.force_scale * scaling.scales().gamma
         contact = float(result["true_contact_wrench_W"][hold, 2].mean())
         felt = result["force_to_master"][hold, 2]
-        free = (result.t >= task.swung + _CALM_S) & (result.t < task.press)
+        free = (result.t >= task.swung + _HAND_SETTLE_TIME_S) & (result.t < task.press)
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
@@ -165,11 +166,11 @@ class GammaSearch:
     caps: dict[float, float]
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        settings = settings_of(values | {"gamma": 1.0})
+        settings = settings_from_values(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_limit(axis, settings)
-        cap = self.caps[settings.low_pass_hz] * self.stated.aims.margin
+        cap = self.caps[settings.low_pass_hz] * self.stated.requirements.margin
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}

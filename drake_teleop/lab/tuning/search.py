@@ -23,7 +23,7 @@ from drake_teleop.lab.tuning.press_trial import (
     GammaSearch,
     Settings,
     StationTrial,
-    settings_of,
+    settings_from_values,
 )
 
 METHODS = ("none", "ledger", "charged_tdpa", "wave")
@@ -33,7 +33,8 @@ SIGMAS = (0.0, 0.3)
 WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall, at which the limits of the settings are searched."""
 _LOW_PASSES = (100.0, 50.0)  # Hz, below the sensor's own
-_HALVINGS, _CLOSE = 4, 1.15  # of gamma until the station holds; ratio where the bisection ends
+_HALVINGS = 4  # of gamma, until the station is stable
+_BISECTION_RATIO = 1.15  # of unstable to stable gamma, where the bisection ends
 _QUIET_SHARE = 0.8  # share of the largest force at rest that noise may use
 
 Row = dict[str, Any]
@@ -73,7 +74,7 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
     if not base.wrist_sensor.ideal:
-        low_passes += [f for f in _LOW_PASSES if stated.aims.min_low_pass_hz <= f < own]
+        low_passes += [f for f in _LOW_PASSES if stated.requirements.min_low_pass_hz <= f < own]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = 1 / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
     caps = {f: min(_QUIET_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
@@ -92,9 +93,9 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
     for row in candidates:
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _station_limit(settings_of(row), trial, execute)
+        gamma, inside = _station_limit(settings_from_values(row), trial, execute)
         if inside:
-            chosen = dataclasses.replace(settings_of(row), gamma=gamma)
+            chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
@@ -121,7 +122,7 @@ def _station_limit(
     settings: Settings, trial: StationTrial, execute: Execute
 ) -> tuple[float, list[Row]]:
     """Return the largest gamma that is stable in the station with the margin, and its rows."""
-    margin, ends = trial.stated.aims.margin, [c[0] for c in trial.stated.corners]
+    margin, ends = trial.stated.requirements.margin, [c[0] for c in trial.stated.corners]
     hands = list(dict.fromkeys(ends))
     tries = 0
 
@@ -147,7 +148,7 @@ def _station_limit(
         gamma, failed = gamma / 2, gamma
     if not inside:
         return gamma, []
-    while failed > _CLOSE * gamma:
+    while failed > _BISECTION_RATIO * gamma:
         middle = float(np.sqrt(gamma * failed))
         if rows := rows_at(middle):
             gamma, inside = middle, rows
@@ -182,7 +183,7 @@ def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> E
 
 def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
     """Return the row with gamma, reduced by the margin, and the predicted detection threshold."""
-    gamma = row["gamma_limit"] / trial.stated.aims.margin
+    gamma = row["gamma_limit"] / trial.stated.requirements.margin
     human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
     masked = row["sigma_inertia"] * scale * _load_force(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)

@@ -61,7 +61,7 @@ class StatedSet:
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
-    def aims(self) -> TunedTask:
+    def requirements(self) -> TunedTask:
         return TASKS[self.task]
 
 
@@ -90,7 +90,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
     return StatedSet(ordered, (1e3 * min(walls), 1e3 * max(walls)), task)
 
 
-def base_of(scenario: Scenario, network: str | None) -> Scenario:
+def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
     """Return the scenario over this network, without environment, task and passivity method."""
     if network is not None and network not in PRESETS:
         remedy = suggestion(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")

@@ -23,7 +23,7 @@ from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_st
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
 from drake_teleop.lab.tuning.search import Found, holds, search_settings, studies_in
-from drake_teleop.lab.tuning.stated_set import StatedSet, base_of, stated_set
+from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import commented, write_scenario
 
@@ -60,7 +60,7 @@ def tune(
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), stated_set(hands, walls, task)
-    base = base_of(given, network)
+    base = without_task_and_method(given, network)
     make_folder(out)
     shown = progress and not quiet
     with show_progress(shown) as stage:
@@ -113,7 +113,7 @@ def _summary(
         "threshold_N": max(row["threshold_N"] for row in at_edge),
         "given_threshold_N": worst_given if all(map(holds, found.given)) else None,
         "rest_force_N": max(row["rest_force_N"] for row in at_edge),
-        "margin": stated.aims.margin,
+        "margin": stated.requirements.margin,
         "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}
         if failed
         else None,
