@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import subprocess
+import sys
 
 import numpy as np
 import polars as pl
@@ -709,3 +711,29 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
 def test_picture_of_a_shortest_motion_states_its_period(short):
     figure = draw(dataclasses.replace(short, criterion="period"))
     assert figure.axes[3].get_title("left") == "period down to 2.4"
+
+
+def test_coaxial_shapes_of_two_links_take_little_time(tmp_path):
+    """Drake takes 0.1 s for one distance: 150 s of CPU for all postures, 3 s for the first."""
+    model = tmp_path / "arm.xml"
+    model.write_text("""<mujoco model="m"><worldbody><body name="base" pos="0 0 1">
+    <geom type="sphere" size="0.01" mass="1"/><body name="l1">
+    <joint name="j1" axis="0 0 1" range="-90 90" limited="true"/>
+    <geom type="capsule" size="0.08" fromto="0 0 -0.06 0 0 0.06" mass="1"/><body name="l2">
+    <joint name="j2" axis="0 0 1" range="-90 90" limited="true"/>
+    <geom type="sphere" size="0.01" pos="0.3 0 0" mass="1"/><body name="l3">
+    <joint name="j3" axis="0 0 1" range="-90 90" limited="true"/>
+    <geom type="capsule" size="0.06" fromto="0 0 -0.005 0 0 0.005" mass="1"/>
+    <geom type="capsule" size="0.03" fromto="0.2 0 -0.1 0.2 0 0.1" mass="1"/></body></body></body>
+    </body></worldbody></mujoco>""")
+    code = f"""
+import resource
+from pathlib import Path
+from drake_teleop.lab.excitation.robot import RobotFromModel
+from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
+resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+limits = RobotFromModel(Path({str(model)!r}), "l3", WristSensorConfig()).limits
+print(len(limits.capsule_radius), len(limits.pairs))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split()) == (0, ["6", "0"])
