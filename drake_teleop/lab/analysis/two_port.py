@@ -9,8 +9,6 @@ arrays (..., 2, 2), frequencies first; s in rad/s, impedances in N s/m, delays o
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,9 +20,6 @@ from drake_teleop.lab.analysis.one_axis import (
     servo_admittance,
     servo_response,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 def two_port(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
