@@ -115,7 +115,7 @@ def gain_covariance(state: State) -> Array:
 
 
 def factor_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] by other plausible units of the torque."""
+    """Return the covariance (16, 16) of [offsets; phi] caused by an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in similar_factors(state):
         distance = other.x[LOAD] - state.x[LOAD]
@@ -124,7 +124,7 @@ def factor_covariance(state: State) -> Array:
 
 
 def attenuation(state: State) -> Array:
-    """Return the bias (16,) of [offsets; phi] by white noise of the angular acceleration."""
+    """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
     variance = white_noise(data.y[data.used][:, ALPHA]) ** 2
