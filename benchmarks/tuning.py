@@ -33,7 +33,7 @@ from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import GammaSearch, Settings, StationTrial
 from drake_teleop.lab.tuning.search import holds
-from drake_teleop.lab.tuning.stated_set import base_of, stated_set
+from drake_teleop.lab.tuning.stated_set import stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -79,7 +79,7 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     row |= {"sentences": found["sentences"], **found["figures"]}
     names = [entry.name for entry in dataclasses.fields(Settings)]
     settings = Settings(**{name: found["settings"][name] for name in names})
-    base = base_of(scenario, network)
+    base = without_task_and_method(scenario, network)
     search = GammaSearch(base, stated, {})
     axis = OneAxisFromScenario(base, (0.0, 0.0, 1.0))
     axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
@@ -92,7 +92,7 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
     for k in range(draws):
         grip, wall = str(rng.choice(HANDS)), float(np.exp(rng.uniform(low, high)))
         inside.append(rests(grip, wall, settings.gamma, k))
-        beyond = stated.aims.margin * float(rng.uniform(1.0, 1.2))
+        beyond = stated.requirements.margin * float(rng.uniform(1.0, 1.2))
         outside.append(not rests(grip, stated.walls[1], settings.gamma * beyond, k))
     row |= {"inside": float(np.mean(inside)), "outside_fails": float(np.mean(outside))}
     trial = StationTrial(base, base, stated, identified_load(base, False).estimate)

@@ -1,16 +1,4 @@
-"""`drake-teleop calibrate`: guided identification of the load from a live stream.
-
-Files in the output folder, beside those of `identify`:
-
-============= ==================================================================================
-log.parquet   recorded log, for `identify log.parquet`; log.yaml with a table for each stream
-              if the source delivers poses or an IMU
-settling.png  half-widths of the intervals over time, with the advice
-summary.json  that of `identify`, with "tolerance", "known" (by name), "all_known",
-              "half_widths_95" over the tolerances, "doubts" (list of texts), "looks" (number
-              of evaluations)
-============= ==================================================================================
-"""
+"""`drake-teleop calibrate`: guided identification of the load from a live stream."""
 
 from __future__ import annotations
 
@@ -55,13 +43,7 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    Args:
-        source, stream_options: see `open_source`.
-        until: tolerance, see `read_tolerance`.
-        largest: range of the sensor: force [N], torque [N m].
-
-    Raises:
-        DrakeTeleopError: if an argument is invalid, or the record contains no load.
+    `largest` is the range of the sensor: force [N], torque [N m].
     """
     tolerance = read_tolerance(until)
     make_folder(out)
@@ -94,7 +76,7 @@ def calibrate_command(
         "seconds": last.t,
         "looks": len(looks),
         "left_out": recorder.left_out,
-        "began_anew": recorder.began_anew,
+        "clock_changes": recorder.clock_changes,
     }
     write_json(out / "summary.json", summary)
     verdict = "known" if summary["all_known"] else "[bold red]not known[/]"
@@ -104,7 +86,6 @@ def calibrate_command(
 
 
 def shown(at: Evaluation, tolerance: Tolerance) -> Group:
-    """Return the terminal output of an intermediate result: table, problems and advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
@@ -146,7 +127,6 @@ def _verdict(at: Evaluation, k: int) -> str:
 
 
 def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
-    """Draw the half-widths of the 95 % intervals over the tolerances, with the advice."""
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()

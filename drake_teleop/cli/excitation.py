@@ -1,15 +1,4 @@
-"""`drake-teleop excite`: an excitation trajectory for the station's slave or another arm.
-
-=================== ============================================================================
-trajectory.csv      one period at 1 kHz: t [s], then by joint q_NAME, qd_NAME, qdd_NAME [rad, s]
-excitation.yaml     coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
-excitation.png      joint angles, wrench and sensor range, criterion during the search
-excitation.html     3D replay, for inspection before a robot runs the motion
-session.json        design_s, CPU time of the optimiser [s]; the only file that is not reproducible
-summary.json        criteria, checked use of limits, predicted standard deviations, assumptions;
-                    with `until` the tolerance and the share of it `reached`
-=================== ============================================================================
-"""
+"""`drake-teleop excite`: an excitation trajectory for the station's slave or another arm."""
 
 from __future__ import annotations
 
@@ -73,22 +62,13 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Design, check and write an excitation trajectory.
+    """Design, check and write an excitation trajectory; return the content of both JSON files.
 
     Args:
-        scenario: name or file of the scenario with slave and wrist sensor.
         model: model file of another arm, with the scenario's sensor.
         sensor_frame: name of the sensor's frame, required with `model`.
-        until: tolerance, see `read_tolerance`; replaces criterion, period and seconds.
-        package_paths, acceleration, payload: see `RobotFromModel`.
-        criterion, period, harmonics, seconds, seed: see `excite`.
+        until: tolerance, which replaces criterion, period and seconds.
         quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The content of summary.json and session.json.
-
-    Raises:
-        DrakeTeleopError: for unusable input, or if no trajectory respects all limits.
     """
     tolerance = None if until is None else read_tolerance(until)
     setup = LoadScenario(scenario)
@@ -100,7 +80,7 @@ def excite_command(
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
             raise DrakeTeleopError(
-                "the model does not say where the sensor is",
+                "is missing, and the model does not contain the sensor's position",
                 where="--sensor-frame",
                 remedy="name the frame or link at which it measures",
             )
@@ -164,7 +144,6 @@ def _refuse(*options: object) -> None:
 
 
 def summarise(found: Excitation) -> dict[str, Any]:
-    """Return the content of summary.json."""
     robot, trajectory = found.robot, found.trajectory
     names = (*_OFFSETS, *_PHI)
     return {
@@ -204,7 +183,6 @@ def table(found: Excitation) -> pl.DataFrame:
 
 
 def draw(found: Excitation) -> Figure:
-    """Draw joint angles, wrench of the heaviest load with its limit, and the criterion."""
     with plot_style():
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))

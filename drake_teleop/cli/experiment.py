@@ -24,16 +24,9 @@ def experiment_command(
     simulated: int = 0,
     **page: Any,
 ) -> pl.DataFrame:
-    """Continue an experiment and return the table of `write_results`.
+    """Continue an experiment and return its result table.
 
-    Args:
-        participant: its number; default: the first with trials left, or a new one.
-        simulated: total number of simulated participants; 0 for people.
-        page: options of the page, see `drive`.
-
-    Raises:
-        DrakeTeleopError: for an invalid file, or a folder with other contents.
-        KeyboardInterrupt: after the results have been written.
+    `simulated` is the total number of simulated participants, 0 for people.
     """
     experiment, scenarios = LoadExperiment(study)
     with open_results(out, experiment) as store:
@@ -43,7 +36,7 @@ def experiment_command(
             else:
                 from drake_teleop.live.experiment.server import serve_experiment
 
-                number = whose_turn(store, len(trials_of(experiment, 1)), participant)
+                number = next_participant(store, len(trials_of(experiment, 1)), participant)
                 serve_experiment(experiment, scenarios, store, number, **page)
         finally:
             table = write_results(experiment, store)
@@ -51,11 +44,8 @@ def experiment_command(
     return table
 
 
-def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """Return a participant's number: the requested one, the first with trials left, or a new one.
-
-    `trials`: number of trials of each participant.
-    """
+def next_participant(store: Store, trials: int, wanted: int | None = None) -> int:
+    """Return a participant's number: the requested, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
     known = store.participants()

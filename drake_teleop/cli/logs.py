@@ -49,11 +49,7 @@ def identify_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Identify the load of a log, write the results into `out`, return the summary.
-
-    Files: identification.json, summary.json (docs/log-summaries.md), report.html, fit.png,
-    knowledge.png, and report.png with both pictures. With a `gripper` file also object.json.
-    """
+    """Identify the load of a log, write the results into `out`, return the summary."""
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
@@ -115,13 +111,7 @@ def eliminate_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Write contact_wrench.parquet, contact_wrench.png and summary.json; return the summary.
-
-    The table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
-    `non_contact_f_x` and `measured_f_x` (without offsets); with `causal` (see `eliminate_log`) also
-    `causal_contact_f_x` and `causal_scaled_f_x`. The column `in_contact` is true in contact, `edge`
-    at samples without a decision.
-    """
+    """Write contact_wrench.parquet, contact_wrench.png and summary.json; return the summary."""
     load_file = Identification.load(load)
     scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
     scales |= dict(sigma_weight=sigma_weight, sigma_inertia=sigma_inertia)
@@ -200,11 +190,7 @@ def detect_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Write detection.parquet, detection.png and summary.json; return the summary.
-
-    The table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and `edge`,
-    which is true at samples without a decision. docs/detection.md describes the summary.
-    """
+    """Write detection.parquet, detection.png and summary.json; return the summary."""
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated
     summary = common_figures(log, eliminated, cutoff_hz, eliminated.delay_s) | {

@@ -13,7 +13,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from drake_teleop.common.config import in_short
+from drake_teleop.common.config import short_text
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir, studies_dir
 from drake_teleop.common.registry import REGISTRIES
@@ -23,7 +23,6 @@ class Utf8Path(click.Path):
     """Parameter type of paths with UTF-8 names, which all libraries accept."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path, or fail with a one-line message."""
         path = super().convert(value, param, ctx)
         try:
             str(path).encode()
@@ -42,7 +41,6 @@ class ShippedOrPath(Utf8Path):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return the completions of an incomplete name or path."""
         names = sorted(path.stem for path in self._folder.glob("*.yaml"))
         fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
         return fitting + super().shell_complete(ctx, param, incomplete)
@@ -61,11 +59,11 @@ def _check_range(
 ) -> None:
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
-        text = f"{in_short(number)} is outside {in_short(low or 0)} to {in_short(high)}"
+        text = f"{short_text(number)} is outside {short_text(low or 0)} to {short_text(high)}"
         kind.fail(text, param, ctx)
     if low is not None and (number < low or (kind.min_open and number == low)):
         relation = "not above" if kind.min_open else "below"
-        kind.fail(f"{in_short(number)} is {relation} {in_short(low)}", param, ctx)
+        kind.fail(f"{short_text(number)} is {relation} {short_text(low)}", param, ctx)
 
 
 class Number(click.FloatRange):
@@ -76,7 +74,6 @@ class Number(click.FloatRange):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Return the number, or fail with a one-line message."""
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
@@ -90,7 +87,6 @@ class Integer(click.IntRange):
     name = "integer"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the number, or fail with a one-line message."""
         number: int = click.INT.convert(value, param, ctx)
         _check_range(self, number, param, ctx)
         return number
@@ -104,7 +100,6 @@ class Delay(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        """Return the number or "auto", or fail with a one-line message."""
         return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
@@ -120,17 +115,13 @@ class Names(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        """Return the names in the text."""
         if isinstance(value, tuple):
             return value
         return tuple(name.strip() for name in value.split(","))
 
 
 class Registered(click.Choice):
-    """Parameter type: one of the shipped names, or a registered part of this kind.
-
-    The table of the parts is not imported; a script that registers a part has done so.
-    """
+    """Parameter type: one of the shipped names, or a registered part of this kind."""
 
     def __init__(self, kind: str, *shipped: str) -> None:
         super().__init__(shipped)
@@ -138,14 +129,12 @@ class Registered(click.Choice):
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """Names that are allowed at present."""
         table = REGISTRIES.get(self._kind)
         new = () if table is None else (name for name in table if name not in table.shipped)
         return (*self._shipped, *new)
 
     @choices.setter
-    def choices(self, value: tuple[str, ...]) -> None:
-        """Ignore the names that click stores."""
+    def choices(self, value: tuple[str, ...]) -> None: ...
 
 
 class PositiveNumbers(click.ParamType):
@@ -156,7 +145,6 @@ class PositiveNumbers(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """Return the numbers in the text, or fail with a one-line message."""
         if isinstance(value, tuple):
             return value
         return tuple(POSITIVE.convert(part, param, ctx) for part in value.split(","))
@@ -271,18 +259,15 @@ yes = click.option(
 
 
 def load(*, required: bool = False, default: str = "") -> Callable[[Any], Any]:
-    """Return the option `--load`; its help contains the text `default`."""
     text = "identification.json of the load." + (f"  [default: {default}]" if default else "")
     return click.option("--load", type=PATH, required=required, help=text)
 
 
 def sigma(text: str) -> Callable[[Any], Any]:
-    """Return the option `--sigma` with the help `text`."""
     return click.option("--sigma", type=SCALE, default=0.0, show_default=True, help=text)
 
 
 def separate_sigmas(command: Any) -> Any:
-    """Add the options `--sigma-weight` and `--sigma-inertia`."""
     text = "Scale of the load's {} alone.  [default: sigma]"
     for part in ("inertia", "weight"):
         option = click.option(f"--sigma-{part}", type=SCALE, help=text.format(part))
@@ -291,13 +276,11 @@ def separate_sigmas(command: Any) -> Any:
 
 
 def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:
-    """Return the option `--sensor-frame`."""
     text = "Frame or link of the model at which the wrist sensor measures."
     return click.option("--sensor-frame", required=required, metavar="NAME", help=text)
 
 
 def sensor_pose(text: str) -> Callable[[Any], Any]:
-    """Return the option `--sensor-pose` with the help `text`."""
     return click.option(
         "--sensor-pose",
         nargs=6,

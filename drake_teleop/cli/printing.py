@@ -10,7 +10,6 @@ from drake_teleop.load.identification import PARAMETERS
 
 
 def print_identification(summary: dict[str, Any], out: Path) -> None:
-    """Print the identified load and the residuals."""
     from rich.table import Table
 
     table = Table(title=f"Load identified from {Path(summary['log']).name}", title_justify="left")
@@ -66,7 +65,6 @@ def _add_rows(table: Any, rows: list[_Row], identifiable: list[str]) -> None:
 
 
 def print_elimination(summary: dict[str, Any], out: Path) -> None:
-    """Print the residual wrench and the contacts."""
     from rich.table import Table
 
     table = Table(title=f"Contact wrench in {Path(summary['log']).name}", title_justify="left")

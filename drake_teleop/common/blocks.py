@@ -1,8 +1,4 @@
-"""Lifetime, scalar types and fault codes of Drake systems.
-
-A Python `LeafSystem` and its Diagram are never freed if C++ holds a bound method, or, in Python
-3.11, if a subclass has no empty `__slots__`.
-"""
+"""Lifetime, scalar types and fault codes of Drake systems."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""`njit` with a disk cache that processes can share and that detects changed callees in any file.
-
-Each signature has a file, named by a hash of the code of the function and its callees: a pickle
-with machine code. It is loaded only if it belongs to the user, to root or to the owner of this
-package, and is not world-writable.
-"""
+"""`njit` with a disk cache that processes share and that detects changed callees in any file."""
 
 from __future__ import annotations
 
@@ -34,9 +29,7 @@ _PLAIN_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), n
 def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code.
 
-    Args:
-        borrows: omit reference counting. The function must create no arrays and receive none from
-            callees; its caller owns the arguments.
+    `borrows` omits reference counting: the function must create no arrays.
     """
     # Set in either case, because callees inherit unset options.
     options["_nrt"] = not borrows
@@ -53,11 +46,7 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
 
 
 def call_at(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled function (address, arguments) that calls the function at an address.
-
-    That function has the given argument types, returns nothing and is compiled once, not inlined.
-    Exceptions propagate.
-    """
+    """Return a compiled function (address, arguments) that calls the function at an address."""
 
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
@@ -84,7 +73,6 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
 
 
 def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
-    """Return the address of a function that returns nothing, valid as long as the function."""
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 
@@ -146,7 +134,6 @@ def _is_trusted(file: os.stat_result) -> bool:
 
 
 def fingerprint(dispatcher: Dispatcher) -> str:
-    """Return a hash of the code of a function and its callees."""
     found: set[Any] = {dispatcher}
     pending: list[Any] = [dispatcher]
     while pending:

@@ -27,10 +27,7 @@ _checks_assignments = ContextVar("checks_assignments", default=True)
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
     """Return a dataclass field for a number or, with a list as default, a vector.
 
-    Args:
-        unit: SI unit, "1" if dimensionless.
-        low, high: plausible range, limits included.
-        doc: meaning, with frame and source.
+    `unit` is an SI unit, "1" if dimensionless; `low` and `high` limit the plausible range.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc}
     if isinstance(default, list):
@@ -48,18 +45,14 @@ def choice(
 
 
 def plain(default: Any, doc: str, registry: Registry[Any] | None = None) -> Any:
-    """Return a dataclass field for a flag, word, integer, list or mapping of names.
-
-    With a registry of dataclasses the field contains these.
-    """
+    """Return a dataclass field for a flag, word, integer, list or mapping of names."""
     metadata = {"doc": doc, "registry": registry}
     if isinstance(default, (list, dict)):
         return dataclasses.field(default_factory=lambda: type(default)(default), metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def in_short(value: Any) -> str:
-    """Return a short text of a value for a message."""
+def short_text(value: Any) -> str:
     if value is None:
         return "nothing"
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -69,19 +62,10 @@ def in_short(value: Any) -> str:
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Check field names and types of parsed YAML against a dataclass.
-
-    Args:
-        data: mappings, sequences, scalars; the key "_tag" contains a mapping's tag.
-        where: `file` or `file:field`.
-        tagged: whether a tag may select one of several dataclasses.
-
-    Raises:
-        DrakeTeleopError: for an unknown field, or a value of the wrong type.
-    """
+    """Check field names and types of parsed YAML against a dataclass."""
     if not isinstance(data, dict):
         raise DrakeTeleopError(
-            f"expected a mapping of fields, found {in_short(data)}",
+            f"expected a mapping of fields, found {short_text(data)}",
             where=where,
             remedy=f"the fields are {', '.join(_field_names(schema))}",
         )
@@ -99,7 +83,6 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
 
 
 def check_name(schema: type, name: Any, where: str) -> None:
-    """Raise DrakeTeleopError, with a similar name, if the dataclass has no field `name`."""
     names = _field_names(schema)
     if name not in names:
         remedy = suggestion(name, names, f"fields: {', '.join(names)}")
@@ -114,11 +97,7 @@ def check_field(schema: type, name: str, value: Any, where: str) -> None:
 
 
 def check_ranges(config: Any, where: str) -> None:
-    """Check all values of a dataclass, recursively.
-
-    Raises:
-        DrakeTeleopError: for a wrong type or length, or a value outside its range or choices.
-    """
+    """Check types, lengths, ranges and choices of all values of a dataclass, recursively."""
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), field_place(where, field.name)
@@ -154,7 +133,8 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
     for number in values:
         if not low <= number <= high:  # also false for NaN
             raise DrakeTeleopError(
-                f"{in_short(number)}{unit} is outside {in_short(low)} to {in_short(high)}{unit}",
+                f"{short_text(number)}{unit} is outside "
+                f"{short_text(low)} to {short_text(high)}{unit}",
                 where=place,
                 remedy=f"check the value and its unit ({metadata['doc']})",
             )
@@ -195,7 +175,6 @@ class Kind(NamedTuple):
 
 @functools.cache
 def kind_of(hint: Any) -> Kind:
-    """Return the structure of a type hint."""
     if typing.get_origin(hint) is list:
         inner = kind_of(typing.get_args(hint)[0])
         return Kind(inner.lists + 1, inner.items, False)
@@ -280,8 +259,6 @@ class FieldInfo:
         kind: "number", "whole number", "true or false", "word" or "block" (a dataclass), of the
             innermost items.
         lists: number of nested lists, 0 for one value.
-        length: required length of the list, or None.
-        optional: whether the value may be null.
         by_name: whether the value is a mapping of names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.
         low, high: range of a quantity, limits included.
@@ -305,7 +282,6 @@ class FieldInfo:
 
     @property
     def range(self) -> str:
-        """Text of the allowed range, words or dataclasses."""
         if self.unit:
             unit = "" if self.unit == "1" else f" {self.unit}"
             return f"{self.low:.7g} to {self.high:.7g}{unit}"
@@ -315,7 +291,6 @@ class FieldInfo:
 
     @property
     def text(self) -> str:
-        """Line of a help text for the field."""
         metadata = [self.range] if self.range else []
         if self.default is None or self.kind != "block":
             metadata.append(f"default {_shown(self.default)}")
@@ -340,7 +315,6 @@ def _changed_fields(self: Any) -> str:
 
 
 def _changed_lines(config: Any) -> Iterator[str]:
-    """Yield a line for each field that differs from its default."""
     for entry in dataclasses.fields(config):
         value = getattr(config, entry.name)
         if value == _default(entry):
@@ -369,7 +343,7 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 
 @contextmanager
 def unchecked_assignments() -> Iterator[None]:
-    """Leave values unchecked, for a reader that checks the whole with the places in its file."""
+    """Disable the checks of assigned values in this context."""
     token = _checks_assignments.set(False)
     try:
         yield
@@ -378,10 +352,7 @@ def unchecked_assignments() -> Iterator[None]:
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
-    """Return the descriptions of the fields of a settings dataclass or instance.
-
-    For an inner block pass the outer field's `default`.
-    """
+    """Return the descriptions of the fields of a settings dataclass or instance."""
     return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 
 

@@ -54,7 +54,6 @@ def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = 
 
 @contextmanager
 def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read") -> Iterator[None]:
-    """Convert any error while reading a file to DrakeTeleopError."""
     try:
         with silent_stderr():  # a panic in polars writes pages from another thread
             yield
@@ -69,10 +68,7 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
 
 
 def refuse_fork() -> None:
-    """Raise DrakeTeleopError in a process forked after the first call: polars would hang there.
-
-    Call this before polars reads or writes.
-    """
+    """Raise DrakeTeleopError in a process forked after the first call: polars would hang there."""
     _POLARS_PROCESS.append(os.getpid())
     del _POLARS_PROCESS[1:]
     if [os.getpid()] != _POLARS_PROCESS:
@@ -94,7 +90,6 @@ def install_extra(name: str) -> str:
 
 
 def require_library(module: str, library: str, extra: str, where: str) -> None:
-    """Raise DrakeTeleopError if a module is missing, which the optional `extra` installs."""
     if importlib.util.find_spec(module) is None:
         what = f"needs the library {library}, which is not installed"
         raise DrakeTeleopError(what, where=where, remedy=install_extra(extra))

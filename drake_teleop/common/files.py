@@ -1,7 +1,4 @@
-"""Output files, each complete or absent, and folders of shipped files.
-
-A file is written under another name and then renamed; after a failure the previous one remains.
-"""
+"""Output files, each complete or absent, and folders of shipped files."""
 
 from __future__ import annotations
 
@@ -37,13 +34,7 @@ class CannotWrite(DrakeTeleopError):
 def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -> Iterator[Path]:
     """Yield a temporary name to write under; then rename the file to `path`.
 
-    Args:
-        aside: the temporary file is beside this path, for a `path` in a folder that is read as one
-            table.
-        shared: the temporary name is unique, because other processes may write the same file now.
-
-    Raises:
-        CannotWrite: if writing fails; `path` is then unchanged.
+    After a failure `path` is unchanged. With `shared` several processes may write the file.
     """
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -59,7 +50,6 @@ def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -
 
 @contextmanager
 def wrap_write_errors(path: Path) -> Iterator[None]:
-    """Convert OSError to CannotWrite with the file's name."""
     try:
         yield
     except OSError as error:
@@ -67,7 +57,6 @@ def wrap_write_errors(path: Path) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text in UTF-8."""
     with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -78,7 +67,6 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def write_picture(path: Path, figure: Figure, **options: Any) -> None:
-    """Write a figure in the format of the file's extension."""
     with whole_file(path) as temporary:
         figure.savefig(temporary, format=path.suffix.removeprefix("."), **options)
 
@@ -102,15 +90,7 @@ def write_table(
 def output_folder(
     out: Path, last: str = "summary.json", *, kept: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create a command's output folder; the output is complete when the file `last` exists.
-
-    Args:
-        last: final file; one of an earlier command is removed first.
-        kept: earlier files that remain, for the error message.
-
-    Raises:
-        CannotWrite: if writing fails; the message lists the files written before.
-    """
+    """Create a command's output folder; the output is complete when the file `last` exists."""
     make_folder(out)
     with wrap_write_errors(out / last):
         (out / last).unlink(missing_ok=True)
@@ -124,7 +104,6 @@ def output_folder(
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder with its parents; raise CannotWrite if it is not writable."""
     remedy = "give another folder"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -136,14 +115,7 @@ def make_folder(folder: Path) -> None:
 
 
 def set_aside(*paths: Path) -> Path | None:
-    """Move existing recordings into a new folder `earlier-1`, `earlier-2`, ... beside them.
-
-    Returns:
-        The new folder; None if no recording exists.
-
-    Raises:
-        CannotWrite: if they cannot be moved.
-    """
+    """Move existing recordings into a new folder `earlier-1`, `earlier-2`, ... and return it."""
     existing = [path for path in paths if path.exists()]
     if not existing:
         return None
@@ -157,7 +129,6 @@ def set_aside(*paths: Path) -> Path | None:
 
 
 def part_of_log(folder: Path, first_row: int) -> Path:
-    """Return the path of the log file that begins with a given row."""
     return folder / _PART_NAME.format(first_row)
 
 
@@ -169,7 +140,7 @@ def remove_log(path: Path) -> None:
     parts = sorted(path.glob(PARTS_OF_LOG))
     if others := sorted(set(path.iterdir()) - set(parts)):
         raise DrakeTeleopError(
-            f"holds {others[0].name}, which is no part of a log",
+            f"contains {others[0].name}, which is not part of a log",
             where=str(path),
             remedy="give another folder for the log",
         )
@@ -211,16 +182,13 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def models_dir() -> Path:
-    """Return the folder of the shipped models."""
     packaged = _PACKAGE / "models"
     return packaged if packaged.is_dir() else _PACKAGE.parent / "models"
 
 
 def scenarios_dir() -> Path:
-    """Return the folder of the shipped scenarios."""
     return _PACKAGE / "station" / "scenarios"
 
 
 def studies_dir() -> Path:
-    """Return the folder of the shipped studies."""
     return _PACKAGE / "lab" / "studies"

@@ -1,7 +1,4 @@
-"""Self-contained HTML pages with a common style, and their Content-Security-Policy.
-
-Pages run only their own scripts, and load nothing.
-"""
+"""Self-contained HTML pages with a common style, and their Content-Security-Policy."""
 
 from __future__ import annotations
 
@@ -18,9 +15,7 @@ import jinja2
 def render(package: str, template: str, **values: Any) -> str:
     """Return the page of a Jinja template, which may extend page.html.j2.
 
-    Args:
-        package: package of the template, such as "drake_teleop.logs".
-        values: template variables, escaped; a missing one is an error.
+    `values` are escaped; a missing one is an error.
     """
 
     def source(name: str) -> str:

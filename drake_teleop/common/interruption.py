@@ -1,8 +1,4 @@
-"""Handling of SIGINT and SIGTERM where C code would lose the KeyboardInterrupt.
-
-C code that calls Python can drop an exception, e.g. llvmlite in a callback of the compiler and
-imports in that of a weak reference, or replace it, e.g. rclpy in the constructor of a message.
-"""
+"""Handling of SIGINT and SIGTERM where C code would lose the KeyboardInterrupt."""
 
 from __future__ import annotations
 

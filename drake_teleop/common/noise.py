@@ -20,7 +20,7 @@ def random_bits(key, counter):
 
 @njit(cache=True)
 def random_normal(key, counter):
-    """Return a standard normal number (Box and Muller); arguments: see `random_bits`."""
+    """Return a standard normal number (Box and Muller), with arguments as for `random_bits`."""
     u = (float(random_bits(key, 2 * counter)) + 1.0) * 2.0**-53
     angle = 2.0 * math.pi * float(random_bits(key, 2 * counter + 1)) * 2.0**-53
     return math.sqrt(-2.0 * math.log(u)) * math.cos(angle)

@@ -15,15 +15,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 
 def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
-    """Return `value` as a finite float64 array.
-
-    Args:
-        name: argument name for the error message.
-        leading: allow further dimensions in front of `shape`.
-
-    Raises:
-        DrakeTeleopError: if `value` is not numeric, has another shape, or is not finite.
-    """
+    """Return a finite float64 array of this shape; `leading` allows more dimensions in front."""
     expected = ", ".join(["..."] * leading + [str(n) for n in shape])
     expected = f"({expected},)" if len(shape) == 1 and not leading else f"({expected})"
     array = numbers(name, value, f"give an array of shape {expected}")
@@ -51,14 +43,7 @@ def numbers(name: str, value: ArrayLike, remedy: str = "") -> Array:
 
 
 def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
-    """Return the common leading shape, and each array as a contiguous table (N, n).
-
-    Args:
-        arrays: for each name an array (..., n) and n.
-
-    Raises:
-        DrakeTeleopError: see `checked`, or if the leading shapes do not match.
-    """
+    """Return the common leading shape, and each array (..., n) as a contiguous table (N, n)."""
     tables = {name: checked(name, value, n, leading=True) for name, (value, n) in arrays.items()}
     try:
         leading = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))
@@ -87,7 +72,6 @@ def number(name: str, value: Any) -> float:
 
 
 def check_identified(name: str, phi: Array) -> Array:
-    """Return the load parameters `phi` (10,); raise DrakeTeleopError if all are zero."""
     if not phi.any():
         raise DrakeTeleopError(
             "is zero throughout, so this load is not identified",
@@ -125,7 +109,6 @@ def runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
-    """Return the time spans (start, stop) in which `contact` (N,) is true; `t` (N,): times."""
     times = np.asarray(t, float)
     return [(float(times[a]), float(times[b - 1])) for a, b in runs(np.asarray(contact, bool))]
 

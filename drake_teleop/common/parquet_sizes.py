@@ -1,9 +1,4 @@
-"""Check of the sizes in a Parquet file, to be made before each read by polars.
-
-A damaged size can make polars abort the process without an exception. Format:
-https://github.com/apache/parquet-format; metadata are structs in Thrift's compact protocol with the
-field numbers of `parquet.thrift`.
-"""
+"""Check of the sizes in a Parquet file: a damaged size can make polars abort the process."""
 
 from __future__ import annotations
 
@@ -26,15 +21,7 @@ _Struct = dict[int, Any]
 
 
 def check_parquet(path: Path) -> None:
-    """Reject a Parquet file whose sizes would abort the process.
-
-    Args:
-        path: one file, not a folder.
-
-    Raises:
-        ValueError: for a wrong size; with the column and the number.
-        OSError: if the file cannot be opened.
-    """
+    """Raise ValueError, with column and number, if sizes in a Parquet file are wrong."""
     with path.open("rb") as file:
         if not file.read(1):
             raise ValueError("it is empty")
@@ -43,7 +30,6 @@ def check_parquet(path: Path) -> None:
 
 
 def check_parquet_content(content: bytes | mmap.mmap) -> None:
-    """Raise ValueError if sizes in a Parquet file's content are wrong."""
     try:
         _check(content)
     except (IndexError, KeyError, TypeError, AttributeError, UnicodeDecodeError):

@@ -15,18 +15,13 @@ Stage: TypeAlias = Callable[[str], Progress]
 
 
 def silent(name: str) -> Progress:
-    """Return a progress function that shows nothing, for a stage of any name."""
+    """Return a progress function that shows nothing."""
     return lambda fraction, words="": None
 
 
 @contextmanager
 def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Stage]:
-    """Yield a `Stage` that shows progress within the context.
-
-    Args:
-        progress: whether to show it, or the `Stage` of the caller.
-        after: time until a bar or line appears [s].
-    """
+    """Yield a `Stage` that shows progress in this context, after `after` seconds."""
     if callable(progress):
         yield progress
     elif not progress:

@@ -33,12 +33,7 @@ class Registry(dict[str, _Part]):
         REGISTRIES[kind] = self
 
     def register(self, name: str, part: _Part | None = None) -> Any:
-        """Add a part, or decorate its definition; an earlier part of this name is replaced.
-
-        Raises:
-            DrakeTeleopError: for the name of a shipped part, or a name with other characters than
-                letters, digits and `._-`.
-        """
+        """Add a part, or decorate its definition; an earlier part of this name is replaced."""
         if part is None:
             return partial(self.register, name)
         if not isinstance(name, str) or not re.fullmatch(r"[.\w][\w.-]*", name, re.ASCII):
@@ -48,15 +43,18 @@ class Registry(dict[str, _Part]):
                 remedy="use only letters, digits, _ . -, first a letter, digit, _ or .",
             )
         if name in self.shipped:
-            raise DrakeTeleopError(f"'{name}' is shipped", where=self.kind, remedy="rename yours")
+            raise DrakeTeleopError(
+                f"'{name}' is a part of drake_teleop", where=self.kind, remedy="use another name"
+            )
         self[name] = part
         return part
 
     def remove(self, name: str) -> None:
-        """Remove a registered part; raise DrakeTeleopError if there is none of this name."""
         if name in self.shipped:
             raise DrakeTeleopError(
-                f"'{name}' is shipped", where=self.kind, remedy="remove only registered parts"
+                f"'{name}' is a part of drake_teleop",
+                where=self.kind,
+                remedy="remove only registered parts",
             )
         del self[self.check(name)]
 
@@ -76,11 +74,7 @@ class Registry(dict[str, _Part]):
 
 
 def register_from(script: Path) -> None:
-    """Import a Python file that registers parts, here and in the processes of studies.
-
-    Raises:
-        DrakeTeleopError: if it is not a Python file, has the name of a module, or fails.
-    """
+    """Import a Python file that registers parts, here and in the processes of studies."""
     script = script.absolute()
     if script.suffix != ".py" or not script.is_file():
         raise DrakeTeleopError(

@@ -23,7 +23,7 @@ EULER_AXES = tuple(
 
 
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
-    """Return rotation matrices (N, 3, 3) from columns (N, WIDTHS[form]), without normalization.
+    """Return rotation matrices (N, 3, 3) from columns of a named form, without normalization.
 
     Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad].
     """

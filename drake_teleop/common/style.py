@@ -49,7 +49,6 @@ _STYLE: dict[Any, Any] = {
 
 
 def plot_style() -> AbstractContextManager[None]:
-    """Return a context with the common fonts, colours and grid."""
     return mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
 
 

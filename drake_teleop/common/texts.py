@@ -1,8 +1,7 @@
 """YAML and JSON files as plain data, without ambiguity.
 
 YAML has the core schema of version 1.2: `1:30` and `yes` are strings, `1e-3` is a number. Repeated
-or non-string keys, integers with leading 0 (octal in YAML 1.1) or beyond 64 bits, and huge files
-are rejected. Tags never execute code.
+keys and huge files are rejected. Tags never execute code.
 """
 
 from __future__ import annotations
@@ -74,19 +73,11 @@ for _kind, _, _first in _CORE_SCHEMA:
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
-    """Return the data of a YAML file.
-
-    Args:
-        tagged: allow tags of mappings, such as `!Touch`, returned under the key "_tag".
-
-    Raises:
-        DrakeTeleopError: for invalid YAML; with file, field and line.
-    """
+    """Return the data of a YAML file; with `tagged` a mapping's tag is under the key "_tag"."""
     return yaml_data(read_text(path), str(path), tagged=tagged)
 
 
 def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
-    """Return the data of a YAML text; `where` is its place for messages."""
     try:
         node = yaml.compose(text, _Loader)
         return None if node is None else _NodeConverter(tagged).data(node, where)
@@ -106,12 +97,7 @@ def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
 def yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """Return YAML that `read_yaml` reads as the same data; raise DrakeTeleopError if impossible.
-
-    Args:
-        head: comment lines at the top.
-        comments: comments at line ends, by field, "block.field".
-    """
+    """Return YAML that `read_yaml` reads as the same data, with comments by field."""
     lines, place, left = [f"# {one_line(text)}" for text in head], list[str](), comments or {}
     for line in yaml_scalar(data, flow=None).splitlines():
         inner = line.lstrip(" ")
@@ -170,7 +156,6 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_text(path: str | Path) -> str:
-    """Return the text of a file; raise DrakeTeleopError if unreadable or not UTF-8."""
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

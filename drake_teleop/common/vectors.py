@@ -1,7 +1,6 @@
 """Vectors of 3, rotation matrices of 9 numbers (by rows) and unit quaternions for compiled code.
 
-The functions allocate no memory. In Python those of vectors accept any scalar type of Drake. Sums
-are evaluated from left to right. Quaternions are tuples (w, x, y, z).
+The functions allocate no memory. Quaternions are tuples (w, x, y, z).
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ def rows(R):
 
 @register_jitable
 def transposed(R):
-    """Return the transpose of a matrix of 9 numbers."""
     return R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]
 
 
@@ -49,44 +47,38 @@ def add_into(x, i, a):
 
 @register_jitable
 def put(x, i, a, j, n):
-    """Copy n numbers from index j of a to index i of x (faster than a slice assignment)."""
+    """Copy n numbers from index j of a to index i of x."""
     for k in range(n):
         x[i + k] = a[j + k]
 
 
 @register_jitable
 def plus(a, b):
-    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @register_jitable
 def minus(a, b):
-    """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @register_jitable
 def times(k, a):
-    """Return the product k a of a number and a vector."""
     return k * a[0], k * a[1], k * a[2]
 
 
 @register_jitable
 def dot(a, b):
-    """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @register_jitable
 def cross(a, b):
-    """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @register_jitable
 def plus_cross(c, a, b):
-    """Return c + a x b."""
     return (
         c[0] + a[1] * b[2] - a[2] * b[1],
         c[1] + a[2] * b[0] - a[0] * b[2],
@@ -157,13 +149,11 @@ def multiply(a, b):
 
 @njit(cache=True)
 def conjugate(a):
-    """Return the quaternion of the inverse rotation."""
     return (a[0], -a[1], -a[2], -a[3])
 
 
 @njit(cache=True)
 def rotate(a, v):
-    """Return the vector v, rotated by the quaternion a."""
     axis = three(a, 1)
     t = times(2.0, cross(axis, v))
     return plus_cross(plus(v, times(a[0], t)), axis, t)
@@ -191,7 +181,6 @@ def logarithm(a):
 
 @njit(cache=True)
 def normalized(a):
-    """Return the unit quaternion a / |a|."""
     scale = 1.0 / math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     return (scale * a[0], scale * a[1], scale * a[2], scale * a[3])
 

@@ -1,4 +1,4 @@
-"""Identification of the load in simulation from wrist sensor samples alone (paper, section IV)."""
+"""Identification of the load in simulation from samples of the wrist sensor (paper, section IV)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class LoadIdentification:
     Attributes:
         estimate: (16,) final recursive estimate of Eq. (7): sensor offsets [N, N m], then phi.
         batch: estimate by batch total least squares from the same record.
-        kappa_w10: criterion of the trajectory, see `excitation.criteria`.
+        kappa_w10: condition number of the excitation, see `excitation.criteria`.
         real_time_factor: simulated time over elapsed time.
     """
 
@@ -76,7 +76,7 @@ class LoadIdentification:
         )
 
     def noise_floor(self, arm: ArmModel) -> NoiseFloor:
-        """Return the contact wrench's noise floor, fitted to this contact-free motion."""
+        """Return the noise floor of the contact wrench, fitted to this motion without contact."""
         usable = self.result["saturated"][:, 0] == 0
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
@@ -93,21 +93,18 @@ class LoadIdentification:
 
 
 def slave_arm(scenario: Scenario) -> ArmModel:
-    """Return the model of the slave's arm, with tool and payload as its load."""
+    """Return the model of the slave's arm with tool and payload as its load."""
     check_scenario(scenario)
     return NominalSlave(scenario.slave).arm
 
 
 def true_load(scenario: Scenario) -> Array:
-    """Return the true load (16,): zero sensor offsets, then the inertial parameters phi."""
+    """Return (16,): zero sensor offsets, then the true parameters phi of tool and payload."""
     return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """Return the shipped scenario "identification" with slave and sensor of `scenario`.
-
-    With contact detection the log has the estimator's rate.
-    """
+    """Return the shipped scenario "identification" with slave and sensor of `scenario`."""
     check_scenario(scenario)
     rates = scenario.rates
     if scenario.contact_detection is not None:
@@ -174,13 +171,7 @@ def identify_load(
 def batch_identification(
     scenario: Scenario, wrench: Array, s: Array, omega: Array, alpha: Array, rate_hz: float
 ) -> Identification:
-    """Identify the load, and the offsets at the start of the record, by total least squares.
-
-    Args:
-        wrench: (N, 6) samples of the wrist sensor, in S.
-        s, omega, alpha: (N, 3) samples of the sensor's specific force and angular motion, in S.
-        rate_hz: rate of the samples.
-    """
+    """Identify load and sensor offsets by total least squares from N samples in S."""
     sensor, rates = scenario.wrist_sensor, scenario.rates
     motion = estimated_motion_std(
         scenario.motion_estimation, sensor, slave_arm(scenario).num_joints, 1 / rates.sensor_hz
@@ -213,7 +204,7 @@ def _design_trajectory(scenario: Scenario, stage: Stage) -> tuple[FourierTraject
 def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         raise DrakeTeleopError(
-            f"it moves {len(trajectory.q0)} joints, the arm has {robot.arm.num_joints}",
+            f"it has {len(trajectory.q0)} joints, the arm {robot.arm.num_joints}",
             where="trajectory",
             remedy="compute a trajectory for this arm",
         )
@@ -233,7 +224,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
 def simulate_with_timing(
     station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
-    """Simulate a station; return the result, and simulated time over elapsed time."""
+    """Return the result of a simulation, and simulated time over elapsed time."""
     start = time.perf_counter()
     result = simulate(station, simulation, progress=progress, log=log)
     elapsed = time.perf_counter() - start
@@ -241,7 +232,7 @@ def simulate_with_timing(
 
 
 def sensor_samples(result: SimulationResult) -> tuple[Array, Array, Array, Array]:
-    """Return the wrist sensor's samples in S: wrench (N, 6), s, omega and alpha (N, 3)."""
+    """Return wrench (N, 6), specific force, angular velocity and acceleration (N, 3), all in S."""
     return (
         result["measured_wrench_S"],
         result["specific_force_S"],

@@ -58,13 +58,7 @@ def identified_load(
 ) -> IdentifiedLoad:
     """Return the load of a scenario from the cache, or identify and cache it.
 
-    Args:
-        progress: True shows progress bars; or a `Stage` that receives the progress.
-        fresh: True ignores the cached load.
-        folder: cache folder; None: `cache_folder()`.
-
-    Raises:
-        DrakeTeleopError: for the reasons of `identify_load`; errors of cache files are ignored.
+    `fresh` ignores the cached load. Errors of cache files are ignored.
     """
     check_scenario(scenario)
     # Another seed: noise of identification and run must be independent.
@@ -84,7 +78,6 @@ def identified_load(
 
 
 def cache_folder() -> Path:
-    """Return the folder in the variable `CACHE_VARIABLE`, or the user's cache folder."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get(CACHE_VARIABLE) or user_cache_path("drake_teleop", appauthor=False))

@@ -25,7 +25,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-_DURING_RUN = "learnt while it ran"
+_DURING_RUN = "estimated during the run"
 _FINAL_FILES = (
     "sensor_log.parquet",
     "identification.json",
@@ -36,7 +36,7 @@ _FINAL_FILES = (
 
 
 class RecordedDrive(Protocol):
-    """Recorded live session that can be simulated again, see `live.session.read_drive`."""
+    """Recorded live session that can be simulated again."""
 
     @property
     def folder(self) -> Path:
@@ -48,7 +48,7 @@ class RecordedDrive(Protocol):
 
     @property
     def load(self) -> IdentifiedLoad | None:
-        """Load with which the session's station was made; None: it was estimated online."""
+        """Load identified before the session; None if the load was estimated during the session."""
 
     def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
         """Simulate the recorded session again."""
@@ -64,31 +64,22 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run one scenario; write all results into `out` and delete those of an earlier run.
+    """Run one scenario or `drive`; write all results into `out` and delete those of an earlier run.
 
-    Args:
-        scenario: shipped name or YAML file.
-        drive: recorded live session that is simulated instead of `scenario`.
-        seed: replaces the scenario's seed.
-        fresh: True ignores the cached load.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The content of summary.json and session.json.
-
-    Raises:
-        DrakeTeleopError: for an unusable scenario, a joint outside its range, or a failed write.
-        KeyboardInterrupt: its message contains the number of recorded samples.
+    Return the content of summary.json and session.json. The message of a KeyboardInterrupt
+    contains the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
         raise DrakeTeleopError(
-            "a drive has its own seed and load",
+            "a recorded drive contains its seed and load, which cannot be replaced",
             where="run --inputs",
             remedy="remove --seed and --fresh",
         )
     if drive is not None and out.resolve() == drive.folder.resolve():
         raise DrakeTeleopError(
-            "is the folder of the drive", where=str(out), remedy="give another --out"
+            "is the folder of the recorded drive, which the results would replace",
+            where=str(out),
+            remedy="give another --out",
         )
     from drake_teleop.station.replay import write_replay  # needs Matplotlib
 
@@ -187,7 +178,7 @@ def _repeat_drive(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioR
     result = drive.repeat(progress("Repeat the drive"), log)
     factor = drive.scenario.simulation.duration / (time.perf_counter() - start)
     identification = None if drive.load is None else drive.load.identification
-    return ScenarioRun(drive.scenario, result, identification, "of the drive", factor)
+    return ScenarioRun(drive.scenario, result, identification, "from the recorded drive", factor)
 
 
 def _describe_log(log: Path) -> str:

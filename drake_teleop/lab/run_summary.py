@@ -1,23 +1,4 @@
-"""Summary and overview picture of a run. `summary.json` contains, besides the scenario:
-
-=========================== =====================================================================
-peak_measured_force_N       largest measured |f| without offsets; also peak_measured_torque_Nm
-peak_contact_force_N        largest contact force from the final load estimate; also ..._torque_Nm
-residual_force_max_N        largest one outside contacts, or null; also residual_torque_max_Nm
-true_contact_s              [start, end] of each contact
-contact_noticed_ms          delay of each detection, or null; also contact_at_hand_ms
-false_contacts              number of detections without true contact
-success, task_time_s, ...   with a task, see `drake_teleop.station.task_measures`
-failure                     with a task: reason of its failure, or null
-peak_force_to_master_N      largest force that the device displayed
-joint_speed_use             largest share of a joint's speed limit; also joint_torque_use
-mass_error_percent          error of the final estimate; also com_error_mm
-assumed                     values that the models of arm and tool do not contain
-contact_by                  reason why Drake's slower contact results are used
-moved_mm                    displacement of each movable body at the end; also turned_deg
-warnings                    faults and their times, see `drake_teleop.station.run_warnings`
-=========================== =====================================================================
-"""
+"""Summary and overview picture of a run; docs/running.md lists the summary's fields."""
 
 from __future__ import annotations
 
@@ -49,13 +30,7 @@ FILTER_TAIL_S = 0.01
 
 @dataclass(frozen=True, eq=False)
 class ScenarioRun:
-    """Scenario and results of one run.
-
-    Attributes:
-        identification: identified load, or None.
-        load_source: origin of the load, as in session.json.
-        real_time_factor: simulated time over elapsed time.
-    """
+    """Scenario and results of one run; `identification` is the identified load, or None."""
 
     scenario: Scenario
     result: SimulationResult
@@ -65,7 +40,7 @@ class ScenarioRun:
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True in true contact; gaps below `FILTER_TAIL_S` are closed."""
+    """Return (N,) booleans: True in true contact; gaps shorter than `FILTER_TAIL_S` are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -73,11 +48,7 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return the contact wrench (N, 6) [N, N m] of Eq. (13), in S, with the final load estimate.
-
-    Raises:
-        DrakeTeleopError: if no load was identified.
-    """
+    """Return the contact wrench (N, 6) [N, N m] in S, calculated with the final load estimate."""
     estimate = result["load_estimate"][-1]
     check_identified("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)
@@ -85,7 +56,7 @@ def calculated_contact_wrench(result: SimulationResult) -> Array:
 
 
 def summarise(run: ScenarioRun) -> dict[str, Any]:
-    """Return the content of summary.json, except the scenario's name."""
+    """Return the content of summary.json without the scenario's name."""
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
     measured = result["measured_wrench_S"] - estimate[:6]

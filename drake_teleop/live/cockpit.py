@@ -49,10 +49,7 @@ def _columns_at_limit(values, limits):
 
 @njit(cache=True)
 def _add_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Add the work at hand and tool in new rows to `energy` (2,) [J].
-
-    `before` (4,) is [t, p_WS] of the previous row, nan if there is none.
-    """
+    """Add the work at hand and tool in new rows to `energy` (2,) [J]."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -84,12 +81,7 @@ class Cockpit:
         self._forces = np.zeros((3, 2))
 
     def frame(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
-        """Return the page's values for at least one new row, finite and ready for JSON.
-
-        "t" [s]; "f": range of measured, contact and rendered force at the hand [N]; "energy": from
-        the hand into the device, from the tool into the environment [J]; "tool", "stylus":
-        positions [m]; "contact": bool; "words": warnings.
-        """
+        """Return the page's values for at least one new row, finite and ready for JSON."""
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces

@@ -1,9 +1,7 @@
 """Client of a haptic device: sends its pose to the station, displays the force, at 1 kHz.
 
-    python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
-    python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
-
-It is a separate process, so that the station cannot delay its safety functions.
+python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
+python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
 """
 
 from __future__ import annotations
@@ -43,14 +41,13 @@ class Device(Protocol):
     """Interface of a haptic device."""
 
     @property
-    def limits(self) -> Limits:
-        """Limits of force, torque and their slew rates."""
+    def limits(self) -> Limits: ...
 
     def read(self) -> DevicePose | None:
         """Return the next pose; None if none is received for 0.5 s."""
 
     def set(self, wrench: Sequence[float]) -> None:
-        """Render the wrench [f; tau] in the base frame B [N, N m]."""
+        """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
 
     def close(self) -> None:
         """Disconnect the device with zero force."""
@@ -59,9 +56,7 @@ class Device(Protocol):
 class Client:
     """Connection of a haptic device and a station.
 
-    Attributes:
-        guard: safety functions.
-        behind: delay between each device position and the force that answers it [s].
+    `behind` is the delay [s] between each device position and the force that answers it.
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
@@ -121,7 +116,6 @@ class Client:
             return
 
     def close(self) -> None:
-        """Close the device and the socket."""
         self._device.close()
         self._socket.close()
 
@@ -137,7 +131,6 @@ class RealTimeDevice:
         self._due = self._simulated_until = time.perf_counter()
 
     def read(self) -> DevicePose:
-        """See `Device.read`."""
         self._due += _PERIOD_S
         now = time.perf_counter()
         if self._due > now:
@@ -150,11 +143,9 @@ class RealTimeDevice:
         return DevicePose(self.virtual.position)
 
     def set(self, wrench: Sequence[float]) -> None:
-        """See `Device.set`."""
         self._wrench = wrench
 
-    def close(self) -> None:
-        """See `Device.close`."""
+    def close(self) -> None: ...
 
 
 def open_device(address: str, grip: str, depth: float) -> Device:
@@ -169,7 +160,6 @@ def open_device(address: str, grip: str, depth: float) -> Device:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the client until the time is over, Ctrl-C, or the device disconnects."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("device", help="virtual, or haply://HOST:PORT")
     parser.add_argument("station", help="udp://127.0.0.1:PORT")

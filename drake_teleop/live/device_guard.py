@@ -1,11 +1,9 @@
 """Safety functions between force commands and the motors of a haptic device.
 
-* Timeout: the force fades from 20 ms after the last command and is zero at 50 ms. Afterwards its
-  limit rises from zero by 100 N/s.
+* Timeout: the force fades from 20 ms after the last command and is zero at 50 ms.
 * Limits of force, torque and their slew rates.
-* Passivity observer (Hannaford and Ryu 2002) of the stored energy E += -f_k . (x_k+1 - x_k), at
-  most 0.3 J. A force that would return more than E along the extrapolated displacement is reduced,
-  at most to that of a damper of 100 N s/m; 30 uJ cover the extrapolation error.
+* Passivity observer (Hannaford and Ryu 2002): a force that would return more energy than is stored
+  is reduced.
 """
 
 from __future__ import annotations
@@ -53,14 +51,7 @@ class DeviceGuard:
     def tick(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
     ) -> tuple[float, ...]:
-        """Return the wrench to display (6,) [N, N m].
-
-        Args:
-            position: (3,) position of the device [m].
-            wrench: (6,) last commanded wrench [N, N m].
-            age: age of this command [s].
-            period: time since the last tick [s].
-        """
+        """Return the wrench to display (6,) [N, N m]; `age` is the age of the command [s]."""
         x = np.array(position, dtype=float)
         motion = np.zeros(3) if self._position is None else x - self._position
         work = -float(self._force @ motion)

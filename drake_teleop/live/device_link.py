@@ -40,10 +40,6 @@ class DeviceLink:
         refused: number of invalid packets and packets of other senders.
         refusal: reason of the last refusal.
         lost: number of missing or overtaken packets.
-        port: UDP port.
-
-    Raises:
-        DrakeTeleopError: for an address of another machine, or a port in use.
     """
 
     def __init__(self, address: str) -> None:
@@ -98,7 +94,6 @@ class DeviceLink:
         self._force_ages.append(state.behind)
 
     def silent(self, now: float) -> bool:
-        """Return whether no valid packet was received for 50 ms."""
         return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send(self, wrench: np.ndarray) -> None:
@@ -116,7 +111,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return the `Inputs` of the device's pose by name; a silent device releases the hand."""
+        """Return the `Inputs` of the device's pose; a silent device releases the hand."""
         state = self.poll(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -148,7 +143,6 @@ class DeviceLink:
         }
 
     def status_text(self) -> str:
-        """Return the link's state at the last `poll` as text for the page."""
         if not self.refused:
             return self._lateness_text()
         reason = f"the last one {self.refusal}"
@@ -169,7 +163,6 @@ class DeviceLink:
         return text + (f"; {figures['lost']:.0f} packets lost" if figures["lost"] else "")
 
     def close(self) -> None:
-        """Close the port."""
         self._socket.close()
 
 
@@ -183,13 +176,9 @@ def _is_loopback(host: str) -> bool:
 
 
 class DeviceConnection:
-    """Link to a haptic device; for a haply:// address also the client process.
+    """Link to a haptic device at udp://127.0.0.1:PORT or haply://HOST:PORT.
 
-    Args:
-        address: udp://127.0.0.1:PORT for a client, or haply://HOST:PORT of an Inverse3.
-
-    Raises:
-        DrakeTeleopError: for another address, or a port in use.
+    For a haply:// address it also runs the client process.
     """
 
     def __init__(self, address: str) -> None:
@@ -208,7 +197,6 @@ class DeviceConnection:
             self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
     def close(self) -> None:
-        """Close the link and end the client process."""
         self.link.close()
         if self._client is None:
             return

@@ -1,8 +1,7 @@
-"""Packets between a haptic device and the station; in C: `drake_teleop_device.h`.
+"""Packets between a haptic device and the station: little-endian, in the device's base frame B.
 
-Little-endian, without padding, in the device's base frame B. From the device: "DTD1", flags,
-number, time [s], position (3) [m], orientation (4) [w, x, y, z], behind [s]. To the device:
-"DTF1", 0, number and time of the answered packet, wrench [f; tau] (6) [N, N m].
+From the device: "DTD1", flags, number, time [s], position (3) [m], orientation (4) [w, x, y, z],
+behind [s]. To the device: "DTF1", 0, number and time of the answered packet, wrench (6) [N, N m].
 """
 
 from __future__ import annotations
@@ -23,11 +22,9 @@ CLUTCH_OPEN = 1
 
 
 class DeviceState(NamedTuple):
-    """Pose of a haptic device at a time.
+    """State of a haptic device, with its packet number and time on the device's clock [s].
 
     Attributes:
-        number: packet number, increasing.
-        t: time on the device's clock [s].
         position: p_BE [m].
         orientation: R_BE, unit quaternion.
         flags: 0 or `CLUTCH_OPEN`.
@@ -59,13 +56,12 @@ class ForceCommand(NamedTuple):
 
 
 def packed_state(state: DeviceState) -> bytes:
-    """Return the packet of a device state."""
     numbers = (*state.position, *state.orientation, state.behind)
     return _STATE.pack(_FROM_DEVICE, state.flags, state.number, state.t, *numbers)
 
 
 def unpacked_state(packet: bytes) -> DeviceState | None:
-    """Return the device state in a packet, None if it is invalid or implausible. Never raises."""
+    """Return the device state in a packet, or None if it is invalid or implausible."""
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
@@ -75,10 +71,7 @@ def unpacked_state(packet: bytes) -> DeviceState | None:
 def plausible_state(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
-    """Return the device state, None if a value is implausible.
-
-    `numbers` (8,): position [m], orientation [w, x, y, z] and `behind` [s].
-    """
+    """Return the device state, or None if a value is implausible."""
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.
@@ -109,12 +102,11 @@ def refusal(packet: bytes) -> str:
 
 
 def packed_force(command: ForceCommand) -> bytes:
-    """Return the packet of a force command."""
     return _FORCE.pack(_TO_DEVICE, 0, command.number, command.t, *command.wrench)
 
 
 def unpacked_force(packet: bytes) -> ForceCommand | None:
-    """Return the force command in a packet, or None if it is invalid. Never raises."""
+    """Return the force command in a packet, or None if it is invalid."""
     if len(packet) != _FORCE.size or packet[:4] != _TO_DEVICE:
         return None
     _, _, number, t, *wrench = _FORCE.unpack(packet)

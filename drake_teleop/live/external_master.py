@@ -59,7 +59,6 @@ def _pose_on_path(path, time, out):
 
 @njit(cache=True)
 def _display_step(wrench, held, period, limits, last, now):
-    """Write wrench, fault and allowed share (8,) to `now`; `limits`: [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH
@@ -99,11 +98,6 @@ class ExternalMaster(LeafSystem):
         - fault_at_hand: a `Fault`
         - displayed_and_fault: the last two side by side
         - hand_wrench_E: (6,) minus the displayed wrench
-
-    Args:
-        start: (7,) initial X_BE.
-        period: period of the hand [s].
-        limits: (2,) of force and torque [N, N m].
     """
 
     __slots__ = ONE_DICT
@@ -185,10 +179,7 @@ class ExternalMaster(LeafSystem):
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the master side of a real device, with the ports of `MakeLiveMasterSide`.
-
-    `cross_fade` adds a `CrossFade` block at the wrench input.
-    """
+    """Return the master side of a real device, with the ports of `MakeLiveMasterSide`."""
     numbers = scenario.master.device(0.0, 0.0).numbers
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     limits = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])

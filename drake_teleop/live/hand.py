@@ -156,7 +156,7 @@ class LiveHand(Operator):
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Start a smooth path to the pose `target` (7,) X_BE; None releases the stylus."""
+        """Start a smooth path to the pose X_BE `target` (7,); None releases the stylus."""
         path = np.zeros(_PATH)
         if target is not None:
             _path_into(
@@ -211,10 +211,7 @@ class LiveHand(Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return `MakeMasterSide` with a `LiveHand`.
-
-    `cross_fade` adds a `CrossFade` block at the wrench input.
-    """
+    """Return `MakeMasterSide` with a `LiveHand`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)

@@ -1,9 +1,6 @@
 """Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
 
-Messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], and the grip's
-`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}. Each message is answered by
-`inverse3[0].commands.set_cursor_force.values`. Axes: x right, y forward, z up. Button a opens the
-clutch. Tested only with a virtual service, not with the device.
+Tested only with a virtual service, not with the device.
 """
 
 from __future__ import annotations
@@ -23,14 +20,14 @@ _GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse
 
 
 class Message(NamedTuple):
-    """Content of a message: name of the device, and its state in B."""
+    """Content of a message: name of the device, and its state in the base frame B."""
 
     device: str
     state: DeviceState
 
 
 def read_message(text: Any) -> Message | None:
-    """Return the content of a message, or None without a plausible pose. Never raises."""
+    """Return the content of a message, or None without a plausible pose."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
@@ -52,7 +49,6 @@ def read_message(text: Any) -> Message | None:
 
 
 def force_message(device: str, wrench: Sequence[float]) -> str:
-    """Return the JSON message that displays the force of a wrench [f; tau] in B [N]."""
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(
@@ -67,11 +63,7 @@ def _number(value: Any) -> float:
 
 
 class HaplyDevice:
-    """Haply Inverse3 at haply://HOST:PORT.
-
-    Raises:
-        DrakeTeleopError: if the service does not answer.
-    """
+    """Haply Inverse3 at haply://HOST:PORT."""
 
     limits = Limits(force=8.0)  # N; the peak of the device is 10 N (data sheet)
 
@@ -98,7 +90,6 @@ class HaplyDevice:
         self._device = ""
 
     def read(self) -> DevicePose | None:
-        """See `Device.read`."""
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -117,13 +108,11 @@ class HaplyDevice:
         return DevicePose(message.state.position, message.state.orientation, message.state.flags)
 
     def set(self, wrench: Sequence[float]) -> None:
-        """See `Device.set`."""
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):  # `read` reports it
             self._socket.send(force_message(self._device, wrench) if self._device else "{}")
 
     def close(self) -> None:
-        """See `Device.close`."""
         self.set((0.0,) * 6)
         self._open.close()

@@ -1,8 +1,4 @@
-"""Inputs of a live session as integers, so that the record is exactly the simulated input.
-
-`inputs.csv` has a row for each change: time [ms], numbers, and choices by name; the last row is the
-end. A comment contains versions.
-"""
+"""Inputs of a live session as integers, so that the record is exactly the simulated input."""
 
 from __future__ import annotations
 
@@ -104,7 +100,6 @@ class Inputs:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Inputs:
-        """Return the initial inputs of a scenario."""
         sigma, sigma_object, gamma = (
             round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()[:3]
         )
@@ -147,17 +142,14 @@ class Inputs:
         return self.station[:2] + self.station[6:]
 
     def pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,); None if released.
-
-        `start` (3,): position of the stylus at zero displacement, in B [m].
-        """
+        """Return the intended pose X_BE (7,) of the stylus; None if released."""
         if not self.held:
             return None
         turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def holding(self, pose: Array, start: Array) -> Inputs:
-        """Return the inputs that hold the stylus at the pose X_BE (7,); `start`: see `pose`."""
+        """Return the inputs that hold the stylus at the pose X_BE (7,)."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
@@ -165,7 +157,6 @@ class Inputs:
 
     @property
     def scales(self) -> dict[str, Any]:
-        """Force scales as arguments of `ForceScaling.SetScales`."""
         return {
             "sigma_weight": None if self.sigma_weight < 0 else _SHARE_UNIT * self.sigma_weight,
             "sigma_gripper": _SHARE_UNIT * self.sigma,
@@ -202,7 +193,6 @@ _COLUMNS = ("ms", *RANGES)
 
 
 def range_of(name: str) -> tuple[int, int]:
-    """Return the range of an input; that of `method` includes registered methods."""
     return (0, len(METHODS) - 1) if name == "method" else RANGES[name]
 
 
@@ -210,25 +200,18 @@ _VERSION = {"drake_teleop": __version__}
 
 
 def header(made_by: Mapping[str, str] = _VERSION) -> str:
-    """Return the first lines of inputs.csv: versions and digests (`made_by`), column names."""
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
 
 def row(ms: int, inputs: Inputs) -> str:
-    """Return the line of inputs.csv for inputs that apply from a time [ms]."""
     values = {name: getattr(inputs, name) for name in RANGES}
     values |= {name: words[values[name]] for name, words in names().items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
 def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """Return the recorded changes with their times [ms]; the last one is the end.
-
-    Raises:
-        DrakeTeleopError: for an invalid line, or if other versions or files prevent an exact
-            repetition.
-    """
+    """Return the recorded changes with their times [ms]; the last one is the end."""
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _COLUMNS:

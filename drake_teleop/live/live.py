@@ -1,8 +1,4 @@
-"""Live session with one driving page and spectators, independent of web server and clock.
-
-Without a driver the hand releases the stylus. After 0.25 s the simulation stops with a complete
-record.
-"""
+"""Live session with one driving page and spectators, independent of web server and clock."""
 
 from __future__ import annotations
 
@@ -41,8 +37,8 @@ Show = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 """Function from rows of a log to the 3D scene's part of a frame."""
 
 #: Period of the frames for the page [s].
-FRAME = 1 / 60
-_MIN_FRAME_PERIOD_S = 0.25 * FRAME  # s, shortest time between two frames
+FRAME_PERIOD_S = 1 / 60
+_MIN_FRAME_PERIOD_S = 0.25 * FRAME_PERIOD_S  # s, shortest time between two frames
 #: Smallest contact force at the hand that a gamepad displays [N].
 TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; maximum number of slices between two polls
@@ -66,15 +62,12 @@ class Live:
         refused: number of invalid messages.
         stopped: failure that stops the simulation, or "".
         requested_scene: scene requested by a page, or ""; the simulation waits for `change_scene`.
-        scene: present scene.
-        pace: timing of the simulation slices.
         recorded: folders of completed records.
 
     Args:
         record: folder of the record; if not empty, the next free one; None: no record.
         show: function that returns the 3D scene's part of a frame.
         link: link to a haptic device; None: the page moves the hand.
-        begin: initial inputs.
     """
 
     def __init__(
@@ -173,7 +166,6 @@ class Live:
             self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        """Handle a message of a page; count invalid messages."""
         message = parse(text)
         if message is None:
             self.refused += 1
@@ -210,16 +202,13 @@ class Live:
 
     @property
     def ms(self) -> int:
-        """Simulated time [ms]."""
         return self._session.ms
 
     @property
     def is_idle(self) -> bool:
-        """Whether the simulation does not advance at present."""
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next simulation slice or page frame [s]."""
         frame = self._frame_due - now
         return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
 
@@ -240,8 +229,8 @@ class Live:
         show_now = self._show_now and now >= self._last_frame_at + _MIN_FRAME_PERIOD_S
         if now < self._frame_due and not show_now:
             return None
-        scheduled = max(self._frame_due + FRAME, now - FRAME)
-        self._frame_due = now + 1.5 * FRAME if show_now else scheduled
+        scheduled = max(self._frame_due + FRAME_PERIOD_S, now - FRAME_PERIOD_S)
+        self._frame_due = now + 1.5 * FRAME_PERIOD_S if show_now else scheduled
         self._last_frame_at, self._show_now = now, False
         return self.frame()
 
@@ -290,7 +279,6 @@ class Live:
         return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """Return a frame: the values that pages show now."""
         rows = self._session.new_rows()
         if len(rows["t"]):
             self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(
@@ -330,11 +318,6 @@ class Live:
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
     def end(self) -> None:
-        """Complete the record.
-
-        Raises:
-            CannotWrite: if writing fails.
-        """
         try:
             self._session.close()
         except DrakeTeleopError as error:
@@ -345,11 +328,6 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        """End the session and close the device link.
-
-        Raises:
-            CannotWrite: if any record is incomplete.
-        """
         self._try(self.end)
         if self._link is not None:
             self._link.close()
@@ -366,10 +344,7 @@ def _free_folder(folder: Path) -> Path:
 
 
 def parse(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message, or None.
-
-    Kinds: "set", "rates" (numbers by input), "pause", "slow", "scene", "reset" and "drive".
-    """
+    """Return the valid requests in a page's message, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None
     try:

@@ -25,10 +25,7 @@ class RateInputs:
         self._end_time = 0.0
 
     def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Set new rates by input name [input units/s]; return the inputs at this time.
-
-        Rates end 1 s of clock time after their last repetition.
-        """
+        """Set new rates by input name [input units/s] for 1 s; return the inputs at this time."""
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
@@ -36,7 +33,6 @@ class RateInputs:
         return inputs.changed(self._at)
 
     def step(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
-        """Return the inputs of the next simulation slice of `slice_s`."""
         if not self._rates:
             return inputs
         if now > self._end_time:
@@ -50,12 +46,7 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Limiter of the target's speed, and for a device also of its acceleration.
-
-    Args:
-        slice_s: period [s].
-        scales: slave over master motion, for translation and rotation.
-    """
+    """Limiter of the target's speed, and for a device also of its acceleration."""
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _Axis] = {}
@@ -96,7 +87,7 @@ class _Axis:
         return self._at
 
     def _braking(self, distance: float) -> float:
-        """Return the speed v with v + (v - change) + (v - 2 change) + ... = distance."""
+        """Return the speed from which the axis can just stop within `distance`."""
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

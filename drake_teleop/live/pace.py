@@ -28,7 +28,6 @@ class Pace:
         self.start(now)
 
     def start(self, now: float) -> None:
-        """Make the next slice due at time `now`."""
         self._due = now
         self._starts.clear()
 
@@ -37,7 +36,6 @@ class Pace:
         return self._due - now
 
     def begin(self, now: float) -> None:
-        """Record the start of the due slice at time `now`."""
         late = now - self._due
         if late > _MAX_LATENESS_S:
             self.given_up += late

@@ -1,7 +1,4 @@
-"""3D scene of a live session for its page: the objects once, then their poses.
-
-Meshcat is closed before the server listens, because malformed input could end the process.
-"""
+"""3D scene of a live session for its page: the objects once, then their poses."""
 
 from __future__ import annotations
 
@@ -33,7 +30,6 @@ class PageScene:
     """3D scene of a scenario; its failure does not end the session.
 
     Attributes:
-        name: name in the page's addresses.
         objects: JSON {"commands": [base64], "files": {address: data URL}}.
         failure: reason if there is no scene, or "".
     """
@@ -52,10 +48,7 @@ class PageScene:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
-        """Return the 3D scene's part of a frame, at the last row.
-
-        "moves": {"poses": {path: 4x4 matrix by columns}, "sizes": {path: [x, y, z]}}.
-        """
+        """Return poses (4x4 matrices by columns) and sizes of the objects by path."""
         moves = {} if self.failure else self._moves(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 

@@ -42,11 +42,7 @@ def made_by(scenario: Scenario) -> dict[str, str]:
 
 
 class Record:
-    """Writer of scenario, load and inputs of a live session into a folder.
-
-    Raises:
-        CannotWrite: if the folder contains a record, or the disk is full.
-    """
+    """Writer of scenario, load and inputs of a live session into a folder."""
 
     def __init__(
         self,
@@ -74,7 +70,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Write the inputs at a time [ms] at once, if they have changed."""
+        """Write the inputs at a time [ms], if they have changed."""
         line = row(ms, inputs)
         if line != self._last:
             self._append(line)
@@ -117,11 +113,6 @@ class LogBeside(LogOnDisk):
         self._writing: Future[None] = self._thread.submit(_import_polars)
 
     def finish(self) -> None:
-        """Wait until all rows are on the disk.
-
-        Raises:
-            DrakeTeleopError: if writing fails.
-        """
         self._writing.result()
 
     def _write(self, part: SimulationResult) -> None:

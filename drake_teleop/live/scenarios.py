@@ -44,10 +44,7 @@ SCENES = ("own", *_SHIPPED)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Return the scenario for a live session, with error-controlled steps.
-
-    Intended motion, task and settling time are removed; faults do not end it.
-    """
+    """Return the scenario without intended motion, task and settling time; faults do not end it."""
     return replace(
         scenario,
         operator__intent=[],
@@ -79,10 +76,7 @@ def scene(name: str, own: Scenario) -> Scenario:
 
 
 def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with all choices of the driver.
-
-    Contact detection is on only with a noise floor and the scenario's own sensor.
-    """
+    """Return the scenario with all choices of the driver."""
     method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {
         "passivity__method": method,
@@ -148,7 +142,7 @@ def _sensor_offset(scenario: Scenario) -> Array:
 
 
 def fill_time(scenario: Scenario) -> float:
-    """Return the time until all packets of a new channel arrive, also the most delayed ones [s]."""
+    """Return the time until all packets of a new channel arrive [s]."""
     if scenario.is_direct:
         return 0.0
     return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME_TIME

@@ -1,7 +1,6 @@
 """Server of `drake-teleop drive`: one page on this machine and its websocket.
 
-One port of 127.0.0.1 serves only clients with the token in the page's address; the websocket
-accepts only this page.
+It serves only clients with the token in the page's address.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ _LOOP_ITERATIONS = 3
 _MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
 _CLOSE_TIMEOUT_S, _END_TIMEOUT_S = 1.0, 4.0
-_OR_DEVICE = ("", " or until the device sends")
+_DEVICE_CONDITIONS = ("", " or until the device sends")
 # All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
@@ -130,11 +129,7 @@ class LiveDrive:
         self._check()
 
     def until_signal(self) -> str:
-        """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`.
-
-        Raises:
-            DrakeTeleopError: if the record is incomplete.
-        """
+        """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`."""
         try:
             self.wait()
             return "stop"
@@ -338,7 +333,8 @@ class LiveDrive:
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
                 _print_note(
-                    "no page is open: the simulation waits" + _OR_DEVICE[self._device is not None]
+                    "no page is open: the simulation waits"
+                    + _DEVICE_CONDITIONS[self._device is not None]
                 )
 
 
@@ -409,11 +405,6 @@ def drive(
 def drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
-    """Run `drake-teleop drive` until Ctrl-C or SIGTERM.
-
-    Raises:
-        DrakeTeleopError: as `drive`, or for a stopped simulation or incomplete record.
-    """
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
     reason = live.until_signal()
@@ -426,7 +417,7 @@ def drive_command(
 
 def start_condition(device: str | None) -> str:
     """Return as text the event for which the simulation waits."""
-    return "the simulation waits until this page is open" + _OR_DEVICE[device is not None]
+    return "the simulation waits until this page is open" + _DEVICE_CONDITIONS[device is not None]
 
 
 def _print_note(text: str) -> None:

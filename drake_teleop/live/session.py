@@ -1,7 +1,4 @@
-"""Station that is simulated in slices of time and takes its inputs between them.
-
-The motion depends on the inputs alone, not on the slices.
-"""
+"""Station that is simulated in slices of time and takes its inputs between them."""
 
 from __future__ import annotations
 
@@ -50,10 +47,7 @@ _NO_EVENT = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Limit the integrator's steps of error control to at least `shortest` [s].
-
-    After a rejected step the step size is `shortest` for 4 ms.
-    """
+    """Limit the integrator's steps of error control to at least `shortest` [s]."""
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
     shortest = min(shortest, longest)
@@ -165,12 +159,7 @@ class _Station:
 
 
 class Session:
-    """Simulated station whose hand follows inputs.
-
-    Attributes:
-        scenario: initial scenario.
-        inputs: present inputs.
-        ms: simulated time [ms].
+    """Simulated station whose hand follows inputs; `ms` is the simulated time [ms].
 
     Args:
         load: identified load; None if it is estimated online.
@@ -204,11 +193,7 @@ class Session:
         self._station.simulator.Initialize()
 
     def apply(self, inputs: Inputs) -> None:
-        """Set and record the inputs from now on; a changed choice replaces the station.
-
-        Raises:
-            DrakeTeleopError: if no such station is possible; then nothing has changed.
-        """
+        """Set and record the inputs from now on; a changed choice replaces the station."""
         before = self.inputs
         if inputs == before:
             return
@@ -249,7 +234,6 @@ class Session:
         return self.ms < self._filled_at_ms
 
     def advance(self, ms: int = SLICE_MS) -> None:
-        """Simulate the next `ms` milliseconds."""
         end = self.ms + ms
         if self.ms < self._filled_at_ms <= end:
             self._advance_to(self._filled_at_ms)
@@ -265,10 +249,7 @@ class Session:
         advance(self._station.simulator, 1e-3 * ms)
 
     def new_rows(self) -> dict[str, NDArray[np.float64]]:
-        """Return the log's rows since the last call: signal -> (n, k), and "t" (n,) [s].
-
-        Call it at least once a second: `advance` discards older rows.
-        """
+        """Return the log's rows since the last call: signal -> (n, k), and "t" (n,) [s]."""
         sink, start = self._station.sink, self._rows_read
         data, times = sink.data()[:, start:].T.copy(), sink.sample_times()[start:]
         rows = {name: data[:, part] for name, part in self._station.columns.items()}
@@ -297,14 +278,13 @@ class Session:
         return self._station.value("force_to_master")
 
     def removed_force(self) -> float:
-        """Return the force [N] that is not rendered because of the limit after a channel change."""
+        """Return the force [N] that the limit after a channel change removes."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block("cross_fade")
         return float(cross_fade.removed_force(context))
 
     def flush(self) -> None:
-        """Write all rows and inputs until now to the disk."""
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
@@ -315,14 +295,12 @@ class Session:
         return with_all_signals(read_log(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
-        """Return the log in memory."""
         parts = [*self._earlier_rows, self._rows()]
         values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
         t = np.concatenate([part.t for part in parts])
         return SimulationResult(t, values, parts[0].specs)
 
     def close(self) -> None:
-        """Complete the record; remove it if no time was simulated."""
         record, self._record = self._record, None
         try:
             if record is not None:
@@ -350,12 +328,7 @@ class Drive:
     def repeat(
         self, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
-        """Simulate the session again and return its log, equal bit by bit.
-
-        Args:
-            log: folder of the log; None for memory.
-            slice_ms: longest step between changes [ms].
-        """
+        """Simulate the session again in steps of at most `slice_ms`; return the same log."""
         session = Session(self.scenario, self.load, log=log, device=self.device)
         end = self.changes[-1][0]
         for ms, inputs in self.changes:
@@ -368,11 +341,6 @@ class Drive:
 
 
 def read_drive(folder: str | Path) -> Drive:
-    """Return the recorded live session in a folder.
-
-    Raises:
-        DrakeTeleopError: for an invalid file.
-    """
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO)
     changes = read_inputs(folder / INPUTS, made_by(scenario))

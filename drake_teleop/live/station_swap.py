@@ -1,7 +1,4 @@
-"""Transfer of a station's state to another station, by block names.
-
-Random numbers, and a changed channel, restart.
-"""
+"""Transfer of a station's state to another station, by block names."""
 
 from __future__ import annotations
 
@@ -33,12 +30,7 @@ _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy time, states and changeable parameters of the station `before` to `station`.
-
-    Args:
-        then, context: contexts of `before` and of `station`.
-        excluded: names of blocks that are not copied.
-    """
+    """Copy time, states and changeable parameters of the station `before` to `station`."""
     context.SetTime(then.get_time())
     sources = dict(_blocks(before))
     for path, block in _blocks(station):
@@ -104,7 +96,6 @@ def _force(wrench):
 
 
 def add_cross_fade(builder: DiagramBuilder, port: InputPort, period: float) -> InputPort:
-    """Add a `CrossFade` in front of `port`, and return its input port."""
     block = builder.AddNamedSystem("cross_fade", CrossFade(period))
     builder.Connect(block.get_output_port(), port)
     return block.get_input_port()

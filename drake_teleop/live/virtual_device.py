@@ -1,7 +1,4 @@
-"""Simulated haptic device in a simulated hand, for tests and for trying a link.
-
-m x'' = f - b x' + k (x_hand - x) + d (x_hand' - x'), with the force f of the last tick.
-"""
+"""Simulated haptic device in a simulated hand, for tests and for trying a link."""
 
 from __future__ import annotations
 
@@ -16,14 +13,8 @@ _STEPS_PER_MS = 10  # per ms
 class VirtualDevice:
     """Simulated device of given mass [kg] and damping [N s/m] in a moving hand.
 
-    Attributes:
-        position: device position [m].
-        velocity: device velocity [m/s].
-        energy: work of device and hand against the force [J].
-
-    Args:
-        hand: function from time [s] to intended position [m] and velocity [m/s].
-        grip: name in `GRIPS`.
+    `hand` maps time [s] to intended position [m] and velocity [m/s]; `energy` is the work of
+    device and hand against the force [J].
     """
 
     def __init__(
@@ -57,10 +48,7 @@ class VirtualDevice:
 def tapping(
     depth: float, *, hertz: float = 0.5
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
-    """Return a hand motion along z from 10 mm to -`depth` [m] and back, `hertz` times a second.
-
-    The hand stays at the lower end for 60 % of the period.
-    """
+    """Return a hand motion along z between 10 mm and -`depth` [m], `hertz` times a second."""
     lift, hold = 0.01, 0.6
 
     def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:

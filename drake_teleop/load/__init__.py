@@ -1,5 +1,1 @@
-"""Inertial load of a wrist force/torque sensor: model, identification and removal from the wrench.
-
-Functions that check arrays raise DrakeTeleopError for wrong shapes and for numbers that are not
-finite.
-"""
+"""Inertial load of a wrist force/torque sensor: identification, and removal from the wrench."""

@@ -1,12 +1,4 @@
-"""Removal or scaling of the load's weight and inertia in a measured wrench, Eqs. (12)-(14), (T7).
-
-    F_c = F - F_o - V phi                                          (13)
-    F'  = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj)      (T7)
-
-F is the measured wrench, F_o the sensor offsets, V phi the wrench of weight and inertia. Wrenches
-act on the load, about the sensor origin So, in S. V(a - g) = V(-g) + V(a) is linear in the specific
-force, so weight and inertia can have different scales sigma.
-"""
+"""Removal or scaling of the load's weight and inertia in a wrench, Eqs. (12)-(14), (T7)."""
 
 from __future__ import annotations
 
@@ -46,10 +38,7 @@ def wrench_of_scales(
 
 @register_jitable
 def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
-    """Return force and torque of V(-g) (excess_gripper phi_gripper + excess_object phi_object).
-
-    They are added to `wrench_of_scales` for shares of the weight that exceed those of the inertia.
-    """
+    """Return force and torque of V(-g) (excess_gripper phi_gripper + excess_object phi_object)."""
     a, b = excess_gripper, excess_object
     up = times(-1.0, three(gravity, 0))
     h = plus(times(a, three(phi_gripper, 1)), times(b, three(phi_object, 1)))
@@ -60,10 +49,6 @@ def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_ob
 def scaled_wrench_into(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
-    """Write F' (6,) of `scaled_wrench` into out, for one sample.
-
-    For sigma = gamma the result does not depend on errors of the load parameters.
-    """
     force, torque = wrench_of_scales(
         wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
     )
@@ -73,7 +58,6 @@ def scaled_wrench_into(
 
 @njit(cache=True)
 def add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    """Add the result of `weight_of_scales` to out (6,), for one sample."""
     force, torque = weight_of_scales(
         gravity, phi_gripper, phi_object, excess_gripper, excess_object
     )
@@ -177,27 +161,19 @@ def weight_and_inertia_scales(
     sigma_weight: float | None = None,
     sigma_inertia: float | None = None,
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the scales of the weight of gripper and object, and those of their inertia."""
     both = sigma_gripper, sigma_object
     weights = both if sigma_weight is None else (sigma_weight, sigma_weight)
     return weights, both if sigma_inertia is None else (sigma_inertia, sigma_inertia)
 
 
 def unknown_gravity(where: str, remedy: str) -> DrakeTeleopError:
-    """Return the error for different scales of weight and inertia without known gravity."""
     return DrakeTeleopError(
         "is unknown, and sigma_weight differs from sigma_inertia", where=where, remedy=remedy
     )
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return sigma_gripper, sigma_object, gamma = 0, eta, 1 for `scaled_wrench`, Eq. (14).
-
-    They remove the gripper and keep the share eta of the object.
-
-    Raises:
-        DrakeTeleopError: if eta is outside [0, 1].
-    """
+    """Return the scales that remove the gripper and keep the share eta of the object, Eq. (14)."""
     if not 0.0 <= number("eta", eta) <= 1.0:
         raise DrakeTeleopError(
             f"{eta:g} is outside 0 to 1",

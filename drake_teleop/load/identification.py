@@ -1,7 +1,4 @@
-"""Identified load of a sensor, and the load of a gripped object as a difference.
-
-Parameters without excitation are undetermined: variance inf.
-"""
+"""Identified load of a sensor, and the load of a gripped object as a difference."""
 
 from __future__ import annotations
 
@@ -209,7 +206,7 @@ class Identification:
             **optional,
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
-            raise _file_error("does not follow from phi, covariance and flags", f"{path}:verdicts")
+            raise _file_error("contradicts phi, covariance and flags", f"{path}:verdicts")
         for name, value in result._derived().items():
             if isinstance(value, bool):
                 follows = document[name] is value
@@ -217,9 +214,7 @@ class Identification:
                 stated = numbers(name, *np.shape(value))
                 follows = np.allclose(stated, value, rtol=1e-6, atol=1e-9)
             if not follows:
-                raise DrakeTeleopError(
-                    "does not follow from phi", where=f"{path}:{name}", remedy="edit phi"
-                )
+                raise DrakeTeleopError("contradicts phi", where=f"{path}:{name}", remedy="edit phi")
         return result
 
     def _derived(self) -> dict[str, Any]:
@@ -241,10 +236,7 @@ def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -
 
 
 def com_deviations(phi: Array, covariance: Array) -> Array:
-    """Return standard deviations (3,) of the centre of mass [m] for a load phi (10,).
-
-    `covariance` (16, 16) is that of [offsets; phi].
-    """
+    """Return standard deviations (3,) of the centre of mass [m]."""
     mass, com, _ = mass_com_inertia(phi)
     change = np.column_stack([-com, np.eye(3)]) / mass
     part = covariance[6:10, 6:10]
@@ -254,16 +246,11 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    """Return (16,) True where a standard deviation is at most 5 % of `natural_scale`."""
     return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
 def natural_scale(phi: Array) -> Array:
-    """Return the typical size (16,) of each of [offsets; phi], to judge its standard deviation.
-
-    For mass m and size L = max(|c|, 3 cm) they are m g, m g L, m, m L and m L^2 / 3. The mass must
-    not be zero.
-    """
+    """Return the typical size (16,) of each of [offsets; phi], to judge its uncertainty."""
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
     scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
@@ -340,14 +327,7 @@ _IS_PHI = np.arange(16) >= 6
 
 
 def identified_object(total: Identification, gripper: Identification) -> Identification:
-    """Return the object's load: that of gripper with object (`total`) minus that of `gripper`.
-
-    Covariances of phi add. Other fields are those of `total`.
-
-    Raises:
-        DrakeTeleopError: if the object's mass is zero, or negative by more than 3 standard
-            deviations.
-    """
+    """Return the object's load: that of gripper with object (`total`) minus that of `gripper`."""
     phi: Array = total.phi - gripper.phi
     covariance = total.covariance.copy()
     covariance[6:, 6:] += gripper.covariance[6:, 6:]
@@ -384,11 +364,7 @@ def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return the smallest eigenvalue of the normalised pseudo-inertia, and its deviation, Eq. (T9).
-
-    It is positive for a load that a rigid body can have. The deviation is inf for undetermined
-    loads.
-    """
+    """Return the smallest eigenvalue of the normalised pseudo-inertia and its deviation."""
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))
     length = np.sqrt(spread / mass) if spread > 0.0 else 1.0

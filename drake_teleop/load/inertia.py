@@ -1,7 +1,7 @@
 """Inertial parameters phi of a rigid load: conversions, frames and physical consistency.
 
-phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], with mass m, centre of
-mass c, and inertia about the frame's origin. Pseudo-inertia: Wensing, Kim, Slotine, RA-L 2018.
+phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], with mass m, centre
+of mass c, and inertia about the frame's origin.
 """
 
 from __future__ import annotations
@@ -23,16 +23,6 @@ def _point_inertia(about: Array, mass: float) -> Array:
 
 
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:
-    """Return the load phi (10,) about the sensor origin So, in S.
-
-    Args:
-        mass: [kg].
-        p_SoBcm_S: (3,) centre of mass from So, in S [m].
-        I_BBcm_S: (3, 3) inertia about the centre of mass, axes of S [kg m^2].
-
-    Raises:
-        DrakeTeleopError: for an asymmetric tensor.
-    """
     m = float(checked("mass", mass))
     p = checked("p_SoBcm_S", p_SoBcm_S, 3)
     I = checked("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
@@ -47,13 +37,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
 
 
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
-    """Return mass [kg], centre of mass p_SoBcm_S (3,) [m] and inertia I_BBcm_S (3, 3) [kg m^2].
-
-    The inertia is about the centre of mass. The mass may be negative.
-
-    Raises:
-        DrakeTeleopError: if the mass is zero.
-    """
+    """Return mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m^2], all in S."""
     phi = checked("phi", phi, 10)
     m = float(phi[0])
     if m == 0.0:
@@ -67,16 +51,12 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
 
 
 def inertia_about_origin(phi: ArrayLike) -> Array:
-    """Return the inertia tensor (3, 3) of phi about So in S [kg m^2], Eq. (3)."""
     xx, xy, xz, yy, yz, zz = checked("phi", phi, 10)[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def pseudo_inertia(phi: ArrayLike) -> Array:
-    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1).
-
-    Sigma (3, 3) is the second moment of mass about So, tr(I) / 2 E - I [kg m^2].
-    """
+    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1)."""
     phi = checked("phi", phi, 10)
     I = inertia_about_origin(phi)  # noqa: E741
     J = np.empty((4, 4))
@@ -87,7 +67,6 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 
 
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
-    """Return the load phi (10,) with this pseudo-inertia J (4, 4)."""
     J = checked("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
         raise DrakeTeleopError(
@@ -101,11 +80,7 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     """Return whether a rigid body can have the parameters phi (10,), Eq. (T1).
 
-    Points, rods, plates and phi = 0 are consistent.
-
-    Args:
-        tolerance: accepted negative eigenvalue of the pseudo-inertia, normalised by mass and radius
-            of gyration.
+    `tolerance` is the accepted negative eigenvalue of the normalised pseudo-inertia.
     """
     J = pseudo_inertia(phi)
     if not J.any():
@@ -121,16 +96,7 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:
-    """Return the load (10,) about Ao in frame A, given that about Bo in frame B, Eq. (T2).
-
-    Args:
-        phi_B: (10,) load about Bo in B.
-        R_AB: (3, 3) rotation, v_A = R_AB v_B.
-        p_AoBo_A: (3,) position of Bo from Ao, in A [m].
-
-    Raises:
-        DrakeTeleopError: if R_AB is not a rotation.
-    """
+    """Return the load (10,) about Ao in frame A, from the load about Bo in frame B, Eq. (T2)."""
     R = checked("R_AB", R_AB, 3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
         raise DrakeTeleopError(

@@ -1,10 +1,8 @@
 """Second moments of a record, from which all least squares estimates follow, Eq. (T4).
 
-They are the mean of z z^T (19, 19). Row c of the regressor [E V] is T_c z with constant T_c:
+They are the mean of z z^T, where row c of the regressor [E V] is T_c z with constant T_c:
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
-
-with wrench F and w = omega.
 """
 
 from __future__ import annotations
@@ -71,10 +69,7 @@ class Noise:
 
 
 class Moments:
-    """Sum over a record of z z^T (19, 19), z = [1, wrench, s, alpha, products of omega].
-
-    The sums of z over equal blocks of samples show the correlation of noise in time.
-    """
+    """Second moments z z^T (19, 19) of a record, summed over its samples."""
 
     def __init__(self) -> None:
         self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_BLOCKS, 19))
@@ -88,7 +83,6 @@ class Moments:
 
     @property
     def mean(self) -> Array:
-        """Mean of z z^T (19, 19) over the record."""
         if self.samples < 3:
             raise DrakeTeleopError(
                 f"{self.samples:.3g} samples cannot determine a load",
@@ -104,7 +98,7 @@ class Moments:
         alpha: ArrayLike,
         weights: ArrayLike | None = None,
     ) -> None:
-        """Add N samples with arguments as for `identify`, or a single one, with `weights` (N,)."""
+        """Add N samples, or a single one, with arguments as for `identify` and `weights` (N,)."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         n = rows[0].shape[0]
         weight = np.ones(n) if weights is None else checked("weights", weights, n)
@@ -152,7 +146,7 @@ def coefficients() -> Array:
 
 
 def centripetal_matrix(r: Array) -> Array:
-    """Return C (..., 3, 6): C z[13:19] is the acceleration omega x (omega x r) of r (..., 3)."""
+    """Return C (..., 3, 6) such that C z[13:19] is the acceleration omega x (omega x r)."""
     x, y, z = np.moveaxis(r, -1, 0)
     o = np.zeros_like(x)
     rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
@@ -160,10 +154,7 @@ def centripetal_matrix(r: Array) -> Array:
 
 
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
-    """Return the Gram matrix (16, 16), sum of W_cd T_c Z T_d^T, and the right-hand side (16,).
-
-    Z (19, 19) is a mean or a noise covariance of z, W (6, 6) the weights between channels.
-    """
+    """Return Gram matrix (16, 16) and right-hand side (16,) of least squares for [offsets; phi]."""
     T = coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
     WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
@@ -173,10 +164,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta, theta = [offsets; phi].
-
-    Z (19, 19) is a mean of z z^T or a noise covariance of z.
-    """
+    """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta."""
     L = -np.einsum("cjk,j->ck", coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T
@@ -184,12 +172,12 @@ def residual_covariance(Z: Array, theta: Array) -> Array:
 
 
 def excited_columns(Z: Array) -> NDArray[np.bool_]:
-    """Return (16,) booleans: True for parameters whose column of [E V] exceeds rounding errors."""
+    """Return (16,) True for parameters whose influence on the wrench exceeds rounding errors."""
     return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
 
 
 def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
-    """Return R (n, rank) with R^T gram R = 1; R R^T right is the minimum-norm solution."""
+    """Return R (n, rank) such that R R^T is the pseudo-inverse of the Gram matrix."""
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
@@ -198,10 +186,6 @@ def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
 
 @njit(cache=True)
 def _accumulate(wrench, s, omega, alpha, weights, sums, blocks, state):
-    """Add samples to the upper half of the sums of z z^T, and to those of z per block.
-
-    A full table of blocks is halved by joining pairs.
-    """
     z = np.empty(19)
     last, length, filled = state
     for i in range(wrench.shape[0]):

@@ -1,8 +1,4 @@
-"""Load and sensor offsets by batch least squares, Eqs. (7)-(8), (T3) and (T16).
-
-In directions without excitation the solution has minimum norm, and affected parameters are
-undetermined. Theory: docs/theory.md, "Details of the estimators".
-"""
+"""Load and sensor offsets by batch least squares, Eqs. (7)-(8), (T3) and (T16)."""
 
 from __future__ import annotations
 
@@ -41,8 +37,6 @@ _WRENCH, _FORCE = slice(1, 7), slice(7, 10)
 class NormalEquations(Moments):
     """Least squares sums of a record, from which load and sensor offsets are solved.
 
-    Samples are added in the order of time, because their noise may be correlated.
-
     Args:
         noise: (6,) standard deviations of the wrench channels [N, N m]; None: equal weights.
         resolution: (2,) quantisation step of forces and torques [N, N m], only for poses at rest.
@@ -56,7 +50,6 @@ class NormalEquations(Moments):
         self._weights = np.ones(6) if noise is None else positive("noise", noise, 6) ** -2.0
 
     def solve(self, delay_s: float = 0.0) -> Identification:
-        """Return the least squares solution; `delay_s` [s] is only stored in it."""
         inverse, undetermined, condition_number = self._pseudo_inverse()
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
@@ -82,10 +75,7 @@ class NormalEquations(Moments):
         )
 
     def covariance(self) -> Array:
-        """Return the finite covariance C (16, 16) of the minimum-norm solution [offsets; phi].
-
-        c^T C c is the variance of a determined combination c (16,) of parameters.
-        """
+        """Return the finite covariance (16, 16) of the minimum-norm solution [offsets; phi]."""
         inverse, _, _ = self._pseudo_inverse()
         return self._covariance(inverse @ self.normal_equations()[1], inverse)[0]
 
@@ -107,10 +97,6 @@ class NormalEquations(Moments):
         return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Return Gram matrix (16, 16) and right-hand side (16,) of [offsets; phi].
-
-        `weights` (6,) of the channels are by default those of the noise.
-        """
         weights = self._weights if weights is None else checked("weights", weights, 6)
         return normal_equations(self._sums, np.diag(weights))
 
@@ -120,32 +106,23 @@ class NormalEquations(Moments):
 
     @property
     def unexcited(self) -> NDArray[np.bool_]:
-        """Booleans (16,): True for parameters that do not influence the wrench."""
         return ~excited_columns(self.mean)
 
     @property
     def weights(self) -> Array:
-        """Weights (6,) of the squared residuals of the wrench channels."""
         return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
-        """Return the sums (6,) of squared residuals of the channels for theta = [offsets; phi]."""
         squares = np.diag(residual_covariance(self._sums, checked("theta", theta, 16)))
         return np.maximum(squares, 0.0)
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
-        """Return residual variances (6,) with correlation in time, and degrees of freedom (6,).
-
-        `theta` is [offsets; phi] (16,).
-        """
+        """Return residual variances (6,) with correlation in time, and their degrees of freedom."""
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(checked("theta", theta, 16), inverse)[:2]
 
     def slow_noise(self) -> NDArray[np.bool_]:
-        """Return (6,) True for wrench channels whose noise is slower than the record resolves.
-
-        Standard deviations are then too small.
-        """
+        """Return (6,) True for wrench channels whose noise is slower than the record resolves."""
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(inverse @ self.normal_equations()[1], inverse)[2]
 

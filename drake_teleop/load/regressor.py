@@ -1,8 +1,6 @@
 """Wrench of a load by its motion: regressor V of Eq. (5), and Newton-Euler Eqs. (1)-(2).
 
-Vectors are in the sensor frame S about its origin So; the wrench acts on the load (at rest f = -m
-g). Functions `..._into` are compiled and do not check their input. A sample is one row of numbers
-(logs: the first 15):
+A sample is one row of numbers (logs: the first 15):
 
     [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
      saturated or lost | joint positions (n) | time (output of the wrist sensor only)]
@@ -35,7 +33,6 @@ TIME = -1  #: [s], only in the output of the wrist sensor
 
 @njit(cache=True)
 def regressor_into(s, omega, alpha, V):
-    """Write the regressor V (6, 10) of `regressor` for one sample."""
     sx, sy, sz = s[0], s[1], s[2]
     wx, wy, wz = omega[0], omega[1], omega[2]
     ax, ay, az = alpha[0], alpha[1], alpha[2]
@@ -68,7 +65,6 @@ def wrench_of_load(s, omega, alpha, phi):
 
 @njit(cache=True)
 def non_contact_wrench_into(s, omega, alpha, phi, out):
-    """Write the wrench V phi (6,) of `non_contact_wrench` into out. phi may be a tuple."""
     force, torque = wrench_of_load(s, omega, alpha, phi)
     out[0], out[1], out[2] = force
     out[3], out[4], out[5] = torque
@@ -125,5 +121,4 @@ def sample_parts(num_joints: int) -> dict[str, int]:
 
 
 def sample_size(num_joints: int) -> int:
-    """Return the length of a wrist sensor's sample without its time."""
     return BEFORE_JOINTS + num_joints

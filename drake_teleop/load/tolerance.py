@@ -42,7 +42,6 @@ class Tolerance(NamedTuple):
 
     @property
     def required(self) -> tuple[str, ...]:
-        """Names of the quantities with a requirement, out of "mass", "com", "inertia"."""
         return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
 
     @property
@@ -51,7 +50,6 @@ class Tolerance(NamedTuple):
         return tuple(entry for name in self.required for entry in ENTRIES[name])
 
     def __str__(self) -> str:
-        """Return the tolerance as text for `read_tolerance`."""
         return ", ".join(
             f"com {1e3 * value:g} mm" if name == "com" else f"{name} {100.0 * value:g} %"
             for name, value in zip(QUANTITIES, self, strict=True)
@@ -60,11 +58,6 @@ class Tolerance(NamedTuple):
 
 
 def read_tolerance(text: str) -> Tolerance:
-    """Return the tolerance of a text such as "mass 0.5 %, com 0.5 mm".
-
-    Raises:
-        DrakeTeleopError: for another form, or a value outside 1e-9 to 10.
-    """
     found: dict[str, float] = {}
     for part in text.split(","):
         match = _ENTRY_PATTERN.fullmatch(part)
@@ -113,11 +106,7 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_of(errors: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of the required numbers, over the tolerances.
-
-    They are inf if undetermined. `errors` is from `errors_of`, `covariance` (16, 16) of [offsets;
-    phi].
-    """
+    """Return standard deviations (k,) of the required numbers, over the tolerances."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)

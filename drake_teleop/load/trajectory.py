@@ -39,10 +39,7 @@ class FourierTrajectory:
     ) -> FourierTrajectory:
         """Return a trajectory without velocity and acceleration at both ends, Eq. (T17).
 
-        Args:
-            q0: (n,) constant part [rad]; the trajectory starts at q0 + sum(delta).
-            sine, cosine: (n, N - 1) free coefficients [rad]; harmonic k is scaled by 1/k.
-            frequency: base frequency [Hz].
+        `sine` and `cosine` (n, N - 1) [rad] are coefficients whose harmonic k is divided by k.
         """
         sine, cosine = np.asarray(sine, float), np.asarray(cosine, float)
         rest_rho, rest_delta = _rest_bases(sine.shape[-1] + 1)
@@ -50,7 +47,6 @@ class FourierTrajectory:
 
     @property
     def period(self) -> float:
-        """Period [s]."""
         return 1.0 / self.frequency
 
     def evaluate(self, t: ArrayLike) -> tuple[Array, Array, Array]:
@@ -69,7 +65,6 @@ class FourierTrajectory:
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
-        """Write the coefficients as YAML, by joint name."""
         from drake_teleop.common.texts import yaml_text
 
         joints = {
@@ -81,11 +76,6 @@ class FourierTrajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:
-        """Read the YAML file of `save`.
-
-        Raises:
-            DrakeTeleopError: naming the file, if the content is not a trajectory.
-        """
         from drake_teleop.common.texts import read_yaml
 
         data = read_yaml(path)

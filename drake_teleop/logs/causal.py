@@ -58,7 +58,6 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
 
 
 def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> Array:
-    """Return the low-pass (7,) of `design_low_pass`."""
     low_pass = np.empty(7)
     design_low_pass(dt, math.tan(math.pi * cutoff_hz * dt), ahead_s, low_pass)
     return low_pass

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, narrowest_half, runs
 from drake_teleop.load.contact.detection import (
-    RARE,
+    MAX_NOISE_LEVEL,
     ContactDetector,
     fit_noise_floor,
     statistics,
@@ -37,7 +37,7 @@ _QUIET_DEVIATIONS = 4.0
 _DEFAULT_CUTOFF_HZ = 30.0  # assumed cut-off without a low-pass
 _BLOCK_S, _BLOCKS = 0.1, 20
 _CONCENTRATION_STEPS, _ROUNDS = 4, 3
-_RECORD_MARGIN, _MIN_REACHED = 1.6, 5.0  # times 1.25 is about `RARE`
+_RECORD_MARGIN, _MIN_REACHED = 1.6, 5.0  # times 1.25 is about `MAX_NOISE_LEVEL`
 _MAX_FLOOR_SAMPLES = 30_000  # largest number of samples for a noise floor, in spans of ten blocks
 _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
 _MAX_CONTACT_SHARE, _MAX_NOISE_RATIO = 0.4, 10.0
@@ -120,7 +120,7 @@ def detect_contact(
     else:
         train = free[0].at(_judged_samples(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
-        threshold = max(RARE, floor.threshold(statistic))
+        threshold = max(MAX_NOISE_LEVEL, floor.threshold(statistic))
     values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
     detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
     values[inner] = statistics(floor, *judged)

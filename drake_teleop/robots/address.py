@@ -9,7 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:
-    """Parsed address with the parameters `allowed`; defaults: `port` and `host`."""
+    """Parsed address; `allowed` names its parameters, `port` and `host` are defaults."""
 
     def __init__(
         self, text: str, port: int | None, allowed: tuple[str, ...], *, host: str = ""
@@ -34,7 +34,6 @@ class Address:
                 )
 
     def parameter(self, name: str) -> str | None:
-        """Return a query parameter; None if it is absent."""
         return self._parameters.get(name)
 
     def numbers(self, name: str, count: int) -> list[float] | None:
@@ -55,7 +54,7 @@ class Address:
         return values
 
     def choice(self, name: str, among: tuple[str, ...]) -> str:
-        """Return a parameter among words, default the first; else raise DrakeTeleopError."""
+        """Return a parameter among words, by default the first."""
         text = self._parameters.get(name, among[0])
         if text not in among:
             raise DrakeTeleopError(
@@ -66,10 +65,7 @@ class Address:
         return text
 
     def sign(self) -> float:
-        """Return the factor that converts the source's wrench to that of sensor on load, Eq. (1).
-
-        It is the parameter `sign`: 1, or -1 (default).
-        """
+        """Factor, 1 or -1, from the source's wrench to that of sensor on load, Eq. (1)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(

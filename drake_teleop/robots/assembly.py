@@ -1,4 +1,4 @@
-"""Readings that combine the wrench of one stream with the motion of another (docs/robot.md)."""
+"""Readings that combine the wrench of one stream with the motion of another."""
 
 from __future__ import annotations
 
@@ -133,12 +133,7 @@ _PERIOD_SAMPLES = 20  # for the median period of the motion
 
 
 class Parts:
-    """One source of wrenches and motions, made of one or two sources of parts (single samples).
-
-    Attributes:
-        motion_stream: stream of the motion: poses if available, else an IMU.
-        two_clocks: whether wrench and motion have different clocks.
-    """
+    """One source of wrenches and motions, made of one or two sources of single samples."""
 
     live = True
 
@@ -168,7 +163,6 @@ class Parts:
         return found + [(part, now) for part in parts if alone or part.stream == WRENCH]
 
     def close(self) -> None:
-        """See `Source`."""
         self._wrench.close()
         if self._motion is not None:
             self._motion.close()
@@ -194,7 +188,6 @@ class PosedByJoints:
         self.streams: tuple[str, ...] = (*others, POSE)
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
         parts = self._source.read(timeout_s)
         if parts is None:
             return None
@@ -209,12 +202,11 @@ class PosedByJoints:
         return part._replace(stream=POSE, values=values)
 
     def close(self) -> None:
-        """See `PartSource`."""
         self._source.close()
 
 
 class MotionWindow:
-    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or IMU samples.
+    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or an IMU.
 
     Args:
         cutoff_hz: cut-off of the smoothing; None for the shortest window.
@@ -230,7 +222,6 @@ class MotionWindow:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all samples."""
         self._last: tuple[float, Array] | None = None
         self._next_t, self._rows = 0.0, deque[Array](maxlen=self._size)
         self._arrival = -math.inf
@@ -244,11 +235,7 @@ class MotionWindow:
             self.reset()
 
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Return the motions that a part, received at time `now` [s], completes.
-
-        Each is a time [s] with specific force, angular velocity and acceleration in S; from poses
-        also with gravity in S: (9,) or (12,).
-        """
+        """Return times [s] and motions [s, omega, alpha, known gravity] that a part completes."""
         row = self._row(part)
         if row is None:
             return []
@@ -320,11 +307,7 @@ class Assembly:
         delay_s: delay of the motion's time stamps behind the wrench's [s].
         track: load for tracking this delay; None for a constant delay.
         X_FS: (7,) pose of the sensor in the frame F of the poses, [w x y z, position].
-        weight_removed: the robot has removed the weight from the wrench. Readings contain the
-            acceleration instead of the specific force; an IMU raises DrakeTeleopError.
-
-    Attributes:
-        lag_s: delay of the readings [s].
+        weight_removed: True if the robot has removed the load's weight from the wrench.
     """
 
     live = True
@@ -355,11 +338,9 @@ class Assembly:
 
     @property
     def delay_s(self) -> float:
-        """Present delay of the motion behind the wrench [s]."""
         return self._delay if self._tracker is None else self._tracker.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """See `Source`."""
         arrived = self._parts.read(timeout_s)
         if arrived is None:
             return None
@@ -413,5 +394,4 @@ class Assembly:
         return Reading(part.number, part.t, values, flags, motion[9:] if len(motion) > 9 else None)
 
     def close(self) -> None:
-        """See `Source`."""
         self._parts.close()

@@ -1,4 +1,4 @@
-"""Load identification from a stream until the tolerances are met (docs/robot.md)."""
+"""Load identification from a stream until the tolerances are met."""
 
 from __future__ import annotations
 
@@ -62,7 +62,6 @@ class Evaluation:
         sure: (k,) True where the interval of level `CONFIDENCE` is within the tolerance.
         known: (k,) True where the previous result was `sure`, too.
         doubts: problems of the record; no parameter is known then.
-        advice: the next motion; "" if all parameters are known.
     """
 
     t: float
@@ -83,10 +82,7 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> Evaluation:
-    """Identify the record at `path` and return the result; `previous` is the previous one.
-
-    `cutoff_hz` and `delay`: see `identify_log`.
-    """
+    """Identify the load of a record and compare its uncertainty with the tolerance."""
     count, found, why = len(tolerance.entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -119,10 +115,7 @@ def evaluate_record(
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return interval half-widths over the tolerances, and degrees of freedom, (k,) each.
-
-    The levels are 95 % (first) and `CONFIDENCE` (second).
-    """
+    """Return half-widths (k,) of both intervals over the tolerances, and degrees of freedom."""
     load = found.identification
     errors = errors_of(tolerance, load.phi)
     deviations = deviations_of(errors, load.covariance)
@@ -133,7 +126,6 @@ def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Arra
 
 
 def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
-    """Return the problems of a record that invalidate all intervals, as text."""
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
         doubts.append("all poses are at rest")
@@ -151,10 +143,7 @@ def best_motion(
 ) -> str:
     """Return as text the next motion that reduces the uncertainty most.
 
-    Args:
-        motion: s, omega, alpha of the record, (N, 3) each.
-        errors: (k, 16) matrix from `errors_of`.
-        noise: (6,) standard deviation of a sample's wrench [N, N m].
+    `motion` is s, omega, alpha of the record, (N, 3) each.
     """
     rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_PER_S_HZ * cutoff_hz)
     equations = NormalEquations(noise)
@@ -211,20 +200,7 @@ def calibrate(
     seconds: float = 120.0,
     show: Callable[[Evaluation], None] = lambda _: None,
 ) -> list[Evaluation]:
-    """Record a stream until the tolerance is met, the source ends or the time is over.
-
-    Args:
-        path: file of the record; the last result refers to it.
-        cutoff_hz, delay: see `identify_log`.
-        seconds: maximum length of the record.
-        show: callback for each result.
-
-    Returns:
-        All intermediate results.
-
-    Raises:
-        DrakeTeleopError: if there are too few samples, or the record cannot be written.
-    """
+    """Record a stream until the tolerance is met, the source ends or the time is over."""
     results: list[Evaluation] = []
     next_length_s = FIRST_RECORD_S
     earlier = [path.with_name(name) for name in recorder.files] if source.live else []

@@ -53,7 +53,6 @@ class Changes:
         self._reported: list[float] = []
 
     def take(self, reading: Reading, flags: int) -> None:
-        """Add a reading, with the flags of its compensated wrench."""
         if flags & _INVALID_FLAGS:
             return
         if not 0.0 < reading.t - self._last < JUMP_S:
@@ -159,7 +158,6 @@ def _change_text(cause: Cause) -> str:
 
 
 def main() -> None:
-    """Find changes in the rows on stdin; write them to stdout."""
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
     rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + VALUES)

@@ -36,7 +36,7 @@ class Control:
         self.port = self._socket.getsockname()[1]
 
     def answer(self, tare: Callable[[], str]) -> None:
-        """Answer a waiting request, if any: call `tare` and send its result."""
+        """Answer a waiting request, if any."""
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"
@@ -47,7 +47,6 @@ class Control:
             pass
 
     def close(self) -> None:
-        """Close the port."""
         self._socket.close()
 
 
@@ -61,15 +60,7 @@ def run(
     changes: Changes | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate readings until the source ends, or Ctrl-C.
-
-    Args:
-        tare: tare once, after `TARE_S` of valid readings.
-        report: callback for a tare, and the first fault of each kind.
-
-    Returns:
-        The number of wrenches, under "wrenches", and the number with each flag.
-    """
+    """Compensate readings until the source ends, or Ctrl-C; count wrenches and flags."""
     counts: Counter[str] = Counter(wrenches=0)
     tare_count = np.inf if not tare else round(TARE_S / source.dt)
 
@@ -128,11 +119,9 @@ def compensate_command(
     """Run the command `compensate`; messages go to stderr.
 
     Args:
-        sigma, gamma, sigma_weight, sigma_inertia, cutoff_hz, predicted: see `Compensator`.
         largest: range of the sensor: force [N], torque [N m].
-        free: log of free motion, see `Detector`.
-        control: UDP port of `Control`.
-        attach: function from a maker of compensators to an object that is used as a compensator.
+        free: log of free motion, for contact detection.
+        control: UDP port that accepts the request `tare`.
         stream: options of `open_source`.
     """
     found = Identification.load(load)

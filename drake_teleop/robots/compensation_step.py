@@ -17,13 +17,7 @@ _MAX_REST_FORCE, _MAX_REST_RATE = 0.1, 0.02  # rms at rest [m/s^2], [rad/s]
 
 @njit(cache=True)
 def value_problem(values, largest, limits):
-    """Return 0 for valid values, else `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`.
-
-    Args:
-        values: (15,) reading.
-        largest: (15,) maximum valid magnitudes.
-        limits: (6,) range of the sensor.
-    """
+    """Return 0 for a valid reading (15,), else `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`."""
     for i in range(15):
         if not math.isfinite(values[i]):
             return NOT_FINITE
@@ -38,13 +32,7 @@ def value_problem(values, largest, limits):
 
 @njit(cache=True)
 def low_pass_into(x, low_pass, memory):
-    """Filter a sample in place, by a second-order low-pass as in `scipy.signal.lfilter`.
-
-    Args:
-        x: (n,) sample.
-        low_pass: (7,) coefficients b, a_1, a_2 and the steady-state memory at input 1.
-        memory: (2, n) filter memory; NaN starts in the steady state.
-    """
+    """Filter a sample (n,) in place, by a second-order low-pass as in `scipy.signal.lfilter`."""
     start = math.isnan(memory[0, 0])
     for i in range(len(x)):
         u = x[i]
@@ -60,14 +48,8 @@ def low_pass_into(x, low_pass, memory):
 def eliminate_into(values, gravity, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
     """Write the contact wrench and scaled wrench of a valid reading to out (12,).
 
-    Args:
-        values: (15,) reading.
-        gravity: (3,) gravity in S, used only for different scales of weight and inertia.
-        offsets: (6,) sensor offsets.
-        phi, nothing: (10,) the load, and zeros.
-        scales: (4,) see `scaled_wrench_into`; then scale of the weight minus that of the inertia.
-        low_pass, memory: see `low_pass_into`; low_pass may be empty.
-        rest: (rows, 21); row `at` receives the reading and its unfiltered contact wrench.
+    `values` (15,) is the reading. Row `at` of `rest` (rows, 21) receives it with its unfiltered
+    contact wrench. `gravity` (3,) is used only for different scales of weight and inertia.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]
@@ -84,17 +66,13 @@ def eliminate_into(values, gravity, offsets, phi, nothing, scales, low_pass, mem
 
 @njit(cache=True)
 def scales_into(sigma_weight, sigma_inertia, gamma, scales):
-    """Write the scales (4,) of `eliminate_into`."""
     scales[0], scales[1], scales[2] = sigma_inertia, sigma_inertia, gamma
     scales[3] = sigma_weight - sigma_inertia
 
 
 @njit(cache=True)
 def add_to_statistics(row, count, mean, squares):
-    """Add a row to the mean and the sum of squared deviations of `count` rows with it.
-
-    The update is that of Welford (1962). `row`, `mean` and `squares` have one size.
-    """
+    """Add a row to the mean and the sum of squared deviations of `count` rows (Welford 1962)."""
     for i in range(len(row)):
         step = row[i] - mean[i]
         mean[i] += step / count
@@ -103,13 +81,7 @@ def add_to_statistics(row, count, mean, squares):
 
 @njit(cache=True)
 def tare_into(count, mean, squares, noise_limits, offsets):
-    """Add the mean contact wrench to the offsets (6,); return 0, or the reason of a refusal.
-
-    Args:
-        count: number of rows.
-        mean, squares: (21,) statistics of reading and unfiltered contact wrench.
-        noise_limits: (6,) maximum standard deviations of the contact wrench.
-    """
+    """Add the mean contact wrench to the offsets (6,); return 0, or the reason of a refusal."""
     for i in range(6, 9):
         if squares[i] > count * (_MAX_REST_FORCE * _MAX_REST_FORCE):
             return MOVES

@@ -1,8 +1,6 @@
 """Contact wrench of each reading; a flagged zero wrench for each invalid reading.
 
-Results are bit-equal to `eliminate --causal`. After `STALE_S` without a valid reading the low-pass
-restarts in its steady state. A reading's age is the excess of (our clock - source's clock) over its
-minimum, which rises by `CLOCK_DRIFT`.
+Results are bit-equal to `eliminate --causal`.
 """
 
 from __future__ import annotations
@@ -104,12 +102,6 @@ class Compensator:
         wait: delay of the motion, in readings, for which the source has corrected.
         predicted: extrapolate over `wait` and the delay of the low-pass.
         largest: (6,) range of the sensor [N, N m].
-        detector: contact detector; its flag replaces that of `watch`.
-
-    Attributes:
-        offsets: (6,) sensor offsets [N, N m].
-        lag_s: delay of a slow contact without prediction [s].
-        good_count: number of successive valid readings.
     """
 
     def __init__(
@@ -178,7 +170,6 @@ class Compensator:
     def set_scales(
         self, sigma: float, gamma: float, sigma_weight: float | None, sigma_inertia: float | None
     ) -> None:
-        """Set the scales from the next reading on; raise DrakeTeleopError if they are unusable."""
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:
@@ -214,7 +205,6 @@ class Compensator:
         return self._zero(_STALE)
 
     def time_to_stale(self, now: float) -> float:
-        """Return the time until the last reading is stale [s]."""
         return max(0.0, self._now + STALE_S - now)
 
     def tare(self) -> str:
@@ -241,7 +231,6 @@ class Compensator:
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
     def _tare_result(self) -> tuple[int, Array, Array]:
-        """Return the reason of a refusal or 0, the change of the offsets, and the new offsets."""
         mean, squares, offsets = np.zeros(VALUES + 6), np.zeros(VALUES + 6), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             add_to_statistics(row, float(number), mean, squares)

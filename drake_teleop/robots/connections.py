@@ -42,16 +42,15 @@ def open_source(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> Source[Reading]:
-    """Return the source at an address (docs/robot.md).
+    """Return the source at an address.
 
     Args:
         load: identified load, for the delay and for `weight_removed`.
-        rate_hz: rate of the wrenches; logs, UR robots and NetBoxes deliver their own.
+        rate_hz: rate of the wrenches, if the source does not deliver its own.
         cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live parts.
         real_time: replay a log in real time.
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
-        arm: kinematics for joint positions.
     """
     kind = _kind(address)
     if kind in PART_SOURCES:
@@ -94,11 +93,7 @@ def open_recording(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> tuple[Source[Any], Records[Any]]:
-    """Return the stream that `calibrate` reads, and its recorder.
-
-    Args:
-        largest: (6,) range of the sensor [N, N m]; the others: see `open_source`.
-    """
+    """Return the stream that `calibrate` reads, and its recorder."""
     kind = _kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
@@ -110,12 +105,10 @@ def open_recording(
 
 
 def is_file(address: str) -> bool:
-    """Return whether the address of a sink is a file or a folder of files."""
     return not _kind(address) and Path(address).suffix in SINKS
 
 
 def open_sink(address: str) -> Sink:
-    """Return the sink at an address; raise DrakeTeleopError if it is invalid."""
     kind = _kind(address) or Path(address).suffix
     if kind not in SINKS:
         remedy = f"give {_forms(SINKS)}"

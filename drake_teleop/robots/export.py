@@ -52,7 +52,6 @@ class Format:
         inertia, offsets: whether the format contains them.
         body: the format requires a physically consistent body.
         comment: prefix of a comment line; "" for none.
-        note: further warning for the user.
     """
 
     write: Callable[[Load], str]
@@ -71,14 +70,10 @@ def export(
     sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> tuple[str, list[str]]:
-    """Return the text in the format `to`, a key of `FORMATS`, and warnings.
+    """Return the text in the format `to`, and warnings of dropped or unidentified values.
 
-    The warnings name values that are dropped or not identified.
-
-    Args:
-        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame F of the export,
-            as in a URDF; None: F is S.
-        sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
+    `sensor_pose` is x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame of the export;
+    `sign` is -1 if the sensor reports the wrench of load on sensor (usual), else 1.
     """
     format = FORMATS[FORMATS.check(to, "export")]
     if format.of_sensor:
@@ -102,7 +97,6 @@ def export(
 
 
 def in_sensor_frame(to: str) -> DrakeTeleopError:
-    """Return the error for a sensor's pose and a format in the sensor's frame."""
     return DrakeTeleopError(
         f"{to} takes its values in the sensor's frame",
         where="export",
@@ -111,7 +105,6 @@ def in_sensor_frame(to: str) -> DrakeTeleopError:
 
 
 def refuse_removed_weight(found: Identification, to: str) -> None:
-    """Raise DrakeTeleopError for a load that was identified from a wrench without its weight."""
     if found.weight_removed:
         raise DrakeTeleopError(
             f"the robot has removed the load's weight from the wrench, and {to} would subtract it"
@@ -208,7 +201,7 @@ def _bota(load: Load) -> str:
     return _json({"payload_compensator_config": config})
 
 
-_SIX = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_INERTIA_NAMES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
 def _urdf(load: Load) -> str:
@@ -216,7 +209,7 @@ def _urdf(load: Load) -> str:
     inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
     SubElement(inertial, "origin", xyz=_words(load.com), rpy="0 0 0")
     SubElement(inertial, "mass", value=_number(load.mass))
-    SubElement(inertial, "inertia", dict(zip(_SIX, map(_number, load.six), strict=True)))
+    SubElement(inertial, "inertia", dict(zip(_INERTIA_NAMES, map(_number, load.six), strict=True)))
     return _xml(root)
 
 
@@ -227,7 +220,7 @@ def _sdf(load: Load) -> str:
     SubElement(inertial, "pose").text = f"{_words(load.com)} 0 0 0"
     SubElement(inertial, "mass").text = _number(load.mass)
     inertia = SubElement(inertial, "inertia")
-    for name, value in zip(_SIX, load.six, strict=True):
+    for name, value in zip(_INERTIA_NAMES, load.six, strict=True):
         SubElement(inertia, name).text = _number(value)
     return _xml(root)
 

@@ -64,11 +64,9 @@ class FoxgloveSink:
         self.port = self._server.port
 
     def write(self, out: Compensated) -> None:
-        """See `Sink`."""
         self._channel.log(out, None)
 
     def close(self) -> None:
-        """See `Sink`."""
         self._channel.close()
         self._server.stop()
 
@@ -87,10 +85,8 @@ class McapSink:
             )
 
     def write(self, out: Compensated) -> None:
-        """See `Sink`."""
         self._channel.log(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
 
     def close(self) -> None:
-        """See `Sink`."""
         self._file.close()
         self._channel.close()

@@ -1,7 +1,7 @@
 """Readings and wrenches as lines of JSON, and wrenches as tables.
 
-Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output: number,
-t, contact and scaled (6 each), and names of flags.
+Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output:
+number, t, contact and scaled (6 each), and names of flags.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _BLOCK_BYTES = 65536
 
 
 def read_line(line: bytes, number: int) -> Reading:
-    """Return the reading in a line, `DAMAGED` if it is invalid; `number` is the default number."""
+    """Return the reading in a line, flagged as damaged if it is invalid."""
     if len(line) > _MAX_LINE_BYTES:
         return DAMAGED
     try:
@@ -55,7 +55,6 @@ def read_line(line: bytes, number: int) -> Reading:
 
 
 def wrench_line(out: Compensated) -> str:
-    """Return a compensated wrench as a line of JSON."""
     data: dict[str, Any] = {
         "number": out.number,
         "t": out.t,
@@ -80,7 +79,6 @@ class LineSource(Source[Reading]):
         self.dt, self._file, self._partial, self._number, self._ended = dt, file, b"", 0, False
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """See `Source`."""
         if self._ended:
             return None
         if not select.select([self._file], [], [], timeout_s)[0]:
@@ -105,7 +103,6 @@ class LineSink(Sink):
         self._file = file
 
     def write(self, out: Compensated) -> None:
-        """See `Sink`."""
         self._file.write(wrench_line(out) + "\n")
         self._file.flush()
 
@@ -128,13 +125,11 @@ class TableSink:
         self._due = -np.inf
 
     def write(self, out: Compensated) -> None:
-        """See `Sink`."""
         self._rows.append(out)
         if time.monotonic() >= self._due:
             self._flush()
 
     def close(self) -> None:
-        """See `Sink`."""
         if self._rows or not self._written:
             self._flush()
 

@@ -41,7 +41,6 @@ class Record(NamedTuple):
 
 
 def unpack_record(packet: bytes) -> Record | None:
-    """Return the record in a packet; None if it is invalid."""
     if len(packet) != RECORD.size:
         return None
     rdt, ft, status, *counts = RECORD.unpack(packet)
@@ -76,7 +75,6 @@ class NetFtSource:
         self._measured, self._measured_at = -1, -math.inf
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
         self._request_stream()
         found: list[Part] = []
         self._socket.settimeout(timeout_s)
@@ -120,7 +118,6 @@ class NetFtSource:
             self._socket.send(REQUEST.pack(_HEADER, command, 0))
 
     def close(self) -> None:
-        """See `PartSource`."""
         self._send(STOP)
         self._socket.close()
 
@@ -145,11 +142,7 @@ def _read_page(address: Address) -> list[float]:
 
 
 def parse_page(content: bytes) -> list[float]:
-    """Return counts per N and per N m, and the rate [Hz], from netftapi2.xml.
-
-    Raises:
-        SyntaxError, KeyError, ValueError: if they are missing or invalid.
-    """
+    """Return counts per N and per N m, and the rate [Hz], from netftapi2.xml."""
     from xml.etree import ElementTree
 
     text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}
@@ -179,12 +172,7 @@ class SampleClock:
         self._first: tuple[int, float] | None = None
 
     def time_of(self, number: int, now: float) -> float:
-        """Return the time of a sample, on this clock [s].
-
-        Args:
-            number: sample number, smaller than before if out of order or after a restart.
-            now: our monotonic clock [s].
-        """
+        """Return the time [s] of a sample that is received at `now` [s] of our monotonic clock."""
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _JUMP_S:
             self._first = number, now

@@ -1,7 +1,4 @@
-"""Recorders that collect the samples of a stream and write them as a log.
-
-If a clock is set, a new record starts; the longest one is written.
-"""
+"""Recorders that collect the samples of a stream and write them as a log."""
 
 from __future__ import annotations
 
@@ -47,10 +44,11 @@ _T = TypeVar("_T")
 class Records(ABC, Generic[_T]):
     """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
+    If a clock is set, a new record starts; the longest one is written.
+
     Attributes:
-        file, files: name of the log, and of all written files.
         left_out: number of rejected samples.
-        began_anew: number of clock changes.
+        clock_changes: number of clock changes.
     """
 
     file: str
@@ -58,7 +56,7 @@ class Records(ABC, Generic[_T]):
 
     def __init__(self, largest: dict[str, Array | None]) -> None:
         self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
-        self.left_out, self.began_anew = 0, 0
+        self.left_out, self.clock_changes = 0, 0
         self._part, self._other_clock = self._empty_part(), self._empty_part()
         self._longest = self._part
 
@@ -78,7 +76,7 @@ class Records(ABC, Generic[_T]):
             other = self._other_clock[stream] = _Samples()
         self.left_out += not (samples if same_clock else other).add(t, values, now)
         if len(other.t) == _CLOCK_SAMPLES:
-            self.began_anew += 1
+            self.clock_changes += 1
             self._longest = self._longest_part()
             self._part, self._other_clock = self._other_clock, self._empty_part()
 
@@ -87,7 +85,6 @@ class Records(ABC, Generic[_T]):
 
     @property
     def seconds(self) -> float:
-        """Length of the record [s]."""
         return _seconds(self._longest_part())
 
     @abstractmethod
@@ -95,8 +92,7 @@ class Records(ABC, Generic[_T]):
         """Add a sample if it is valid."""
 
     @abstractmethod
-    def write(self, path: Path) -> None:
-        """Write the log; raise DrakeTeleopError if there are too few samples."""
+    def write(self, path: Path) -> None: ...
 
 
 class Recorder(Records[Reading]):
@@ -109,11 +105,9 @@ class Recorder(Records[Reading]):
         super().__init__({WRENCH: largest})
 
     def add(self, sample: Reading) -> None:
-        """See `Records`."""
         self._add(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
-        """See `Records`."""
         t, values = self._longest_part()[WRENCH].table(VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
@@ -135,7 +129,6 @@ class PartRecorder(Records[tuple[Part, float]]):
         self._p_FS = X_FS[4:]
 
     def add(self, sample: tuple[Part, float]) -> None:
-        """See `Records`."""
         part, now = sample
         if part.stream not in self._part:
             return
@@ -146,7 +139,6 @@ class PartRecorder(Records[tuple[Part, float]]):
         self._add(part.stream, part.t, part.values, flags, now)
 
     def write(self, path: Path) -> None:
-        """See `Records`."""
         import polars as pl
 
         wrench, motion = (self._longest_part()[stream] for stream in (WRENCH, self._motion_stream))

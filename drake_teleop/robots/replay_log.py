@@ -20,14 +20,8 @@ from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 class LogSource(Source[Reading]):
     """Source of a log's readings, with the motion aligned to the wrench.
 
-    `wait`: removed delay of the motion, in readings.
-
-    Args:
-        load: load for the estimate of the delay; None: no alignment. If the robot removed its
-            weight, s is the acceleration.
-        cutoff_hz, delay: see `eliminate_log`.
-        real_time: replay in real time; else as fast as possible.
-        chunk: maximum number of readings per call.
+    `wait` is the removed delay of the motion, in readings; `chunk` the largest number of readings
+    per call. Without a `load` the motion is not aligned.
     """
 
     def __init__(
@@ -62,7 +56,6 @@ class LogSource(Source[Reading]):
         self._at, self._chunk, self._start = 0, chunk, math.nan
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """See `Source`."""
         first, last = self._at, len(self._t)
         if first == last:
             return None

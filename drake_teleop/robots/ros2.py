@@ -1,8 +1,4 @@
-"""Source and sink for ROS 2 by rclpy, in one node of this process.
-
-All subscriptions are best-effort, which fits every publisher. Messages are received in CDR, so that
-an invalid one becomes a flagged reading.
-"""
+"""Source and sink for ROS 2 by rclpy, in one node of this process."""
 
 from __future__ import annotations
 
@@ -53,12 +49,10 @@ class RosNode:
         self._executor.add_node(self.node)
 
     def spin(self, timeout_s: float) -> None:
-        """Wait for one event and execute its callback."""
         self._executor.spin_once(timeout_sec=timeout_s)
 
     @delayed_signals()
     def close(self) -> None:
-        """Leave the network; a second call does nothing."""
         if self._context.ok():
             shared_node.cache_clear()
             self._executor.shutdown()
@@ -68,16 +62,11 @@ class RosNode:
 
 @cache
 def shared_node(domain: int) -> RosNode:
-    """Return the node of this process in a ROS domain."""
     return RosNode(domain)
 
 
 def parse_address(text: str, allowed: tuple[str, ...]) -> Address:
-    """Return the address ros2://TOPIC[?...]; the first name of TOPIC is no host.
-
-    Raises:
-        DrakeTeleopError: if it is invalid, or rclpy is missing.
-    """
+    """Return the address ros2://TOPIC[?...]; the first name of TOPIC is no host."""
     kind, _, rest = text.partition("://")
     address = Address(f"{kind}:///{rest.lstrip('/')}", None, allowed, host="localhost")
     require_library("rclpy", "rclpy", "ros2", text)
@@ -85,11 +74,7 @@ def parse_address(text: str, allowed: tuple[str, ...]) -> Address:
 
 
 def message_class(kind: str, where: str) -> Any:
-    """Return the class of a message type such as "sensor_msgs/msg/Imu".
-
-    Raises:
-        DrakeTeleopError: if its package is missing; `where` is the address.
-    """
+    """Return the class of a message type such as "sensor_msgs/msg/Imu"."""
     package, _, name = kind.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
@@ -123,7 +108,6 @@ class Ros2Source:
 
     @delayed_signals()
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
         self._take_all()
         if not self._found:
             self._node.spin(timeout_s)
@@ -135,7 +119,6 @@ class Ros2Source:
         return found
 
     def close(self) -> None:
-        """See `PartSource`."""
         self._node.close()
 
     def _take_all(self) -> None:
@@ -176,10 +159,7 @@ class Ros2Source:
 
 
 class Ros2Sink:
-    """Sink at ros2://TOPIC[?frame=NAME&wrench=scaled&domain=N], with flags on `/diagnostics`.
-
-    The messages have the time stamps of sending, because stale zeros have no other.
-    """
+    """Sink at ros2://TOPIC[?frame=NAME&wrench=scaled&domain=N], with flags on `/diagnostics`."""
 
     @delayed_signals()
     def __init__(self, address: str) -> None:
@@ -206,7 +186,6 @@ class Ros2Sink:
 
     @delayed_signals()
     def write(self, out: Compensated) -> None:
-        """See `Sink`."""
         message, ns = self._message, time.time_ns()
         _stamp(message.header, ns)
         wrench = getattr(out, self._which).tolist()
@@ -223,7 +202,6 @@ class Ros2Sink:
             self._diagnostics.publish(self._diagnosis(out, ns))
 
     def close(self) -> None:
-        """See `Sink`."""
         self._node.close()
 
     def _diagnosis(self, out: Compensated, ns: int) -> Any:

@@ -27,7 +27,6 @@ SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 
 
 def domain_of(address: Address) -> int:
-    """Return the ROS domain in an address, by default 0; raise DrakeTeleopError if invalid."""
     text = address.parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         raise DrakeTeleopError(
@@ -39,7 +38,6 @@ def domain_of(address: Address) -> int:
 
 
 def topic_of(address: Address, text: str) -> str:
-    """Return a topic name without leading slash; raise DrakeTeleopError if invalid."""
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
@@ -53,14 +51,7 @@ def topic_of(address: Address, text: str) -> str:
 def source_topics(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """Return the topics in an address by name (see `KINDS`), the frames of `tf`, and the streams.
-
-    Args:
-        joints: names of the arm's joints.
-
-    Raises:
-        DrakeTeleopError: if a topic or `tf` is invalid, or joint names are missing.
-    """
+    """Return the topics in an address by name, the frames of `tf`, and the streams."""
     topics = {WRENCH: topic_of(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
         if (text := address.parameter(stream)) is not None:
@@ -84,18 +75,11 @@ def source_topics(
 
 
 def damaged(name: str) -> Part:
-    """Return the part for an invalid message; `name`: see `KINDS`."""
     return DAMAGED_WRENCH._replace(stream=_STREAMS.get(name, name))
 
 
 class MessageConverter:
-    """Converter of ROS 2 messages to parts (samples of single streams).
-
-    Args:
-        sign: see `Address.sign`.
-        frames: parent and child frame of the pose from `/tf`; empty for none.
-        joints: names of the joints, in the order of the values.
-    """
+    """Converter of ROS 2 messages to parts; `frames` are parent and child of the pose in `/tf`."""
 
     def __init__(
         self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
@@ -104,7 +88,7 @@ class MessageConverter:
         self._links: dict[str, tuple[str, Array]] = {}
 
     def parts_of(self, name: str, data: Any, number: int) -> list[Part]:
-        """Return the parts of a message with ROS's fields; `name`: see `KINDS`."""
+        """Return the parts of a message with ROS's fields; `name` is a key of `KINDS`."""
         if name == "tf":
             samples = self._transform_pose(data)
         else:

@@ -1,16 +1,4 @@
-"""`drake-teleop ros2`: `compensate` as a ROS 2 node with services and parameters.
-
-=============== ===============================================================================
-service         std_srvs/Trigger; `message` contains the result or the reason of a refusal
-~/tare          set the offsets; at rest, without contact
-~/load          read the file of the parameter `load`
-~/calibrate     record until the tolerance `until` is met, and use the load; answers at the end
-parameter
-sigma, gamma    scales of the scaled wrench; sigma_weight and sigma_inertia, if negative: sigma
-load, until     file of the load; tolerances and
-seconds         largest length [s] of the record of a calibration
-=============== ===============================================================================
-"""
+"""`drake-teleop ros2`: `compensate` as a ROS 2 node with services and parameters."""
 
 from __future__ import annotations
 
@@ -40,13 +28,8 @@ _CALIBRATE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[
 class ServedCompensator:
     """Compensator that the services and parameters of a node replace and change.
 
-    Args:
-        node: node of rclpy.
-        make: function from a load to a compensator.
-        load: file of the load.
-        calibrate: function from tolerance and seconds to the arguments of `calibrate`.
-        out: folder of the calibration.
-        scales: sigma and gamma.
+    `make` maps a load to a compensator; `calibrate` maps tolerance and seconds to the arguments of
+    the command `calibrate`, whose results are written to `out`.
     """
 
     @delayed_signals()
@@ -80,7 +63,6 @@ class ServedCompensator:
         return getattr(self._current, name)
 
     def close(self) -> None:
-        """End a calibration that runs; its record is kept."""
         if (process := self._process) is not None:
             process.terminate()
             try:
@@ -169,15 +151,7 @@ def ros2_command(
     calibrate: Callable[[str, float], list[str]],
     **options: Any,
 ) -> None:
-    """Run the command `ros2` until SIGINT or SIGTERM; `options` are those of `compensate_command`.
-
-    Args:
-        out: folder of the calibrations.
-        calibrate: function from tolerance and seconds [s] to the arguments of `calibrate`.
-
-    Raises:
-        DrakeTeleopError: if an argument is invalid, or rclpy is missing.
-    """
+    """Run the command `ros2` until SIGINT or SIGTERM."""
     for address in (source, sink):
         if not address.startswith("ros2://"):
             raise DrakeTeleopError(

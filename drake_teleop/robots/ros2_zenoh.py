@@ -1,8 +1,4 @@
-"""Experimental source and sink for ROS 2 with rmw_zenoh, by eclipse-zenoh, without ROS.
-
-A topic has the key `DOMAIN/TOPIC/TYPE/HASH`. Messages are CDR, with number, send time and sender
-attached.
-"""
+"""Experimental source and sink for ROS 2 with rmw_zenoh, by eclipse-zenoh, without ROS."""
 
 from __future__ import annotations
 
@@ -39,13 +35,11 @@ _NODE = "drake_teleop"
 
 
 def require_libraries(where: str) -> None:
-    """Raise DrakeTeleopError, for the address `where`, if a library is missing."""
     require_library("zenoh", "eclipse-zenoh", "ros", where)
     require_library("rosbags", "rosbags", "ros", where)
 
 
 def message_types() -> Any:
-    """Return the store of ROS 2 message types of rosbags."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -70,7 +64,7 @@ def open_session(address: Address) -> Any:
 
 
 def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
-    """Return the zenoh key of a topic, by default with any hash (ROS Humble has none)."""
+    """Return the zenoh key of a topic, by default with any type hash."""
     return f"{domain}/{topic}/{_dds(kind)}/{hashed}"
 
 
@@ -87,12 +81,11 @@ def liveliness_tokens(
 
 
 def attachment(number: int, ns: int, sender: bytes) -> bytes:
-    """Return the attachment of a message, as in rmw_zenoh since 0.2.4; `ns`: send time."""
+    """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
     return _ATTACHMENT.pack(number, ns, len(sender), sender)
 
 
 def message_number(attached: bytes) -> int | None:
-    """Return the message number in an attachment; None if it is absent."""
     if len(attached) == _ATTACHMENT.size:
         return int(_NUMBER.unpack_from(attached)[0])
     if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
@@ -106,7 +99,7 @@ def _dds(kind: str) -> str:
 
 
 class Messages(MessageConverter):
-    """Converter of ROS 2 messages in CDR; for the arguments see `MessageConverter`."""
+    """Converter of ROS 2 messages in CDR."""
 
     def __init__(
         self, sign: float, frames: tuple[str, ...] = (), joints: tuple[str, ...] = ()
@@ -121,7 +114,6 @@ class Messages(MessageConverter):
         self._counts = dict.fromkeys(KINDS, 0)
 
     def parts(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
-        """Return the parts of a CDR message, flagged if it is invalid; `name`: see `KINDS`."""
         self._counts[name] += 1
         number = message_number(attachment)
         if number is None:
@@ -153,7 +145,6 @@ class ZenohSource:
             )
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
         found: list[Part] = []
         try:
             found += self.messages.parts(*self._queue.get(timeout=timeout_s))
@@ -164,7 +155,6 @@ class ZenohSource:
         return found
 
     def close(self) -> None:
-        """See `PartSource`."""
         self._session.close()
 
     def _callback(self, stream: str) -> Callable[[Any], None]:
@@ -180,7 +170,7 @@ class ZenohSource:
 class ZenohSink:
     """Sink for WrenchStamped at zenoh://HOST[:PORT]/TOPIC[?frame=NAME&wrench=scaled&domain=N].
 
-    Messages contain the send time, because stale zeros have no other. Flags are not sent.
+    Flags are not sent.
     """
 
     def __init__(self, address: str) -> None:
@@ -203,7 +193,6 @@ class ZenohSink:
         )
 
     def write(self, out: Compensated) -> None:
-        """See `Sink`."""
         ns = time.time_ns()
         self._number += 1
         message = self.message(getattr(out, self._which), ns)
@@ -219,5 +208,4 @@ class ZenohSink:
         return bytes(self._types.serialize_cdr(kinds[WRENCH_STAMPED](header, both), WRENCH_STAMPED))
 
     def close(self) -> None:
-        """See `Sink`."""
         self._session.close()

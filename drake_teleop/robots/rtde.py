@@ -54,7 +54,6 @@ class RtdeSource:
         self.dt = 0.002 if spacing < 0.005 else 0.008
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
         samples, self._first = [*self._first, *self._samples(timeout_s)], []
         return [part for sample in samples for part in parts_of(sample, self.dt, self._sign)]
 
@@ -92,15 +91,10 @@ class RtdeSource:
         os.close(self._pipe)
 
     def close(self) -> None:
-        """See `PartSource`."""
         self._stop()
 
 
 def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
-    """Return wrench, pose and acceleration of a sample of `rtde_reader` as parts.
-
-    `dt`: period of the robot [s]; `sign`: see `Address.sign`.
-    """
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
     values_of_stream = {

@@ -17,7 +17,6 @@ _POLL_S, _MAX_SILENCE_S = 0.0002, 1.0
 
 
 def read(host: str, pipe: int) -> None:
-    """Write samples to a pipe until the robot disconnects or sends no new ones."""
     import rtde_receive
 
     robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(VARIABLES))
@@ -34,7 +33,6 @@ def read(host: str, pipe: int) -> None:
 
 
 def main() -> None:
-    """Run `read` with the command-line arguments host and file descriptor."""
     try:
         read(sys.argv[1], int(sys.argv[2]))
     finally:

@@ -104,7 +104,6 @@ class Source(Protocol[_T]):
         """Return the samples after waiting for the first; [] after the timeout, None at the end."""
 
     def close(self) -> None:
-        """Close the source."""
         return
 
 
@@ -114,19 +113,15 @@ class PartSource(Protocol):
     dt: float
     streams: tuple[str, ...]
 
-    def read(self, timeout_s: float) -> list[Part] | None:
-        """See `Source`."""
+    def read(self, timeout_s: float) -> list[Part] | None: ...
 
-    def close(self) -> None:
-        """See `Source`."""
+    def close(self) -> None: ...
 
 
 class Sink(Protocol):
     """Interface of a sink of compensated wrenches."""
 
-    def write(self, out: Compensated) -> None:
-        """Write a compensated wrench."""
+    def write(self, out: Compensated) -> None: ...
 
     def close(self) -> None:
-        """Close the sink."""
         return

@@ -1,9 +1,4 @@
-"""Sources and sink of UDP packets, with the layout of `drake_teleop_udp.h`.
-
-Little-endian, without padding. Input: "DTW1", flags (`ReadingFlag.SATURATED` only), number, time
-[s], wrench (6), s, omega, alpha (3 each); or "DTP1", the same head, wrench (6), pose (w x y z,
-position). Output: "DTC1", the same head, contact wrench (6), scaled wrench (6).
-"""
+"""Sources and sink of UDP packets: little-endian, without padding, as in `drake_teleop_udp.h`."""
 
 from __future__ import annotations
 
@@ -39,12 +34,11 @@ _SATURATED = int(ReadingFlag.SATURATED)
 
 
 def pack_reading(reading: Reading) -> bytes:
-    """Return the packet of a reading."""
     return READING.pack(_READING_TAG, reading.flags, reading.number, reading.t, *reading.values)
 
 
 def unpack_reading(packet: bytes) -> Reading:
-    """Return the reading in a packet; `DAMAGED` if it is invalid."""
+    """Return the reading in a packet, flagged as damaged if it is invalid."""
     if len(packet) != READING.size or packet[:4] != _READING_TAG:
         return DAMAGED
     _, flags, number, t = _HEAD.unpack_from(packet)
@@ -53,13 +47,11 @@ def unpack_reading(packet: bytes) -> Reading:
 
 
 def pack_parts(wrench: Part, pose: Part) -> bytes:
-    """Return the packet of a wrench and a pose."""
     head = _POSED_TAG, wrench.flags, wrench.number, wrench.t
     return POSED.pack(*head, *wrench.values, *pose.values)
 
 
 def unpack_parts(packet: bytes) -> list[Part]:
-    """Return wrench and pose in a packet; a damaged wrench if it is invalid."""
     if len(packet) != POSED.size or packet[:4] != _POSED_TAG:
         return [DAMAGED_WRENCH]
     _, flags, number, t = _HEAD.unpack_from(packet)
@@ -69,13 +61,11 @@ def unpack_parts(packet: bytes) -> list[Part]:
 
 
 def pack_wrench(out: Compensated) -> bytes:
-    """Return the packet of a compensated wrench."""
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
     return _HEAD.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
 def unpack_wrench(packet: bytes) -> Compensated:
-    """Return the compensated wrench in a packet; raise DrakeTeleopError if it is invalid."""
     if len(packet) != WRENCH.size or packet[:4] != _WRENCH_TAG:
         raise DrakeTeleopError(
             f"its {len(packet)} bytes are not a compensated wrench",
@@ -87,7 +77,6 @@ def unpack_wrench(packet: bytes) -> Compensated:
 
 
 def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
-    """Return host (default: this machine) and port; raise DrakeTeleopError if there is no port."""
     try:
         parts = urlsplit(address)
         host, port = parts.hostname or THIS_MACHINE, port if parts.port is None else parts.port
@@ -103,7 +92,6 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that receives UDP packets; raise DrakeTeleopError if the port is in use."""
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.bind((host, port))
@@ -141,7 +129,6 @@ class UdpSource(_Receiver):
     live = True
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        """See `Source`."""
         return [unpack_reading(packet) for packet in self.packets(timeout_s)]
 
 
@@ -155,7 +142,6 @@ class PosedSource(_Receiver):
         super().__init__(address, dt)
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `PartSource`."""
         parts = [part for packet in self.packets(timeout_s) for part in unpack_parts(packet)]
         signs = {streams.WRENCH: self._sign}
         return [part._replace(values=signs.get(part.stream, 1.0) * part.values) for part in parts]
@@ -181,5 +167,4 @@ class UdpSink:
                 ) from error
 
     def close(self) -> None:
-        """See `Sink`."""
         self._socket.close()

@@ -1,8 +1,4 @@
-"""Detection of contact or of another load, sample by sample, for `compensate --watch`.
-
-With `--free LOG`, contact is detected as by `detect`, with a noise floor fitted to a log of free
-motion.
-"""
+"""Detection of contact or of another load, sample by sample, for `compensate`."""
 
 from __future__ import annotations
 
@@ -14,7 +10,12 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.contact.detection import RARE, ContactDetector, fit_noise_floor, flag_update
+from drake_teleop.load.contact.detection import (
+    MAX_NOISE_LEVEL,
+    ContactDetector,
+    fit_noise_floor,
+    flag_update,
+)
 from drake_teleop.load.contact.noise_floor import finite_covariance
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters
@@ -42,16 +43,13 @@ _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual.
-
-    `dt`: period of the readings [s]; `cutoff_hz`: low-pass of the residual of `load`.
-    """
+    """Return a reading's white noise (6,) [N, N m] that explains the residual of `load`."""
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
 
 class Watch:
-    """Detector of contact and of another load; `cutoff_hz`: low-pass of the residual of `load`."""
+    """Detector of contact and of another load than the identified one."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = raw_noise(load, dt, cutoff_hz)
@@ -67,7 +65,7 @@ class Watch:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Reset all but the identified load; `offsets` (6,): sensor offsets [N, N m]."""
+        """Reset all but the identified load."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = watched_memory(self._out, self._covariance)
 
@@ -88,12 +86,7 @@ _RATE_TOLERANCE = 0.05
 
 
 class Detector:
-    """Contact detector with the noise floor of a log after the causal low-pass.
-
-    Args:
-        free: log of free motion of the load, at the rate of the stream.
-        delay: delay of the log, see `eliminate_log`.
-    """
+    """Contact detector with the noise floor of a log of free motion, after the causal low-pass."""
 
     def __init__(
         self,
@@ -128,7 +121,7 @@ class Detector:
         covariance = finite_covariance(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
-        threshold = max(RARE, floor.threshold(_STATISTIC))
+        threshold = max(MAX_NOISE_LEVEL, floor.threshold(_STATISTIC))
         self._settings = ContactDetector(
             floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
         ).settings
@@ -137,7 +130,6 @@ class Detector:
         self.restart()
 
     def restart(self) -> None:
-        """Reset all but the noise floor."""
         self._memory = ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
@@ -151,10 +143,7 @@ class Detector:
         return out
 
     def flags(self, values: Array, contact: Array) -> int:
-        """Return `ReadingFlag.IN_CONTACT` or 0 for a valid reading (15,).
-
-        `contact` (6,): its low-passed contact wrench [N, N m].
-        """
+        """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
         touched = _detect(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )

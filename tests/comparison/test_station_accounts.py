@@ -106,7 +106,9 @@ def test_station_without_channel_raises():
     result, _ = logged(lambda p: np.zeros(6))
     kept = [name for name in result if name != "ports"]
     less = SimulationResult(result.t, {n: result[n] for n in kept}, [SIGNALS[n] for n in kept])
-    with pytest.raises(DrakeTeleopError, match=r"accounts: .*no ports; run a station over"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"accounts: .*lacks the signals .*ports; run a station over"
+    ):
         station_accounts(less, SCENARIO)
 
 

@@ -13,7 +13,7 @@ from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import (
     DISTURBED,
-    FADE,
+    FADE_TIME_S,
     LEARNING,
     OTHER_LOAD,
     SETTLED,
@@ -142,7 +142,7 @@ def test_estimate_changes_without_a_step(grasped):
     assert np.abs(faded[0]) < 0.01 * phi[2900, 0]
     watched = grasped.t > first(grasped, SETTLED) + 0.01
     steps = np.abs(np.diff(phi[watched], axis=0))
-    assert (steps <= 1e-3 / FADE * np.ptp(phi[watched], axis=0) * 1.02).all()
+    assert (steps <= 1e-3 / FADE_TIME_S * np.ptp(phi[watched], axis=0) * 1.02).all()
 
 
 @pytest.mark.long
@@ -233,7 +233,7 @@ def test_known_gripper_stays_eliminated(known, grasped):
 def test_watch_without_a_load_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"load_estimator.method: .*too small.*rtls"):
         replace(SCENARIO, load_estimator__method="rls").check()
-    with pytest.raises(DrakeTeleopError, match=r"load_estimator.watch: .*no load to watch"):
+    with pytest.raises(DrakeTeleopError, match=r"load_estimator.watch: .*no load to monitor"):
         MakeTeleopStation(replace(Scenario(), load_estimator__watch=True))
 
 

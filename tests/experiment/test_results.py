@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_procedure import SMALL, go_through
 
-from drake_teleop.cli.experiment import whose_turn
+from drake_teleop.cli.experiment import next_participant
 from drake_teleop.common.style import Picture
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
 from drake_teleop.live.experiment.procedure import Procedure, trials_of
@@ -58,11 +58,11 @@ def test_axis_of_a_quantity_has_tick_labels(least, most):
 
 def test_next_participant_has_trials_left_or_is_new(tmp_path):
     store, trials = Store(tmp_path), len(trials_of(SMALL, 1))
-    assert whose_turn(store, trials) == 1
+    assert next_participant(store, trials) == 1
     go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0)
-    assert whose_turn(store, trials) == 2
+    assert next_participant(store, trials) == 2
     go_through(Procedure(SMALL, 2, store), np.random.default_rng(0), 2.0, most=5)
-    assert (whose_turn(store, trials), whose_turn(store, trials, 7)) == (2, 7)
+    assert (next_participant(store, trials), next_participant(store, trials, 7)) == (2, 7)
 
 
 def test_shares_have_arithmetic_means_and_times_geometric_ones(tmp_path):

@@ -13,7 +13,7 @@ from full_disk import small_disk
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.progress import silent
-from drake_teleop.live.live import FRAME, MAX_MESSAGE_BYTES, Live, parse
+from drake_teleop.live.live import FRAME_PERIOD_S, MAX_MESSAGE_BYTES, Live, parse
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.result import SimulationResult
@@ -61,7 +61,7 @@ def test_closed_page_releases_the_hand_and_completes_the_record(scenario, load, 
     assert frames[-1]["contact"] and frames[-1]["f"][1][1] > 0.2
     assert not frames[1]["contact"] and frames[-1]["state"] == "running"
     assert frames[-1]["factor"] == pytest.approx(1.0, abs=0.01) and frames[-1]["lost"] == 0.0
-    assert len(frames) == pytest.approx(0.25 / FRAME, abs=2)
+    assert len(frames) == pytest.approx(0.25 / FRAME_PERIOD_S, abs=2)
     assert frames[-1]["energy"][0] > 0.0 and frames[-1]["energy"][1] > 0.0
 
     left = clock.now
@@ -93,11 +93,11 @@ def test_first_page_drives_and_another_takes_over_on_request(scenario, load, clo
     live.join(1, clock())
     live.join(2, clock())
     live.handle_message(2, '{"set": {"x": 100}, "pause": true, "reset": true}', clock())
-    (frame, *_) = pass_time(live, clock, FRAME)
+    (frame, *_) = pass_time(live, clock, FRAME_PERIOD_S)
     assert (frame["driver"], frame["inputs"]["x"], frame["drive"]) == (1, 0, 1)
     live.handle_message(2, '{"drive": true, "set": {"x": 100}}', clock())
     live.handle_message(1, '{"set": {"x": 500}}', clock())
-    frame = pass_time(live, clock, FRAME)[-1]
+    frame = pass_time(live, clock, FRAME_PERIOD_S)[-1]
     assert (frame["driver"], frame["inputs"]["x"]) == (2, 100)
     live.handle_message(2, '{"pause": true}', clock())
     frames = pass_time(live, clock, 0.1)
@@ -105,7 +105,7 @@ def test_first_page_drives_and_another_takes_over_on_request(scenario, load, clo
     live.handle_message(2, '{"pause": false, "slow": 10}', clock())
     assert pass_time(live, clock, 0.2)[-1]["t"] - frames[-1]["t"] == pytest.approx(0.02, abs=6e-3)
     live.handle_message(2, '{"reset": true}', clock())
-    frame = pass_time(live, clock, FRAME)[-1]
+    frame = pass_time(live, clock, FRAME_PERIOD_S)[-1]
     assert (frame["drive"], frame["inputs"]["x"]) == (2, 0) and frame["t"] < 0.02
 
 
@@ -126,10 +126,10 @@ def test_impossible_station_is_reported_and_the_drive_continues(scenario, load, 
 def test_removed_force_is_reported(scenario, load, clock, monkeypatch):
     live = make(scenario, load, clock)
     live.join(1, clock())
-    assert pass_time(live, clock, FRAME)[-1]["words"] == []
+    assert pass_time(live, clock, FRAME_PERIOD_S)[-1]["words"] == []
     monkeypatch.setattr(Session, "removed_force", lambda session: 1.234)
     said = "1.2 N are not rendered until the hand presses less"
-    assert pass_time(live, clock, FRAME)[-1]["words"] == [said]
+    assert pass_time(live, clock, FRAME_PERIOD_S)[-1]["words"] == [said]
 
 
 def test_new_scene_starts_a_drive_with_its_own_folder(scenario, load, clock, tmp_path):

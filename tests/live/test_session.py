@@ -256,7 +256,7 @@ def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeyp
     assert [p.read_bytes() for p in parts] == [p.read_bytes() for p in again]
     assert (
         json.loads((tmp_path / "again" / "session.json").read_text())["load_source"]
-        == "of the drive"
+        == "from the recorded drive"
     )
     for wrong in ([], ["press", "--inputs", str(folder)], ["--inputs", str(folder), "--seed", "1"]):
         with pytest.raises(SystemExit) as end:

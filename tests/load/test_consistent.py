@@ -135,7 +135,7 @@ def test_bad_input_is_named():
     with pytest.raises(DrakeTeleopError, match=r"^prior\.weight: 0.0 is not positive"):
         Prior(TOOL, 0.0)
     with pytest.raises(
-        DrakeTeleopError, match=r"^prior\.phi: its body has no extent in some direction"
+        DrakeTeleopError, match=r"^prior\.phi: is the load of a body that has no extent"
     ):
         Prior(POINT, 1.0)
     with pytest.raises(DrakeTeleopError, match=r"^ellipsoid\.matrix: is not positive definite"):

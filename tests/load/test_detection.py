@@ -22,9 +22,9 @@ from contact_detection import auc, free_threshold
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import (
-    LEAVE,
+    DEFAULT_SLACK,
+    END_LEVEL,
     SIZE,
-    SLACK,
     ContactDetector,
     detection_update,
     fit_noise_floor,
@@ -348,7 +348,7 @@ def test_fast_motion_is_no_contact_and_a_push_in_it_is():
 def test_an_update_is_one_sample():
     memory, floor = np.zeros(SIZE), white(0.5)
     for count in (1.0, 2.0):
-        detection_update(memory, NOISE, *STILL, floor.parameters, SLACK, 0.0, LEAVE)
+        detection_update(memory, NOISE, *STILL, floor.parameters, DEFAULT_SLACK, 0.0, END_LEVEL)
         assert memory[0] == count
 
 

@@ -297,7 +297,7 @@ def test_old_files_without_the_optional_fields_are_read(tmp_path):
         ),
         ("degrees_of_freedom", 3.0, "json:degrees_of_freedom: is not a list of 16"),
         ("prior_dominated", [1.5] * 16, "json:prior_dominated: is not a list of 16"),
-        ("verdicts", ["identified"] * 15, "json:verdicts: does not follow"),
+        ("verdicts", ["identified"] * 15, "json:verdicts: contradicts"),
     ],
 )
 def test_spoilt_optional_fields(tmp_path, field, value, message):

@@ -77,8 +77,11 @@ def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, nam
 def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
     steps = (Step("load", 103.0), Step("offsets", 105.0))
     values = [*LOAD, 1.0, *np.zeros(5)]
-    found = causes_of(state_of(Model(steps=steps), values, (span,)))
-    assert ("contact" in [x.name for x in found]) == shown
+    state = state_of(Model(steps=steps), values, (span,))
+    found = causes_of(state)
+    contacts = [(x.start_s, x.stop_s) for x in found if x.name == "contact"]
+    margin = state.data.dt
+    assert contacts == ([(span[0] + margin, span[1] - margin)] if shown else [])
     starts = [x.start_s for x in found]
     assert starts == sorted(starts) and {103.0, 105.0} <= set(starts)
 

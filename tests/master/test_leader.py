@@ -211,7 +211,7 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
 @pytest.mark.parametrize(
     ("leader", "said"),
     [
-        (None, "master.leader: a leader arm and `model: leader` belong together"),
+        (None, "master.leader: a leader arm requires `model: leader`"),
         (Leader(hand_frame="hand"), "master.leader.file: is required for a leader arm"),
         (
             dataclasses.replace(LEADER, friction=[-1.0]),

@@ -286,7 +286,7 @@ def test_invalid_force_is_rejected_when_assigned():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (with_task(Reach(width=0.4)), r"operator\.task\.translation: the target is 0\.1 m away"),
+        (with_task(Reach(width=0.4)), r"operator\.task\.translation: the target is 0\.1 m from"),
         (with_task(Insert(translation=[0.0, 0.0, -0.01])), r"operator\.task\.translation"),
         (with_task(Touch(standoff=0.3)), r"operator\.task\.translation"),
         (with_task(Reach(), kinematic_scaling__translation_scale=0.0), "translation_scale"),
@@ -299,7 +299,7 @@ def test_impossible_task_is_rejected(changes, message):
 
 def test_target_beyond_its_radius_is_accepted():
     check_task(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
-    with pytest.raises(DrakeTeleopError, match=r"not more than 0\.02 m"):
+    with pytest.raises(DrakeTeleopError, match=r"not above 0\.02 m"):
         check_task(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
 
 

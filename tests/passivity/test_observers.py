@@ -84,9 +84,9 @@ def test_created_energy_never_falls():
 
 
 def test_arrays_of_wrong_shape_are_rejected():
-    with pytest.raises(DrakeTeleopError, match="there is no pair 'forward'"):
+    with pytest.raises(DrakeTeleopError, match="pair: 'forward' is unknown"):
         port_work(np.zeros((3, 6)), np.zeros((3, 7)), "forward")
-    with pytest.raises(DrakeTeleopError, match="do not fit"):
+    with pytest.raises(DrakeTeleopError, match="wrench has the shape"):
         port_work(np.zeros((3, 6)), np.zeros((2, 7)))
-    with pytest.raises(DrakeTeleopError, match="is not one"):
+    with pytest.raises(DrakeTeleopError, match="memory: has the shape"):
         ledger(np.zeros(MEMORY + 1))

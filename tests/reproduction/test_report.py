@@ -13,8 +13,8 @@ from drake_teleop.lab.reproduction.report import (
     ReportFigure,
     captions,
     compare_with_paper,
+    describe_unaccepted,
     parameter_rows,
-    unaccepted,
     write_report,
 )
 
@@ -108,7 +108,7 @@ def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdic
     for full, number in wrong.items():
         part, _, short = full.partition(".")
         nested.setdefault(part, {})[short] = number
-    (line,) = unaccepted(nested)
+    (line,) = describe_unaccepted(nested)
     assert line.startswith(row.what) and line.endswith(verdict)
 
 

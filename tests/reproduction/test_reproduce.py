@@ -25,7 +25,7 @@ from drake_teleop.lab.reproduction.experiments import (
     ideal_values,
     raw_excess,
 )
-from drake_teleop.lab.reproduction.report import compare_with_paper, flat, unaccepted
+from drake_teleop.lab.reproduction.report import compare_with_paper, describe_unaccepted, flat
 from drake_teleop.lab.run_summary import in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -122,7 +122,7 @@ def test_the_speed_was_measured(run):
 
 @pytest.mark.slow
 def test_all_rows_are_accepted(run):
-    assert unaccepted(run[0]) == []
+    assert describe_unaccepted(run[0]) == []
 
 
 @pytest.mark.slow

@@ -192,9 +192,9 @@ def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: P
         recorder.add(reading)
     assert recorder.left_out == 4 and recorder.seconds == pytest.approx(3 * DT)
     for k in range(50):
-        assert recorder.began_anew == 0 and recorder.seconds == pytest.approx(3 * DT)
+        assert recorder.clock_changes == 0 and recorder.seconds == pytest.approx(3 * DT)
         recorder.add(Reading(4 + k, 100.0 + DT * k, rows[8]))
-    assert recorder.began_anew == 1 and recorder.seconds == pytest.approx(49 * DT)
+    assert recorder.clock_changes == 1 and recorder.seconds == pytest.approx(49 * DT)
     assert recorder.left_out == 4
 
 
@@ -212,7 +212,7 @@ def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
 @pytest.mark.parametrize("count", [1, 2, 49])
 def test_wrong_stamps_reject_only_their_own_readings(wrong: float, count: int) -> None:
     recorder = take(Recorder(), (10.0, 800), (wrong, count), (14.0, 200))
-    assert (recorder.left_out, recorder.began_anew) == (count, 0)
+    assert (recorder.left_out, recorder.clock_changes) == (count, 0)
     assert recorder.seconds == pytest.approx(4.0 + 199 * DT)
 
 
@@ -221,7 +221,7 @@ def test_longest_part_is_written_after_a_clock_change(
     first: int, second: int, tmp_path: Path
 ) -> None:
     recorder = take(Recorder(), (0.0, first), (1e6, 1), (500.0, second))
-    assert (recorder.left_out, recorder.began_anew) == (1, 1)
+    assert (recorder.left_out, recorder.clock_changes) == (1, 1)
     assert recorder.seconds == pytest.approx(799 * DT)
     recorder.write(tmp_path / recorder.file)
     assert len(pl.read_parquet(tmp_path / recorder.file)) == 800
@@ -238,7 +238,7 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
         recorder.add((Part(WRENCH, k, 70.0 + DT * k, wrench), DT * k))
         recorder.add((Part(POSE, k, 90.0 + DT * k, pose), DT * k))
     assert recorder.seconds == pytest.approx(999 * DT) and recorder.left_out == 1
-    assert recorder.began_anew <= 2
+    assert recorder.clock_changes <= 2
 
 
 @pytest.mark.long
@@ -278,7 +278,7 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
         (WRENCH, POSE, POSE), bad, (0, 0, ReadingFlag.DAMAGED), strict=True
     ):
         recorder.add((Part(stream, 0, 2.1, values, int(flags)), 2.1))
-    assert recorder.left_out == 3 and recorder.began_anew == 0
+    assert recorder.left_out == 3 and recorder.clock_changes == 0
     recorder.write(tmp_path / recorder.file)
     found = identify_log(tmp_path / recorder.file)
     assert found.identification.delay_s == pytest.approx(late, abs=1e-3)

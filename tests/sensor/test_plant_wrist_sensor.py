@@ -454,7 +454,7 @@ REFUSED = {
     ),
     "other plant": (
         lambda c: setattr(c, "place", moving().weld),
-        "'wrist' is of another plant",
+        "'wrist' belongs to another plant",
     ),
     "a name": (lambda c: setattr(c, "place", "wrist"), "expected Joint or Frame, found 'wrist'"),
     "half steps": (

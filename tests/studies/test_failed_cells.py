@@ -16,7 +16,7 @@ from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
     Factorial,
     effects,
-    filled,
+    fill_missing,
     interval,
     main_effects,
     pair_means,
@@ -146,7 +146,7 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
     seen[:2, 1:] = False
     for _ in range(40):
         table = random.normal(0, 3.0, 6) + random.normal(0, 0.5, (6, 6))
-        table = filled(np.where(seen, table, np.nan))
+        table = fill_missing(np.where(seen, table, np.nan))
         for which, into in ((seen, inside), (np.ones_like(seen), narrow)):
             found, halves = Factorial(levels, [3, 2], which).effects(table)
             into.append(np.abs(found[0]) <= halves[0])
@@ -159,7 +159,7 @@ def test_half_widths_equal_least_squares():
     random = np.random.default_rng(4)
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = random.random((6, 4)) < 0.7
-    table = filled(np.where(seen, random.normal(size=(6, 4)), np.nan))
+    table = fill_missing(np.where(seen, random.normal(size=(6, 4)), np.nan))
     design = Factorial(levels, [3, 2], seen)
     weights = design.compared(0)[2]
     weights -= weights.mean(axis=0)

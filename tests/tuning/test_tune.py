@@ -19,7 +19,7 @@ from drake_teleop.lab.tuning.press_trial import (
     rms_above,
 )
 from drake_teleop.lab.tuning.search import holds, search_settings
-from drake_teleop.lab.tuning.stated_set import base_of, stated_set
+from drake_teleop.lab.tuning.stated_set import stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.master.data_sheets import Master
@@ -55,7 +55,7 @@ def test_invalid_sets_are_refused(arguments, where):
 
 def test_unknown_networks_are_refused():
     with pytest.raises(DrakeTeleopError, match=r"^network: 'internt' is unknown"):
-        base_of(LoadScenario("touch"), "internt")
+        without_task_and_method(LoadScenario("touch"), "internt")
 
 
 def test_leaf_of_a_stiffness_has_this_stiffness():
@@ -107,7 +107,7 @@ class FakeStation:
 
 def trial(walls=(0.5, 20.0)) -> StationTrial:
     given = LoadScenario("contact_transition")
-    base = base_of(given, "internet")
+    base = without_task_and_method(given, "internet")
     return StationTrial(given, base, stated_set(["light", "firm"], walls, "press"), np.ones(16))
 
 
@@ -135,7 +135,7 @@ def test_search_refuses_a_set_that_no_settings_hold():
 
 
 def test_settings_change_method_scales_and_filter_alone():
-    base = base_of(LoadScenario("contact_transition"), "internet")
+    base = without_task_and_method(LoadScenario("contact_transition"), "internet")
     stated = stated_set(["light", "firm"], [1.0], "press")
     tuned = Settings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
     assert tuned.force_scaling.scales().shares == (0.3, 0.3, 0.0, 0.0)
@@ -158,7 +158,7 @@ def test_tuned_scenario_is_written_and_an_interrupted_search_continues(tmp_path,
     monkeypatch.setattr(search, "METHODS", ("ledger", "wave"))
     monkeypatch.setattr(search, "SIGMAS", (0.0,))
     monkeypatch.setattr(search, "_LOW_PASSES", ())
-    monkeypatch.setattr(search, "_CLOSE", 2.0)
+    monkeypatch.setattr(search, "_BISECTION_RATIO", 2.0)
     arguments = {"hands": ["medium"], "walls": [1.0], "network": "lan", "jobs": 1}
     summary = tune("touch", tmp_path, progress=False, **arguments)
     tuned = LoadScenario(tmp_path / "tuned.yaml")

@@ -1,7 +1,6 @@
 """Stability with any passive hand and environment, or with those in given ranges.
 
-H is the station's hybrid matrix (..., 2, 2) on the imaginary axis (see `two_port`); results are per
-frequency omega [rad/s]. h11 and h22 must have no pole in the right half plane.
+H is the station's hybrid matrix (..., 2, 2) of `two_port` at frequencies omega [rad/s].
 """
 
 from __future__ import annotations
@@ -26,27 +25,21 @@ _ROUNDING = 1e-12  # relative to the terms that cancel in a criterion
 
 
 def llewellyn(H: Complex) -> Real:
-    """Return Llewellyn's criterion 2 Re h11 Re h22 - Re(h12 h21) - |h12 h21| (T54).
-
-    Negative: not absolutely stable. Llewellyn, Proc. IRE 40 (1952).
-    """
+    """Return Llewellyn's criterion (Proc. IRE 40, 1952; T54); negative: not absolutely stable."""
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
     return 2 * h11.real * h22.real - product.real - np.abs(product)
 
 
 def llewellyn_parameter(H: Complex) -> Real:
-    """Return Llewellyn's parameter (2 Re h11 Re h22 - Re h12 h21) / |h12 h21|.
-
-    Absolute stability requires at least 1.
-    """
+    """Return Llewellyn's parameter; absolute stability requires at least 1."""
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         return 1.0 + llewellyn(H) / product
 
 
 def absolutely_stable(H: Complex) -> Flags:
-    """Return booleans: True where the station is stable with every passive hand and environment."""
+    """Return True at frequencies where the station is stable with any passive hand and wall."""
     h11, h12, h21, h22 = entries(H)
     size = np.abs(h12 * h21) + np.abs(h11 * h22)
     return (
@@ -57,10 +50,7 @@ def absolutely_stable(H: Complex) -> Flags:
 
 
 def required_damping(H: Complex) -> Real:
-    """Return the device damping [N s/m] that is missing for absolute stability, per frequency.
-
-    The maximum over the frequencies counts. inf: none suffices.
-    """
+    """Return the additional device damping [N s/m] for absolute stability; inf: none suffices."""
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
     loss = product.real + np.abs(product)
@@ -71,16 +61,13 @@ def required_damping(H: Complex) -> Real:
 
 
 def raisbeck(H: Complex) -> Real:
-    """Return Raisbeck's passivity criterion 4 Re h11 Re h22 - |h12 + conj(h21)|^2 (T55).
-
-    Negative: not passive. Scale H by `power_scaled`. Raisbeck, J. Appl. Phys. 25 (1954).
-    """
+    """Return Raisbeck's criterion (J. Appl. Phys. 25, 1954; T55); negative: not passive."""
     h11, h12, h21, h22 = entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
 
 
 def passive(H: Complex) -> Flags:
-    """Return booleans: True where the station absorbs power for every input."""
+    """Return True at frequencies where the station absorbs power for every input."""
     h11, h12, h21, h22 = entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
     return (
@@ -91,17 +78,16 @@ def passive(H: Complex) -> Flags:
 
 
 def scattering_norm(S: Complex) -> Real:
-    """Return the largest singular value of the scattering matrix S; passive if at most 1."""
+    """Return the largest singular value of a scattering matrix; passive if at most 1."""
     return _largest_singular_value(*entries(S))
 
 
 def structured_singular_value(
     S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
 ) -> Real:
-    """Return mu of the scattering matrix S for loads with bounded reflection factors (T56).
+    """Return mu of the scattering matrix S for loads with at most these reflection factors (T56).
 
-    `hand` and `environment` are the bounds. With 1 (any passive load), mu <= 1 means absolutely
-    stable.
+    With factors of 1 (any passive load), mu <= 1 means absolutely stable.
     """
     s11, s12, s21, s22 = entries(S)
     r1, r2 = np.asarray(hand), np.asarray(environment)
@@ -126,7 +112,7 @@ def _squared_abs(z: Complex) -> Real:
 
 
 class WorstLoads(NamedTuple):
-    """Lossless hand and environment closest to oscillation: reactances X (...) [N s/m].
+    """Reactances X [N s/m] of the lossless hand and environment that are closest to oscillation.
 
     At frequency w, X > 0 is a mass X / w, X < 0 a spring -X w.
     """
@@ -137,10 +123,7 @@ class WorstLoads(NamedTuple):
 
 
 def worst_loads(H: Complex) -> WorstLoads:
-    """Return the lossless loads closest to oscillation; Re h22 must not be 0.
-
-    A negative resistance proves that the station is not absolutely stable.
-    """
+    """Return the lossless loads closest to oscillation; Re h22 must not be 0."""
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
     size = np.abs(product)
@@ -155,10 +138,7 @@ def worst_loads(H: Complex) -> WorstLoads:
 
 @dataclass(frozen=True)
 class ImpedanceRange:
-    """Range of hand or environment impedances m s + b + k / s; fields are (smallest, largest).
-
-    At one frequency it is a rectangle in the complex plane.
-    """
+    """Range of hand or environment impedances m s + b + k / s; fields are (smallest, largest)."""
 
     mass: tuple[float, float]  #: kg
     damping: tuple[float, float]  #: N s/m
@@ -173,7 +153,7 @@ class ImpedanceRange:
                 )
 
     def corners(self, omega: Real) -> Complex:
-        """Return the corners (..., 4) of the rectangle of impedances [N s/m], counter-clockwise."""
+        """Return the corners (..., 4) [N s/m] in the complex plane, counter-clockwise."""
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
         least, most = self.damping
@@ -182,7 +162,6 @@ class ImpedanceRange:
         )
 
     def contains(self, impedance: Complex, omega: Real) -> Flags:
-        """Return booleans: True where the range contains the impedance [N s/m] at omega [rad/s]."""
         corners = self.corners(omega)
         low, high = corners[..., 0], corners[..., 2]
         return (
@@ -194,7 +173,6 @@ class ImpedanceRange:
 
 
 def range_of_grips() -> ImpedanceRange:
-    """Return the range of hand impedances from the light to the firm grip."""
     from drake_teleop.station.operator.operator import GRIPS
 
     mass, damping, stiffness = (
@@ -209,10 +187,9 @@ def range_of_grips() -> ImpedanceRange:
 def can_oscillate(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Flags:
-    """Return booleans (per omega): True if some hand and environment of the ranges oscillate (T57).
+    """Return True at frequencies where some hand and environment of the ranges oscillate (T57).
 
-    If all are False on a dense grid, the pairs are all stable or all unstable: test one. Behind an
-    ideal servo, hand and device must be heavier than the displayed tool.
+    If all are False on a dense grid, the pairs are all stable or all unstable.
     """
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
@@ -228,10 +205,7 @@ def can_oscillate(
 
 
 def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange) -> Real:
-    """Return the softest wall [N/m] with which some hand of the range oscillates, per omega.
-
-    Walls below the minimum over omega keep all hands stable that are stable without wall.
-    """
+    """Return per frequency the softest wall [N/m] with which some hand of the range oscillates."""
     h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
@@ -262,10 +236,7 @@ def _edge_crossings(
 def bounded_singular_value(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Real:
-    """Return mu for the hands and environments of the ranges.
-
-    Below 1 no pair can oscillate; this is sufficient, not necessary.
-    """
+    """Return mu per frequency; below 1 no hand and environment of the ranges can oscillate."""
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))

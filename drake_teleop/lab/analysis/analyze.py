@@ -1,31 +1,4 @@
-"""`drake-teleop analyze`: stability and transparency of a station at rest, along one direction.
-
-The two-port between hand and environment is that of the linearised Diagram. `summary.json` contains
-
-============ ==================================================================================
-scenario     its name, direction, grip, passivity method, delay_s (one way), wall_N_per_m (of its
-             leaf or wall, otherwise the paper's 5.1 kN/m), wall_is (source of this value)
-axis         fields of `analysis.one_axis.OneAxis`, and tool_coupling
-diagram      list: point, states, stable, decay_1_per_s (of the slowest motion),
-             frequency_Hz (of its oscillation); one_axis: the same of the sampled one-axis model
-two_port     largest deviation of the Diagram's H, hand's mass included, up to 30 Hz, from the
-             closed_form and the sampled model of one axis
-margins      list: grip, wall_N_per_m, stable, gain, phase_deg, round_trip_s (null: no limit)
-absolute     absolutely_stable, least_parameter (>= 1 is stable) and at_Hz,
-             lacking_damping_Ns_per_m, passive, scattering_norm
-bounded      grips: stiffest wall [N/m] for every hand between the lightest and the firmest grip;
-             each: for each grip alone; null: no limit
-transparency free and wall: felt and ideal, each mass [kg], damping [N s/m], stiffness [N/m]; and
-             unnoticed_to_Hz; tracking_bandwidth_Hz; width_decades; smallest_stiffness_N_per_m
-z_width      device_damping_Ns_per_m, rate_Hz; walls: list: wall_damping_Ns_per_m, passive_N_per_m,
-             passive_in_the_hand_N_per_m, stable_in_the_hand_N_per_m
-maps         list: title, x, y; for each grip: stable (fraction of the map), boundary (points)
-measured     in free motion, by multi-sine in the nonlinear simulation: frequency_Hz, felt_re,
-             felt_im, coherence, greatest_error and greatest_error_deg against the linearisation;
-             null if free motion is unstable
-verdict      list of short sentences
-============ ==================================================================================
-"""
+"""`drake-teleop analyze`: stability and transparency of a station at rest, along one direction."""
 
 from __future__ import annotations
 
@@ -72,15 +45,9 @@ def analyze_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Analyse a scenario; write summary.json, report.html and its pictures into `out`.
+    """Analyse a scenario along the world's x, y or z axis; write report and summary into `out`.
 
-    Args:
-        scenario: shipped name or YAML file.
-        direction: x, y or z of the world.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The content of summary.json; the module lists it.
+    Return the content of summary.json (docs/analysis.md).
     """
     setup = LoadScenario(scenario)
     make_folder(out)  # before the work, so that a bad path fails early
@@ -97,10 +64,7 @@ def analyze_command(
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | Stage = True
 ) -> tuple[dict[str, Any], Curves]:
-    """Analyse a scenario, without its passivity method, along the world's x, y or z axis.
-
-    Return the summary and the curves. `progress`: whether or where to show the progress.
-    """
+    """Analyse a scenario without its passivity method; return summary and curves of the report."""
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
 
@@ -194,7 +158,6 @@ def describe_wall(scenario: Scenario, is_known: bool) -> str:
 
 
 def sampling_of(scenario: Scenario) -> Sampling:
-    """Return the scenario's update rates and its sensor's low-pass."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     return Sampling(
         rates.hand_hz,
@@ -205,16 +168,12 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 
 def leaf_displacement(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in B, that presses the tip 5 mm into the leaf spring.
-
-    Raises:
-        DrakeTeleopError: if the translation scale is 0.
-    """
+    """Return the master's displacement [m], in B, that presses the tip 5 mm into the leaf."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
         raise DrakeTeleopError(
-            "the slave does not move",
+            "is 0, so that the slave cannot press on the leaf spring",
             where="kinematic_scaling.translation_scale",
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )
@@ -225,16 +184,15 @@ def leaf_displacement(scenario: Scenario) -> list[float]:
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
-    """Return the linear model with the loops of hand and network closed."""
     return close_network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
 def close_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Return the linear model with all loops closed, except the hand's along the direction.
+    """Return the model with all loops closed, except the loop of the hand along `along`.
 
-    If it is no axis of B, the hand's loop remains open in all directions.
+    Along no axis of B, the hand's loop remains open in all directions.
     """
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)

@@ -1,7 +1,7 @@
-"""Loop of the sampled one-axis model, cut at the displayed force: stability for every delay (T60).
+"""Loop of the sampled one-axis model, cut at the displayed force (T60).
 
-The loop is L(z) z^(-D), with a round trip of D hand periods. The argument principle counts its
-unstable multipliers (eigenvalues over a period).
+The loop is L(z) z^(-D) for a round trip of D hand periods. Multipliers are eigenvalues over a
+period; the argument principle counts the unstable ones.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class CutLoop:
     def of(
         cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
     ) -> CutLoop:
-        """Return the loop with these multipliers, and its crossings of |L| = level; period [s]."""
+        """Return the loop with these multipliers, period [s] and crossings of |L| = level."""
         shape, n = opened.shape[:-1], opened.shape[-1]
         found = np.zeros((3, *shape, _MAX_CROSSINGS))
         _find_crossings(
@@ -55,12 +55,7 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
-    """Return the model's loop cut at the displayed force; `axis.delay` has no effect.
-
-    Raises:
-        DrakeTeleopError: for an ideal servo, or a rate of servo or sensor that is no whole multiple
-            of the hand's.
-    """
+    """Return the loop without delay, cut at the displayed force; see `cut_map` for errors."""
     M = cut_map(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
@@ -71,10 +66,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
-    """Return the loop response L(z) z^(-D) (N, ...) at z = e^(j w T); 1 is the stability limit.
-
-    D is the round trip in hand periods T. `frequency`: w (N,) [rad/s]; `delay`: one way [s], (...).
-    """
+    """Return the loop response (N, ...) with a one-way `delay` [s]; 1 is the stability limit."""
     dimensions = max(loop.period.ndim, np.ndim(delay))
     w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
     z = np.exp(1j * w * loop.period)[..., None]
@@ -84,11 +76,7 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
 
 
 def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
-    """Return the factor, and the rotation [rad] in either direction, that bring a stable loop to 1.
-
-    `response`: (n,) of `loop_response` at increasing frequencies up to half the hand's rate; inf:
-    no limit. Crossings are interpolated.
-    """
+    """Return the gain factor and the phase [rad] that bring a stable loop to its limit, or inf."""
     if np.abs(response).max() < _MIN_LOOP_GAIN:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
@@ -110,10 +98,7 @@ def _interpolate(value: Array, fraction: Array) -> Array:
 
 
 def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
-    """Return the number (...) of closed-loop multipliers outside the unit circle.
-
-    `delay` is one way [s], (...), not rounded to hand periods.
-    """
+    """Return the number of unstable multipliers of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period)[..., None]
     turns = (loop.phases - D * loop.angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
@@ -123,10 +108,7 @@ def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
 
 
 def delay_margin(loop: CutLoop) -> Array:
-    """Return the total round-trip delay (...) at which the loop first becomes unstable [s].
-
-    0: unstable without delay; inf: no limit. Longer delays may be stable again.
-    """
+    """Return the shortest round-trip delay (...) [s] at which the loop is unstable; inf: none."""
     inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
     steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period
@@ -134,10 +116,7 @@ def delay_margin(loop: CutLoop) -> Array:
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
-    """Return the closed loop's multiplier (...) of largest magnitude, with imaginary part >= 0.
-
-    `delay` is one way [s], (...); the result is exact at whole hand periods.
-    """
+    """Return the closed loop's multiplier of largest magnitude, with imaginary part >= 0."""
     shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
     n = loop.open.shape[-1]
     opened, closed = (np.broadcast_to(m, (*shape, n)) for m in (loop.open, loop.closed))

@@ -48,7 +48,6 @@ _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def with_grip(axis: OneAxis, grip: str) -> OneAxis:
-    """Return the axis with the hand impedance of a grip: light, medium or firm."""
     hand = GRIPS[grip]
     return dataclasses.replace(
         axis, hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness
@@ -58,10 +57,7 @@ def with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest motion of the linearised Diagram.
-
-    Above `MAX_STATES` states only those of the one-axis model.
-    """
+    """Return stability and slowest motion of the linearised Diagram and of the one-axis model."""
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
     one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
@@ -87,10 +83,7 @@ def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
 
 
 def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the largest relative deviation of the Diagram's H from two one-axis models.
-
-    `with_hand`: that H (n, 2, 2), hand's mass included, at `OMEGA`; compared up to 30 Hz.
-    """
+    """Return the largest relative deviation of the Diagram's H up to 30 Hz from one-axis models."""
     compared = OMEGA <= COMPARISON_BAND
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
@@ -162,10 +155,7 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """Return displayed and ideal impedance in free motion and at the wall, and tracking figures.
-
-    `wall` is stiffness [N/m] and damping [N s/m].
-    """
+    """Return displayed and ideal impedance in free motion and at the wall, and tracking figures."""
     fitted = OMEGA <= _FIT_BAND
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}
@@ -195,7 +185,6 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
 
 
 def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the stiffest virtual walls that the device itself can render (Z-width)."""
     damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
     passive = sampled_wall.passive_stiffness(axis.device_damping, damping, period)
     stable = sampled_wall.stable_stiffness(
@@ -224,10 +213,7 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measured_figures(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """Measure the impedance displayed in free motion, by simulation without Coulomb friction.
-
-    Errors are relative to the linear model `system`.
-    """
+    """Return the impedance displayed in free motion, measured in a simulation without friction."""
     frictionless = scenario.master.without_coulomb_friction()
     free = scenario.without_environment()
     smooth = replace(free, master=frictionless, slave__friction=[])
@@ -254,7 +240,6 @@ def measured_figures(
 def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
 ) -> dict[str, dict[str, StabilityMap]]:
-    """Return stability maps over pairs of parameters: title -> grip -> map."""
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
     n, tool = _MAP_POINTS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)

@@ -1,4 +1,4 @@
-"""Frequency responses of the nonlinear station, measured with a multi-sine motion (T64)."""
+"""Frequency responses of the nonlinear station, measured with a multi-sine motion."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class MultiSine:
     seed: int = 0  #: seed of the random phases
 
     def multiples(self) -> NDArray[np.int64]:
-        """Return the odd multiples (n,) of 1 / period that the motion contains."""
+        """Return the frequencies of the motion as odd multiples (n,) of 1 / period."""
         spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
         odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
         return odd[odd > 0]
 
     def segments(self, direction: Array, start: float) -> list[Sine]:
-        """Return one sine motion per frequency, along `direction` (6,) in B, from `start` [s]."""
+        """Return one sine motion per frequency along `direction` (6,), in B, from `start` [s]."""
         frequencies = self.multiples() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         duration = self.settle + self.period * self.periods + self.settle
@@ -86,29 +86,22 @@ class StationResponse:
     force_scale: float
 
     def response(self, output: str, input_: str) -> Complex:
-        """Return the frequency response (n,), output over input."""
         ratio: Complex = self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
         return ratio
 
     def coherence(self, output: str, input_: str) -> Array:
-        """Return the coherence (n,): fraction of the output's power that is linear in the input."""
+        """Return (n,): fraction of the output's power that is linear in the input."""
         y, x = self.spectra[output], self.spectra[input_]
         cross = np.abs((y * x.conj()).sum(axis=0)) ** 2
         power = (np.abs(y) ** 2).sum(axis=0) * (np.abs(x) ** 2).sum(axis=0)
         return cross / power
 
     def apparent_mass(self) -> float:
-        """Return the displayed tool mass, at the slave's scale [kg]; ideal: sigma times tool mass.
-
-        Valid for delays far below 0.1 s.
-
-        Raises:
-            DrakeTeleopError: if fewer than three frequencies are below 10 Hz.
-        """
+        """Return the displayed tool mass at the slave's scale [kg], for delays far below 0.1 s."""
         low = self.omega <= _APPARENT_MASS_BAND
         if np.count_nonzero(low) < 3:
             raise DrakeTeleopError(
-                "fewer than three lines below 10 Hz",
+                "fewer than three frequencies are below 10 Hz",
                 where="MultiSine",
                 remedy="lower `lowest` or lengthen `period`",
             )
@@ -130,15 +123,9 @@ def measure_frequency_response(
     load_estimate: Array | None = None,
     approach: Sequence[MinimumJerk] = (),
 ) -> StationResponse:
-    """Simulate the station with a multi-sine motion of the operator and return the spectra.
+    """Simulate the station with a multi-sine motion of the operator; return the spectra.
 
-    Args:
-        scenario: scenario whose intended motion is replaced.
-        load_estimate: (16,) as for `MakeTeleopStation`.
-        approach: motions to the operating point, before the multi-sine.
-
-    Raises:
-        DrakeTeleopError: if the multi-sine's period is no whole number of hand periods.
+    `approach` contains motions to the operating point before the multi-sine.
     """
     check_scenario(scenario)
     rate = scenario.rates.hand_hz

@@ -85,10 +85,7 @@ class Linearization:
     def close(
         self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
     ) -> Linearization:
-        """Return the model with outputs fed back to inputs, u += z^-periods y; the inputs remain.
-
-        Outputs and inputs: a port or a list of components; other names raise DrakeTeleopError.
-        """
+        """Return the model with feedback of outputs to inputs, u += z^-periods y."""
         rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
@@ -96,7 +93,7 @@ class Linearization:
         return dataclasses.replace(self, A=A)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return the response G(e^(j omega dt)) (n, outputs, inputs) at omega (n,) [rad/s]."""
+        """Return the response (n, outputs, inputs) at omega (n,) [rad/s]."""
         z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
         identity = np.eye(len(self.A))
         # Solve for each frequency: a chain of delays has no basis of eigenvectors.
@@ -113,15 +110,14 @@ class Linearization:
     def multipliers(self) -> Complex:
         """Eigenvalues over one period, largest first; stable if all magnitudes are below 1.
 
-        Above 800 states (with delays) only those near the unit circle up to 100 Hz; above 8000,
-        DrakeTeleopError.
+        Above 800 states they are only those near the unit circle, up to 100 Hz.
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
         if size <= _MAX_DENSE_STATES:
             values = np.linalg.eigvals(self.expanded().A)
         elif size > MAX_STATES:
             raise DrakeTeleopError(
-                f"{size} states, most of them of the delay, are too many",
+                f"{size} states are too many for eigenvalues; most of them represent the delay",
                 where="channel.delay",
                 remedy="count unstable multipliers of one axis instead (cut_loop)",
             )
@@ -172,9 +168,9 @@ class Linearization:
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
             raise DrakeTeleopError(
-                f"there is no {missing[0]}",
+                f"'{missing[0]}' is no port or component of this model",
                 where="close",
-                remedy=f"name one of {', '.join(ports)}, or a list of parts, as ['{known[0]}']",
+                remedy=f"name one of {', '.join(ports)}, or list components, as ['{known[0]}']",
             )
         return tuple(known.index(name) for name in parts)
 
@@ -222,13 +218,8 @@ def linearize(
 ) -> Linearization:
     """Return the scenario's Diagram, linearised at rest with its loops cut.
 
-    Args:
-        scenario: its intended motion, network and passivity method have no effect.
-        load_estimate: (16,) as for `MakeTeleopStation`.
-        displacement: of the master from its start [m], in B; the slave follows.
-
-    Raises:
-        DrakeTeleopError: if the rates have no common period, or the slave does not come to rest.
+    Intended motion, network and passivity method have no effect. `displacement` moves the master
+    from its start [m], in B; the slave follows.
     """
     check_scenario(scenario)
     if load_estimate is not None:
@@ -257,10 +248,7 @@ def linearize_station(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Linearization:
-    """Return the linearised Diagram with all loops closed, over the scenario's constant delays.
-
-    Arguments: see `linearize`. A passivity method is not linear and raises DrakeTeleopError.
-    """
+    """Return the linearised Diagram with all loops closed over the scenario's constant delays."""
     check_scenario(scenario)
     if scenario.passivity.method != "none":
         raise DrakeTeleopError(
@@ -273,17 +261,13 @@ def linearize_station(
 
 
 def close_network(system: Linearization, scenario: Scenario) -> Linearization:
-    """Return the model with both network loops closed, each with its constant delay."""
     forward, backward = delays(scenario)
     system = system.close("pose_command", "pose_received", forward)
     return system.close("wrench_B", "wrench_received", backward)
 
 
 def delays(scenario: Scenario) -> tuple[int, int]:
-    """Return the delays of pose and wrench over the network, in hand periods.
-
-    Both are 0 for an ideal network without a passivity method, otherwise at least 1.
-    """
+    """Return the network delays of pose and wrench in hand periods."""
     lines = scenario.channel.lines()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
         return 0, 0
@@ -294,10 +278,9 @@ def delays(scenario: Scenario) -> tuple[int, int]:
 
 
 def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
-    """Return the hybrid matrix H (n, 2, 2) along one direction, at omega (n,) [rad/s], not zero.
+    """Return the hybrid matrix H (n, 2, 2) along one direction at omega (n,) [rad/s], not zero.
 
-    `hand` and `tool` (6,): see `TaskDirection`. In `system` the hand's loop is cut in this
-    direction. H includes the hand's mass; the spectrum of held forces is divided out.
+    In `system` the hand's loop is cut in this direction. H includes the hand's mass.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)
@@ -534,7 +517,7 @@ class _Period:
             self._set(x)
             x = self._balance_hand()
         raise DrakeTeleopError(
-            f"the slave does not come to rest, {self.states[np.argmax(np.abs(moved))]} moves",
+            f"the slave does not come to rest (state {self.states[np.argmax(np.abs(moved))]})",
             where="displacement",
             remedy="choose another operating point",
         )

@@ -1,4 +1,4 @@
-"""Stability maps: stability and distortion of the sampled loop over two parameters."""
+"""Stability and distortion of the sampled loop over two parameters."""
 
 from __future__ import annotations
 
@@ -48,7 +48,6 @@ class StabilityMap:
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Booleans (ny, nx): True where the loop is stable."""
         return self.unstable == 0
 
 
@@ -60,16 +59,9 @@ def stability_map(
     y_name: str,
     y: ArrayLike,
 ) -> StabilityMap:
-    """Return stability and distortion over a grid of two parameters.
+    """Return stability and distortion over increasing values of two parameters.
 
-    Args:
-        x_name, y_name: fields of `OneAxis`, "low_pass_hz", or "rate": the hand's rate [Hz], with
-            the other rates in proportion.
-        x, y: increasing values (nx,), (ny,).
-
-    Raises:
-        DrakeTeleopError: for another name, values that do not increase, or the reasons of
-            `cut_loop`.
+    Names are fields of `OneAxis`, "low_pass_hz", or "rate": all rates in proportion.
     """
     xs, ys = _increasing(x_name, x), _increasing(y_name, y)
 
@@ -101,10 +93,7 @@ def stability_map(
 
 
 def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
-    """Return the largest relative error (...) of the operator's force over `frequency` [rad/s].
-
-    The force moves hand and device against the displayed force; reference: `ideal_impedance`.
-    """
+    """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
     shape = np.broadcast_shapes(
         loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
     )
@@ -119,7 +108,7 @@ def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_
 def _increasing(name: str, values: ArrayLike) -> Array:
     if name not in _PARAMETERS:
         raise DrakeTeleopError(
-            f"there is no parameter '{name}' to draw a map of",
+            f"'{name}' is no parameter of a stability map",
             where="stability_map",
             remedy=f"choose one of {', '.join(sorted(_PARAMETERS))}",
         )

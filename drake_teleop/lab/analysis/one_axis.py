@@ -24,8 +24,7 @@ Complex = NDArray[np.complex128]
 class Axis:
     """Parameters of all models of one direction; default: the paper's station with medium grip.
 
-    sigma and gamma are the displayed shares of the tool's inertial force and of the contact force:
-    sigma is `sigma_inertia` of a scenario, and the constant weight has no effect.
+    sigma and gamma are the displayed shares of the tool's inertial force and of the contact force.
     """
 
     hand_mass: float = 0.25  #: kg
@@ -44,18 +43,16 @@ class Axis:
 
     @property
     def servo_stiffness(self) -> float:
-        """Stiffness m_s k_v k_p between command and slave [N/m]."""
         return self.slave_mass * self.velocity_gain * self.position_gain
 
     @property
     def servo_damping(self) -> float:
-        """Damping m_s k_v between slave and world [N s/m]."""
         return self.slave_mass * self.velocity_gain
 
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxis(Axis):
-    """Parameters of one direction for the linear analysis; numbers, or arrays that broadcast."""
+    """Parameters of one direction for the linear analysis: numbers, or arrays that broadcast."""
 
     device_damping: float = 0.5  #: N s/m
     mass_error: float = 0.0  #: kg, estimated minus true tool mass
@@ -65,30 +62,24 @@ class OneAxis(Axis):
 
     @property
     def displayed_tool_mass(self) -> float:
-        """Tool mass displayed after elimination [kg]: sigma m_t + (sigma - gamma) dm.
-
-        m_t is the tool mass, dm its estimation error.
-        """
+        """Tool mass [kg] displayed after elimination with the estimated mass."""
         return self.sigma * self.tool_mass + (self.sigma - self.gamma) * self.mass_error
 
 
 def hand_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Return the hand's impedance Z_h [N s/m] at s [rad/s]."""
     return axis.hand_mass * s + axis.hand_damping + axis.hand_stiffness / s
 
 
 def device_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Return the device's impedance Z_m [N s/m] at s [rad/s]."""
     return axis.device_mass * s + axis.device_damping
 
 
 def environment_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Return the environment's impedance Z_e [N s/m] at s [rad/s]."""
     return axis.wall_damping + axis.wall_stiffness / s
 
 
 def servo_response(axis: OneAxis, s: Complex) -> Complex:
-    """Return the servo's response C / (Z_s + C): slave position over command."""
+    """Return C / (Z_s + C): slave position over command."""
     if axis.ideal_servo:
         return np.ones_like(s)
     gain = axis.velocity_gain * axis.position_gain
@@ -96,7 +87,7 @@ def servo_response(axis: OneAxis, s: Complex) -> Complex:
 
 
 def servo_admittance(axis: OneAxis, s: Complex) -> Complex:
-    """Return the slave's admittance 1 / (Z_s + C) [m/(N s)] with its servo."""
+    """Return 1 / (Z_s + C) [m/(N s)]: slave velocity over contact force."""
     if axis.ideal_servo:
         return np.zeros_like(s)
     kv, kp = axis.velocity_gain, axis.position_gain

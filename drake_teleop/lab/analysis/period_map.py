@@ -1,11 +1,7 @@
 """Sampled one-axis model of the station over a period of the hand.
 
-Order of events; all updates at one instant read earlier values:
-
-* The device advances by one hand period with held force; the other blocks read its prediction.
-* The servo reads the command and the slave's state; its force is held.
-* The sensor samples just before the servo's update; its low-pass is digital.
-* A channel with a delay of d hand periods returns its input of d periods ago (`cut_loop`).
+All updates at one instant read earlier values. Device and servo hold their forces; the sensor
+samples just before the servo's update.
 """
 
 from __future__ import annotations
@@ -48,20 +44,15 @@ def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
 
 
 def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the matrix over one hand period, for the loop cut at the received force.
+    """Return the model's matrix over one hand period, with the loop cut at the received force.
 
-    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force; it has no
-    delay.
-
-    Raises:
-        DrakeTeleopError: for an ideal servo, if the rate of servo or sensor is no whole multiple of
-            the hand's rate, or if the low-pass is not below half the sensor's rate.
+    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
     """
     if axis.ideal_servo:
         raise DrakeTeleopError(
-            "an ideal servo has no sampled form",
+            "the sampled model does not include an ideal servo",
             where="axis.ideal_servo",
-            remedy="give it high gains, or use the continuous model",
+            remedy="set it to False with high gains, or use two_port.hybrid",
         )
     servo_samples, sensor_samples = (
         _samples(sampling, name) for name in ("joint_control_hz", "sensor_hz")
@@ -92,10 +83,9 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
 
 
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
-    """Return the two-port H (N, 2, 2) of the sampled station, without hand and wall.
+    """Return the two-port H (N, 2, 2) of the sampled station without hand and wall.
 
-    The spectrum of held forces is divided out; the delay is rounded to hand periods. `frequency`
-    (N,) [rad/s]: positive, below half the hand's rate.
+    `frequency` (N,) [rad/s]: positive, below half the hand's rate.
     """
     bare = replace(
         axis,
@@ -125,7 +115,6 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
 
 
 def _samples(sampling: Sampling, name: str) -> int:
-    """Return the number of samples of servo or sensor in a hand period."""
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
@@ -144,7 +133,7 @@ def _sections(sampling: Sampling) -> Array:
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
     if not (cutoffs < rates / 2).all():
         raise DrakeTeleopError(
-            "the low-pass lets half the sensor's rate pass",
+            "the cut-off frequency is not below half of the sensor's rate",
             where="sampling.low_pass_hz",
             remedy="choose less than half of sensor_hz",
         )
@@ -223,7 +212,7 @@ class _Rows:
 
 
 def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
-    """Return the parts (..., 2) of (x, v) due to x, v and held u of x'' = u - b x' - k x."""
+    """Return the (..., 2) responses of x'' = u - b x' - k x to unit x, unit x' and held unit u."""
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t

@@ -60,7 +60,6 @@ class Curves:
 
 
 def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
-    """Write report.html and its pictures into `out`."""
     pictures = {
         "bode": draw_bode(curves, summary["measured"]),
         "nyquist": draw_nyquist(curves),
@@ -120,7 +119,6 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
 
 
 def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
-    """Draw the impedance displayed to the hand over frequency, in free motion and at the wall."""
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
     stiffness, damping = curves.wall
     environments = {
@@ -160,7 +158,6 @@ def _degrees(felt: Complex) -> Any:
 
 
 def draw_nyquist(curves: Curves) -> Figure:
-    """Draw the Nyquist plot of the loop at the wall per grip; stable loops do not encircle -1."""
     with plot_style():
         figure = Picture(figsize=(9.0, 4.2))
         whole, near = figure.subplots(1, 2)
@@ -213,7 +210,6 @@ def draw_passive_loads(curves: Curves) -> Figure:
 
 
 def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
-    """Draw the Z-width of the station, and the virtual walls that the device itself can render."""
     hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
@@ -287,7 +283,6 @@ def _draw_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """Print margins and verdict to the terminal; `out` is the folder of the written report."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape

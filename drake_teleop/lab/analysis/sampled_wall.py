@@ -1,11 +1,9 @@
 """Z-width of a sampled device: the stiffest virtual wall that it can render.
 
-The device moves continuously; its position x is sampled every Ts [s]. The wall of stiffness K [N/m]
-and damping B [N s/m] responds with the held force
+The device's position x is sampled every Ts [s]. The wall of stiffness K [N/m] and damping B [N s/m]
+responds with the held force
 
     f_k = K x_k + B (x_k - x_(k-1)) / Ts.
-
-Invalid signs raise DrakeTeleopError.
 """
 
 from __future__ import annotations
@@ -22,10 +20,7 @@ _HALVINGS = 60
 
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
-    """Return the largest stiffness [N/m] of a passive wall; 0 if there is none (T62).
-
-    Dampings in N s/m; `period`: sample time [s].
-    """
+    """Return the largest stiffness [N/m] of a passive wall, 0 if there is none (T62)."""
     b = _checked_positive(device_damping, "damping of the device")
     _checked_positive(period, "period")
     return np.maximum(2 * (b - np.abs(wall_damping)) / period, 0.0)
@@ -41,8 +36,7 @@ def stable_stiffness(
 ) -> Array:
     """Return the wall stiffness [N/m] at which the loop becomes unstable; 0: unstable with any.
 
-    `mass` [kg], `damping` [N s/m] and `hand_stiffness` [N/m]: device and hand together; `period`:
-    sample time [s].
+    Mass [kg], damping [N s/m] and `hand_stiffness` [N/m] are those of device and hand together.
     """
     _, held = _sampled_device(mass, damping, hand_stiffness, period)
     # A coefficient of a stable cubic is below 3, which bounds the stiffness.
@@ -67,10 +61,7 @@ def sampled_poles(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Complex:
-    """Return the closed loop's multipliers (..., 3) over a sample.
-
-    `stiffness` is the wall's [N/m]; for the other arguments see `stable_stiffness`.
-    """
+    """Return the closed loop's eigenvalues (..., 3) over a sample; `stiffness`: wall [N/m]."""
     mass, damping, K, B, hand = np.broadcast_arrays(
         mass, damping, stiffness, wall_damping, hand_stiffness
     )
@@ -87,7 +78,7 @@ def sampled_poles(
 def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
-    """Return the matrices Phi (..., 2, 2), Gamma (..., 2) of the device under held force."""
+    """Return state matrix (..., 2, 2) and input vector (..., 2) of the device over a sample."""
     from scipy.linalg import expm
 
     _checked_positive(mass, "mass of the device")
@@ -96,7 +87,9 @@ def _sampled_device(
     m, b, k = np.broadcast_arrays(mass, damping, stiffness)
     if not np.all(k >= 0):
         raise DrakeTeleopError(
-            "the stiffness of the hand is negative", remedy="give 0 or more [N/m]"
+            "the stiffness of the hand is negative",
+            where="hand_stiffness",
+            remedy="give 0 or more [N/m]",
         )
     rates = np.zeros((*m.shape, 3, 3))
     rates[..., 0, 1] = 1

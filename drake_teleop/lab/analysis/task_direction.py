@@ -1,7 +1,6 @@
 """Parameters of the one-axis model along a task direction, from the scenario's true models.
 
-One axis represents the station if a contact force causes no rotation, as along the tool; otherwise
-use `linearization`.
+One axis represents the station if a contact force causes no rotation, as along the tool.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class TaskDirection:
 
 
 def OneAxisFromScenario(scenario: Scenario, direction: Sequence[float]) -> OneAxis:
-    """Return the one-axis parameters of a scenario along a direction in W; see `task_direction`."""
+    """Return the one-axis parameters of a scenario along a direction (3,) in W."""
     return task_direction(scenario, direction).axis
 
 
@@ -57,15 +56,8 @@ def task_direction(
 ) -> TaskDirection:
     """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
 
-    Masses are effective, 1 / (n' J M^-1 J' n). The delay is the mean of both ways.
-
-    Args:
-        load_estimate: (16,) as for `MakeTeleopStation`; default: no error.
-        displacement: of the master from its start [m], in B; the slave follows.
-
-    Raises:
-        DrakeTeleopError: for a zero direction, a pose out of reach, or different scales of gripper
-            and object.
+    `displacement` moves the master from its start [m], in B; the slave follows. Without
+    `load_estimate` (16,) the tool mass has no error.
     """
     check_scenario(scenario)
     n_W = checked("direction", direction, 3)
@@ -160,7 +152,7 @@ def _slave_posture(slave: SlavePlant, moved: Array) -> Array:
         q, status = find_posture(arm, pose, slave.start)
     if status != IkStatus.OK:
         raise DrakeTeleopError(
-            f"the arm cannot follow by {moved} m ({IkStatus(status).name})",
+            f"the arm cannot reach this displacement of {moved} m ({IkStatus(status).name})",
             where="displacement",
             remedy="choose a smaller displacement or another start posture",
         )

@@ -1,6 +1,6 @@
 """Comparison of the displayed impedance with the ideal one and with human thresholds.
 
-Arrays are over frequency, impedances in N s/m, omega in rad/s. H: hybrid matrix (see `two_port`).
+Impedances are in N s/m, omega in rad/s; H is the station's hybrid matrix (see `two_port`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Real = NDArray[np.float64]
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
-    """Return the ideal displayed impedance [N s/m], set by the scales of force and motion (T52)."""
+    """Return the ideal displayed impedance, set by the scales of force and motion (T52)."""
     felt = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
     return device_impedance(axis, s) + axis.force_scale * axis.position_scale * felt
 
@@ -55,10 +55,7 @@ class ZWidth(NamedTuple):
 
 
 def transmitted_width(H: Complex) -> ZWidth:
-    """Return the transmitted Z-width; `rigid` is infinite behind an ideal servo.
-
-    Colgate and Brown, ICRA 1994; Hannaford, T-RA 5 (1989).
-    """
+    """Return the impedances displayed in free motion and at a rigid wall, which may be infinite."""
     h11, h12, h21, h22 = entries(H)
     with np.errstate(divide="ignore", invalid="ignore"):
         rigid = np.where(h22 == 0, np.inf, h11 - h12 * h21 / h22)
@@ -71,11 +68,7 @@ WEBER_FRACTION = 0.23
 
 
 def is_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
-    """Return booleans: True where a human can distinguish the displayed impedance from the ideal.
-
-    One Weber fraction applies to mass, damping and stiffness (Fu, Landman, van Paassen and Mulder,
-    T-HMS 48, 2018; abstracts).
-    """
+    """Return True where a human can distinguish the displayed impedance from the ideal."""
     return np.abs(felt / ideal - 1) > WEBER_FRACTION
 
 
@@ -86,14 +79,12 @@ def smallest_stiffness_change(
     weber: float = WEBER_FRACTION,
     damping: ArrayLike = 0.0,
 ) -> Real:
-    """Return the smallest increase of the environment's stiffness that the hand can detect [N/m].
-
-    It explores with a motion at `omega`; detection as in `is_noticed`. inf: none is detectable; for
-    stiffness 0: the softest detectable wall.
-    """
+    """Return the smallest detectable increase of the environment's stiffness [N/m], or inf."""
     if weber <= 0:
         raise DrakeTeleopError(
-            f"is {weber:g}, must be positive", where="weber", remedy="give, say, 0.1"
+            f"the Weber fraction is {weber:g}, must be positive",
+            where="weber",
+            remedy="give a fraction, such as 0.23",
         )
     _, h12, h21, h22 = entries(H)
     s = 1j * omega

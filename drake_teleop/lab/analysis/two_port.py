@@ -9,8 +9,6 @@ arrays (..., 2, 2), frequencies first; s in rad/s, impedances in N s/m, delays o
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,9 +21,6 @@ from drake_teleop.lab.analysis.one_axis import (
     servo_response,
 )
 
-if TYPE_CHECKING:
-    pass
-
 
 def two_port(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
     """Return matrices (..., 2, 2) of four entries that broadcast."""
@@ -35,14 +30,13 @@ def two_port(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> 
 
 
 def entries(H: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-    """Return the entries h11, h12, h21 and h22 of H."""
     return H[..., 0, 0], H[..., 0, 1], H[..., 1, 0], H[..., 1, 1]
 
 
 def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None = None) -> Complex:
     """Return the hybrid matrix H (..., 2, 2) of the position-force station at s [rad/s] (T51).
 
-    `servo` replaces the axis' servo response C/(Z_s + C) and admittance 1/(Z_s + C).
+    `servo` replaces the axis' servo response and admittance.
     """
     response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
     delay_factor = np.exp(-s * axis.delay)
@@ -57,9 +51,9 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
 
 
 def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
-    """Return the scattering matrix S, which maps the waves F + b V to F - b V (slave: V = -V_s).
+    """Return the scattering matrix S for reference impedances b [N s/m] of both ports.
 
-    `reference`: b [N s/m] of both ports; it does not change whether the norm of S exceeds 1.
+    S maps the waves F + b V to F - b V.
     """
     h11, h12, h21, h22 = entries(H)
     b1, b2 = np.asarray(reference[0]), np.asarray(reference[1])
@@ -78,10 +72,7 @@ def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) 
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return the reference impedances b [N s/m] of both ports for `scattering`.
-
-    Master: hand damping; slave: hand damping / (k_f l_p). Scales of 0 raise DrakeTeleopError.
-    """
+    """Return the reference impedances b [N s/m] of master and slave port for `scattering`."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(
@@ -98,10 +89,7 @@ def power_ratio(axis: OneAxis) -> float:
 
 
 def power_scaled(H: Complex, ratio: ArrayLike) -> Complex:
-    """Return H with the slave's power multiplied by `ratio`; raise an error unless it is positive.
-
-    With `power_ratio` this removes the gain or loss of power by the scales.
-    """
+    """Return H with the slave's power multiplied by `ratio` > 0."""
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
         raise DrakeTeleopError(
@@ -121,5 +109,5 @@ def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> C
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
-    """Return the impedance Z_to displayed to the hand for that of the environment [N s/m] (T52)."""
+    """Return the impedance displayed to the hand with this impedance of the environment [N s/m]."""
     return absorb(H, environment=environment)[..., 0, 0]

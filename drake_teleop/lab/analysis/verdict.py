@@ -8,7 +8,6 @@ import numpy as np
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """Return the summary as sentences, each understandable alone."""
     sentences = []
     if figures["method"] != "none":
         sentences += [

@@ -2,23 +2,7 @@
 
 Three studies use the same channel: the whole station presses on leaf springs (`delayed_contact`);
 in one degree of freedom, a hand lets go and taps (`release_and_taps`), and the longest stable round
-trip is found for three walls (`one_dof`). `summary.json` contains
-
-========= ======================================================================================
-decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_N for each leaf;
-          leaked_J. If unstable, these are empty or null
-station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with the energy between
-          hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
-          left_behind [m]; leaked [J]; fast_force, rms above 5 Hz in the hold [N]. A run that is
-          not at rest in its hold ends there (left_behind and drift are null); `error` says why a
-          run ended early (others are null)
-hands     list: method, network, fields of `release_and_taps.ReleaseAndTaps`
-one_dof   list: method, wall_N_per_m, jitter, loss; longest_s, up to which all round trips of
-          grid_s were stable (0: none)
-covering  list: sigma, round_trip_s, wall_N_per_m; injected_J, energy created in one run without
-          a method; damping_Ns_per_m of the device that prevents it
-networks, methods, scenario, seed  as requested
-========= ======================================================================================
+trip is found for three walls (`one_dof`).
 """
 
 from __future__ import annotations
@@ -79,7 +63,7 @@ _RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz
 _MAX_STEP = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
 #: needs 9,000 to 16,000 steps per second instead of 1,500.
-_SLIP_SPEED = 1e-3
+_SLIP_SPEED_M_S = 1e-3
 
 
 def compare_command(
@@ -93,17 +77,10 @@ def compare_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
+    """Compare all or these methods; write summary, runs, report and pictures into `out`.
 
-    Args:
-        networks, methods: names of networks and passivity methods; None: all methods.
-        scenario: shipped name or YAML file; its rates, integrator and environment are not used.
-        seed: seed of sensor noise and networks.
-        jobs: number of processes; -1: one for each core.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The content of summary.json; the module lists it.
+    Rates, integrator and environment of the scenario are not used. Return the content of
+    summary.json (docs/delay.md).
     """
     for name in networks:
         if name not in PRESETS:
@@ -156,10 +133,7 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none.
-
-    `seeds` are those of a network with jitter or packet loss.
-    """
+    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none."""
     longest = 0.0
     for round_trip in ROUND_TRIPS:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -184,17 +158,14 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """Run the whole station once with a leaf spring; return its table row and its traces.
-
-    `estimate` (16,) is the load estimate: sensor offsets [N, N m], then phi.
-    """
+    """Run the whole station once with a leaf spring; return its table row and its traces."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
-    setup = replace(setup, sheet_spring__slip=_SLIP_SPEED)
+    setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
         result, found = _run_to_end_or_hold(station, setup, task)

@@ -1,15 +1,4 @@
-"""Decision table: one verdict for each passivity method and network.
-
-The first condition that the whole station meets on any leaf spring is the verdict (leaks: also in
-the runs of `release_and_taps`)::
-
-    unstable      the station does not come to rest, or the run ended early
-    left behind   the slave is more than 5 mm from the master 2 s after contact
-    chatters      the rendered force in the hold has more than 0.05 N rms above 5 Hz
-    leaks         more than 1 mJ came out between hand and actual motion, beyond the energy put in
-                  and stored at the start
-    holds         otherwise
-"""
+"""Decision table: the first verdict of docs/delay.md that applies to a method and network."""
 
 from __future__ import annotations
 
@@ -37,7 +26,6 @@ class Cell:
 
     @property
     def words(self) -> str:
-        """Verdict as text, with the leaked energy."""
         if self.verdict != LEAKS or self.leaked is None:
             return self.verdict
         number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")

@@ -29,10 +29,7 @@ LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the times of the task for a round trip [s].
-
-    One round trip is added before the press, three to the hold, two to the final rest.
-    """
+    """Return the times of the task for a round trip [s]; waiting times increase with it."""
     return Task(
         swing=0.3,
         swung=1.8,
@@ -56,11 +53,8 @@ def delayed_contact(
 ) -> tuple[Scenario, Task]:
     """Return the scenario with this task and the task's times.
 
-    Args:
-        base: gives rates, sensor, scales and grip.
-        leaf: key of `LEAVES`, or stiffness [N/m].
-        task: times; default: those of `task_for_round_trip`.
-        depth: intended displacement of the hand beyond the contact [m].
+    `leaf` is a key of `LEAVES` or a stiffness [N/m]; `depth` [m] is the intended displacement of
+    the hand beyond the contact.
     """
     task = task or task_for_round_trip(sum(line.delay for line in channel.lines()))
     settle = 0.5
@@ -102,7 +96,7 @@ def delayed_contact(
 
 
 def thickness_of(stiffness: float) -> float:
-    """Return the thickness [m] of a leaf with this stiffness [N/m]."""
+    """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
     unit = SheetSpring(length=_LEAF_LENGTH, width=_LEAF_WIDTH, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
@@ -135,10 +129,7 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 
 
 def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
-    """Return the energy (N,) from hand and environment, plus the method's initial energy [J].
-
-    Negative: the station is active between the hand and the slave's actual motion.
-    """
+    """Return the energy (N,) from hand and environment, plus the method's initial energy [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().shares):
         accounts += load_work(result, scenario)

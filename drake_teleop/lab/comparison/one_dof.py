@@ -1,4 +1,4 @@
-"""One degree of freedom of the station: plant, task and figures, for thousands of runs.
+"""One degree of freedom of the station: plant, task and measures, for thousands of runs.
 
 The station's own `channel_step` connects hand and slave along x at 1 kHz, with held forces.
 """
@@ -101,14 +101,10 @@ class OneDofRun:
     master's scale. In a passive station, HAND plus any other place never falls below
     -start_energy::
 
-        HAND      -sum f_(k-1) (x_k - x_(k-1))   held force, exact
-        COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port,
-                                                 its sign depends on the servo's lag
-        MOTOR     -integral k_f gamma f_m dx_s   servo's force, to half an integration step
-        ACTUAL     integral k_f gamma f_w dx_s   wall's force, exact for a spring
-
-    MOTOR and ACTUAL exclude the inertia that sigma leaves in f_e, which is no part of the
-    environment.
+        HAND      -sum f_(k-1) (x_k - x_(k-1))   held force
+        COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port
+        MOTOR     -integral k_f gamma f_m dx_s   servo's force
+        ACTUAL     integral k_f gamma f_w dx_s   wall's force
     """
 
     t: NDArray[np.float64]  #: s
@@ -123,9 +119,9 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least(self, place: int) -> float:
-        """Return the least value over time of E_0 plus the `accounts` of HAND and `place` [J].
+        """Return the least sum over time of start energy and `accounts` at HAND and `place` [J].
 
-        With `place` HAND: of HAND alone. Negative: the station is active.
+        A negative sum means that the station is active.
         """
         other = 0.0 if place == HAND else self.accounts[:, place]
         return self.start_energy + float(np.nanmin(self.accounts[:, HAND] + other))
@@ -164,15 +160,11 @@ def run_one_dof(
     """Simulate one run in one degree of freedom.
 
     Args:
-        passivity: configuration of the passivity method.
-        forward, backward: networks from and to the master; backward default: as forward.
-        timeout: time without packets before the safe state (both ends come to rest) [s].
+        timeout: time without packets before both ends come to rest [s].
         intent: (N, 2) intended position [m] and velocity [m/s]; default: the task's.
-        grip: (N, 3) mass, damping and stiffness of the hand [kg, N s/m, N/m], zeros after it let
-            go; default: the model's.
-        wall: (N, 2) position [m], linear in between, and stiffness [N/m]; default: the model's.
-        delays: forward and backward, periods of travel of each packet, -1 if lost; replace those of
-            the network.
+        grip: (N, 3) mass, damping and stiffness of the hand, zeros after it let go.
+        wall: (N, 2) position [m] and stiffness [N/m]; default: the model's.
+        delays: forward and backward, periods of travel of each packet, -1 if lost.
     """
     scale = model.force_scale
     passivity = dataclasses.replace(
@@ -243,7 +235,6 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
 
 
 def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
-    """Return the measures of a run of `run_one_dof`."""
     return figures_of(
         t=run.t,
         master=run.master,
@@ -266,13 +257,11 @@ def figures_of(
     task: Task,
     turned: NDArray[np.float64] | None = None,
 ) -> Figures:
-    """Return the measures of a run of the task; all arrays (N,), equidistant.
+    """Return the measures of a run of the task from equidistant arrays (N,).
 
     Args:
-        t: times [s].
         master, slave: positions in the direction of pressing [m].
-        felt: force on the hand [N].
-        pressed: force of the environment, scaled to the hand [N].
+        felt, pressed: forces on the hand and of the environment, at the hand's scale [N].
         energy: from both ends into the channel [J].
         turned: (N, 3) rotation vector of the slave's tool [rad], if it can rotate.
     """
@@ -304,10 +293,7 @@ def figures_of(
 
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
-    """Return the least device damping [N s/m] that makes the displayed impedance passive (T43).
-
-    `round_trip` in s.
-    """
+    """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
     return max(0.0, -float(_resistance(model, round_trip).min()))
 
 

@@ -1,7 +1,4 @@
-"""A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`).
-
-The wall has 5.1 kN/m, the network is a preset. Each rate of `TAP_RATES` has eight taps of 30 mm.
-"""
+"""A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`)."""
 
 from __future__ import annotations
 
@@ -40,7 +37,6 @@ class ReleaseAndTaps:
 
 
 def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
-    """Simulate a hand that lets go and one that taps, with a passivity method over a network."""
     round_trip, model = 2 * PRESETS[network].delay, OneDof()
 
     def run(intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None) -> OneDofRun:

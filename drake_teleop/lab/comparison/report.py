@@ -54,7 +54,6 @@ Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
 
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
-    """Write report.html and its PNG pictures into `out`."""
     pictures = {
         "decision": draw_decision(summary),
         "hands": draw_hands(summary),
@@ -77,7 +76,6 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """Return the table cells of one run of the station, as text."""
     return [
         # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
@@ -86,7 +84,6 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def draw_decision(summary: Mapping[str, Any]) -> Figure:
-    """Draw the verdict of each method (a row) over each network (a column)."""
     methods, networks, table = summary["methods"], summary["networks"], decide(summary)
     with plot_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
@@ -125,7 +122,6 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_hands(summary: Mapping[str, Any]) -> Figure:
-    """Draw the results of letting go and taps: a row for each method, a mark for each network."""
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
@@ -164,8 +160,6 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw the displayed force over time: a row for each method, a column for each network."""
-
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
@@ -213,7 +207,6 @@ def _draw_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str)
 
 
 def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the longest stable round trip of each method: a panel for each wall."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     walls = sorted({row["wall_N_per_m"] for row in rows})
     with plot_style():
@@ -240,7 +233,6 @@ def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """Print the decision table to the terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table

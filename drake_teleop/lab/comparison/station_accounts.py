@@ -1,12 +1,7 @@
 """Energy balances of a station's run, from its recorded signals.
 
-The balances are those of `one_dof.OneDofRun.accounts`, for translation and rotation separately,
-scaled to the master's power, positive inwards [J]. With c = k_f gamma over the kinematic scale::
-
-    HAND      -sum f_(k-1) . dx_k       held wrench, at every period of the channel: exact
-    COMMAND    sum w_k . dc_k           sent wrench along the command: exact; no physical port
-    MOTOR     -integral c f_m . dx_s    motor torque minus weight, as a wrench at So
-    ACTUAL     integral c f_w . dx_s    true contact wrench at So; exact for a spring
+The balances are those of `one_dof.OneDofRun.accounts`, at the master's scale, positive inwards [J],
+by translation and rotation. MOTOR is from the motor torque minus weight, as a wrench at So.
 """
 
 from __future__ import annotations
@@ -36,19 +31,13 @@ _REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energy that entered the station at four places, up to each row of the log.
+    """Return the energies (N, 4, 2) [J] by place and by translation and rotation.
 
-    Returns:
-        (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL`, by translation and rotation [J], zero
-            in the first row. Hand and command lack the last row's period. `MOTOR` is NaN if the log
-            is slower than the joint control.
-
-    Raises:
-        DrakeTeleopError: if the result lacks a signal.
+    `MOTOR` is NaN if the log is slower than the joint control.
     """
     if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
-            f"this result holds no {', '.join(missing)}",
+            f"the result lacks the signals {', '.join(missing)}",
             where="accounts",
             remedy="run a station over a network, or with a method",
         )
@@ -77,13 +66,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the displayed work of the slave's load (weight and inertia) along its actual motion.
-
-    With sigma > 0 it belongs to the environment; `ACTUAL` excludes it.
-
-    Returns:
-        (N, 2) work by translation and rotation [J], zero in the first row.
-    """
+    """Return the displayed work (N, 2) of the slave's load, by translation and rotation [J]."""
     arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))

@@ -1,7 +1,4 @@
-"""Independent check of a trajectory against every limit at 1 kHz.
-
-Derivatives are finite differences; Drake's plant gives torques, accelerations and distances.
-"""
+"""Independent check of a trajectory against every limit at 1 kHz, with Drake's plant."""
 
 from __future__ import annotations
 
@@ -66,12 +63,7 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Use]:
-    """Return the use of every limit by a sampled motion, largest first.
-
-    Args:
-        t: (T,) times [s].
-        q, qd, qdd: (T, n) joint positions, velocities and accelerations [rad, s].
-    """
+    """Return the use of every limit by a motion of T samples and n joints, largest first."""
     names, limits = robot.arm.joint_names, robot.limits
     motion = _evaluate_bodies(robot, q, qd, qdd, progress)
     uses = [
@@ -96,15 +88,7 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
 
 @dataclass(frozen=True)
 class _Motion:
-    """Values of T samples of a motion.
-
-    Attributes:
-        torque: (T, n) joint torques.
-        sensor: (T, 4) norms of force, torque, s and alpha at the sensor.
-        workspace: (T, 3 P) use of the box by P points.
-        clearance: (T,) required clearance over distance.
-        nearest: names of the nearest bodies.
-    """
+    """Values of T samples of a motion; `clearance` is required clearance over distance."""
 
     torque: Array
     sensor: Array
@@ -157,7 +141,6 @@ def _evaluate_bodies(
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
-    """Return norms (T, 4) of force, torque, s, alpha in S (Newton-Euler)."""
     mass, com = M_S.get_mass(), M_S.get_com()
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))

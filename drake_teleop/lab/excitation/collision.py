@@ -44,7 +44,7 @@ from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize
 
 # Vertices of the circumscribed polygon of a cylinder.
-_RIM = 24
+_NUM_RIM_POINTS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +55,14 @@ class Capsule:
     radius: float
 
     def moved(self, X: RigidTransform) -> Capsule:
-        """Return the capsule transformed by X."""
         return Capsule(X.multiply(self.ends.T).T, self.radius)
 
     def holds(self, other: Capsule) -> bool:
-        """Return whether this capsule contains another one."""
         distances = _distances(self.ends, other.ends)
         return bool(np.all(distances + other.radius <= self.radius + 1e-9))
 
 
 def bounding_capsule(shape: Shape) -> Capsule:
-    """Return a small capsule around a shape, in the shape's frame."""
     if isinstance(shape, Sphere):
         return Capsule(np.zeros((2, 3)), shape.radius())
     if isinstance(shape, CapsuleShape):
@@ -94,11 +91,11 @@ def _hull(shape: Shape) -> Array:
         corners = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, 8).T
         return corners * [shape.a(), shape.b(), shape.c()]
     if isinstance(shape, Cylinder):
-        angle = 2 * np.pi * np.arange(_RIM) / _RIM
-        radius = shape.radius() / np.cos(np.pi / _RIM)
+        angle = 2 * np.pi * np.arange(_NUM_RIM_POINTS) / _NUM_RIM_POINTS
+        radius = shape.radius() / np.cos(np.pi / _NUM_RIM_POINTS)
         rim = radius * np.column_stack([np.cos(angle), np.sin(angle)])
         half = shape.length() / 2
-        ends = [np.column_stack([rim, np.full(_RIM, z)]) for z in (-half, half)]
+        ends = [np.column_stack([rim, np.full(_NUM_RIM_POINTS, z)]) for z in (-half, half)]
         return np.concatenate(ends)
     hull = shape.GetConvexHull()
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
@@ -143,9 +140,6 @@ class Scene:
     Args:
         reserve: (10,) parameters phi of an additional load on the sensor.
         visuals_count: True: visual shapes also count as collision shapes.
-
-    Raises:
-        DrakeTeleopError: for a shape that is too large for an arm.
     """
 
     def __init__(
@@ -175,15 +169,10 @@ class Scene:
     def without_neighbours(
         self, postures: Array, start: Array | None
     ) -> tuple[dict[_Pair, Array], list[str]]:
-        """Return the pairs of shapes that may collide, with distances in each posture (inf: far).
+        """Return pairs of shapes that may collide, and names of bodies that touch at the start.
 
-        Excluded are pairs on one link, pairs that are always near, and pairs at a constant
-        distance. Shapes that touch in the start posture are excluded too; the names of their bodies
-        are returned.
-
-        Args:
-            postures: (T, n) joint positions.
-            start: (n,) start posture, if known.
+        Excluded are pairs that are on one link, always near, at a constant distance, or in
+        contact in the posture `start`.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -234,11 +223,7 @@ class Scene:
     def capsules(
         self, candidates: dict[_Pair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
-        """Return links, ends, radii, pairs and minimum distances of the capsules, see `Limits`.
-
-        Excluded are capsules inside larger ones, and pairs whose capsules are near regardless of
-        their shapes.
-        """
+        """Return links, ends, radii, pairs and minimum distances of the capsules, see `Limits`."""
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
@@ -286,10 +271,9 @@ class Scene:
 
 
 def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
-    """Return the minimum distance of two capsules from (T,) distances in random postures [m].
+    """Return the minimum distance [m] of two capsules from (T,) distances in random postures.
 
-    Capsules are larger than their shapes, so the lower quartile of their excess near contact is
-    subtracted. At least 90 % of the free postures remain feasible.
+    Capsules are larger than their shapes, so the lower quartile of their excess is subtracted.
     """
     touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
     excess = (

@@ -2,13 +2,11 @@
 
 =========== ====================================================================================
 kappa_w10   10 columns of V, rows / sigma, columns times diag(1, L, L, L, L^2 ...). The default.
-kappa10     10 columns of V in SI units; at least sqrt(8/3).
-kappa16     16 columns of [1 V] in SI units; at least 9.81 from rest to rest.
+kappa10     10 columns of V in SI units.
+kappa16     16 columns of [1 V] in SI units.
 A16         rms of the 10 predicted errors of phi over acceptable errors.
 D16         geometric mean of the 16 semi-axes of the standard ellipsoid over acceptable errors.
 =========== ====================================================================================
-
-A16 and D16 assume one period at 1 kHz, white wrench noise and exact motion.
 """
 
 from __future__ import annotations
@@ -50,17 +48,13 @@ class Scales(NamedTuple):
 
 
 def characteristic_length(phi: Array) -> float:
-    """Return the length L [m]: the load's radius of gyration about So, at most 0.1."""
+    """Return the load's radius of gyration about So [m], at most 0.1."""
     trace = phi[4] + phi[7] + phi[9]
     return float(min(0.1, np.sqrt(trace / (2 * phi[0]))))
 
 
 class Criterion:
-    """One of `CRITERIA` as a smooth function of the motion.
-
-    Raises:
-        DrakeTeleopError: for an unknown name.
-    """
+    """One of `CRITERIA` as a smooth function of the motion."""
 
     def __init__(self, name: str, scales: Scales) -> None:
         if name not in CRITERIA:
@@ -101,11 +95,7 @@ class Criterion:
         return float(np.exp(log_value) / np.sqrt(RATE * duration))
 
     def smooth(self, s: Array, omega: Array, alpha: Array, sharpness: float) -> tuple[float, Array]:
-        """Return the logarithm of the criterion and its gradient by V (T, 6, 10).
-
-        Log-sum-exps replace extreme eigenvalues: at an optimum the smallest one is multiple and its
-        gradient is not unique. A16 and D16 are for one mean sample.
-        """
+        """Return the logarithm of the criterion and its gradient by V (T, 6, 10)."""
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
@@ -120,7 +110,6 @@ class Criterion:
     def _log_criterion_and_gradient(
         self, eigenvalues: Array, vectors: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return log criterion and gradient by eigenvalues (A16: by the Gram matrix)."""
         if self.name == "D16":
             n = len(eigenvalues)
             return float(-0.5 * np.log(eigenvalues).mean()), -0.5 / (n * eigenvalues)

@@ -68,17 +68,9 @@ def excite(
     seconds: float | None = None,
     progress: bool | Stage = True,
 ) -> Excitation:
-    """Design an excitation trajectory and check it.
+    """Design an excitation trajectory with `harmonics` harmonics in Eq. (9), and check it.
 
-    Args:
-        criterion: name in `CRITERIA`.
-        period: duration of the trajectory [s].
-        harmonics: number N of harmonics in Eq. (9), at least 2.
-        seed, starts, seconds: see `design`.
-        progress: True shows progress bars; or a `Stage` that receives the progress.
-
-    Raises:
-        DrakeTeleopError: if no trajectory respects all limits.
+    `criterion` is a name in `CRITERIA`, `period` in s; `design` explains seed, starts, seconds.
     """
     task = Task(
         robot.arm.table,
@@ -109,7 +101,6 @@ def checked_excitation(
     trajectory: FourierTrajectory,
     uses: list[Use],
 ) -> Excitation:
-    """Return a checked trajectory with criteria, the load's predicted deviations and history."""
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,
@@ -128,11 +119,7 @@ def checked_excitation(
 def best_checked(
     robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
 ) -> tuple[FourierTrajectory, list[Use]]:
-    """Return the best trajectory that passes the check, and its use of the limits.
-
-    Raises:
-        DrakeTeleopError: if no trajectory passes.
-    """
+    """Return the best trajectory that passes the check, and its use of the limits."""
     worst: Use | None = None
     for trajectory in _candidates(found, robot):
         uses = check(robot, trajectory, progress)
@@ -169,11 +156,7 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
 
 
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
-    """Yield trajectories within the limits at 1 kHz, best first.
-
-    A descent may end too close to a true shape, so the next candidate of this descent is worse by
-    `_CANDIDATE_RATIO`.
-    """
+    """Yield trajectories within the limits at 1 kHz, best first."""
     ranked = sorted(found, key=lambda iterate: iterate.value)
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)
     checks = 0

@@ -70,7 +70,7 @@ class Limits(NamedTuple):
 
 
 def sampled_half(q_half: Array) -> Array:
-    """Return the half ranges (n,) for random postures: half a turn without limits."""
+    """Return the half ranges (n,) for random postures [rad]: pi without limits."""
     return np.where(np.isfinite(q_half), q_half, np.pi)
 
 
@@ -115,11 +115,8 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
 def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
     """Write the largest use of each of `LIMITS` over all samples, with gradients (T47).
 
-    Args:
-        q, qd, qdd: (T, n) joint positions, velocities and accelerations.
-        motions: (T, n+1, 21) from `motions_of`.
-        smooth, largest: (7,) outputs: smooth and exact maximum.
-        gradient: (7, 3, T, n) output: gradient of the smooth uses by q, qd, qdd.
+    Outputs: smooth and exact maximum (7,), and the gradient (7, 3, T, n) of the smooth one by
+    joint positions, velocities and accelerations.
     """
     gradient[:] = 0.0
     T, n = q.shape
@@ -342,7 +339,7 @@ def _is_far(first, second, enough):
 def _segment_distance(first, second, nearest):
     """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
 
-    Output `nearest` (5,): positions along the segments (0 to 1), unit vector from second to first.
+    `nearest` (5,): positions along the segments (0 to 1), unit vector from second to first.
     """
     dd = ee = de = dr = er = 0.0
     for i in range(3):
@@ -375,5 +372,4 @@ def _segment_distance(first, second, nearest):
 
 
 def empty_motions(samples: int, joints: int) -> Array:
-    """Return an uninitialised array for the output of `motions_of`."""
     return np.empty((samples, joints + 1, MOTION_SIZE))

@@ -1,7 +1,7 @@
-"""Gradients of functions of a serial arm's link motions in one sweep (T48, T49).
+"""Gradients of functions of a serial arm's link motions, by the adjoint recursion (T48, T49).
 
-The sweep is the adjoint of the recursion of `slave/arm.py`. Seeds are the derivatives of a scalar J
-by each link's motion ``[s, omega, alpha, p, R]`` in W; for R it is g of ``dJ = g . dtheta``.
+A seed contains the derivatives of a scalar J by a link's motion ``[s, omega, alpha, p, R]`` in W;
+for R it is g of ``dJ = g . dtheta``.
 """
 
 from __future__ import annotations
@@ -31,19 +31,17 @@ _S, _OMEGA, _ALPHA, _P, _THETA, _V, _W = 0, 3, 6, 9, 12, 15, 18
 
 @njit(cache=True)
 def to_world(motion, a):
-    """Return a triple `a` of the link's frame, in W; `motion` (21,) contains the rotation R."""
     return apply(nine(motion, 12), a)
 
 
 @njit(cache=True)
 def to_link(motion, a):
-    """Return a triple `a` of W, in the link's frame."""
     return apply(transposed(nine(motion, 12)), a)
 
 
 @njit(cache=True)
 def seed_vector(motion, place, gradient, seed):
-    """Add a derivative by s, omega or alpha (`place` 0, 3, 6), in the link's frame, to `seed`."""
+    """Add to `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in the link's frame."""
     g = to_world(motion, gradient)
     add_into(seed, place, g)
     add_into(seed, _THETA, cross(g, three(motion, place)))
@@ -51,20 +49,14 @@ def seed_vector(motion, place, gradient, seed):
 
 @njit(cache=True)
 def seed_point(motion, point, gradient, seed):
-    """Add a derivative, in W, by the position of a point (3,) fixed to the link to `seed`."""
+    """Add to `seed` a derivative, in W, by the position of a point (3,) fixed to the link."""
     add_into(seed, _P, gradient)
     add_into(seed, _THETA, cross(to_world(motion, point), gradient))
 
 
 @njit(cache=True)
 def seed_wrench(motion, phi, g_force, g_torque, seed):
-    """Add derivatives by the wrench of a load, Eqs. (1)-(2), about the link's origin to a seed.
-
-    Args:
-        phi: (10,) parameters of the load.
-        g_force, g_torque: derivatives by force and torque, triples in the link's frame.
-        seed: (21,) the link's seed, added to.
-    """
+    """Add to `seed` (21,) derivatives by the wrench of a load phi, both in the link's frame."""
     s = to_link(motion, three(motion, _S))
     w = to_link(motion, three(motion, _OMEGA))
     h, inertia = three(phi, 1), symmetric(phi, 4)
@@ -85,10 +77,7 @@ def seed_wrench(motion, phi, g_force, g_torque, seed):
 def seed_joint_torque(table, motions, c, virtual, seeds):
     """Add the seeds of J = c . tau, with joint torques tau without rotor inertia and damping.
 
-    Args:
-        c: (n,) weights of the joint torques.
-        virtual: (n+1, 6) output: link velocities for joint velocities c, for `pull_back`.
-        seeds: (n+1, 21) seeds of the links, added to.
+    Write the link velocities for joint velocities c into `virtual` (n+1, 6).
     """
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)
@@ -121,12 +110,9 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
 
 @njit(cache=True)
 def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
-    """Add the gradients that belong to the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
+    """Add to `g_q`, `g_qd`, `g_qdd` (n,) the gradients that follow from the seeds of all links.
 
-    Args:
-        motions: (n+1, 21), `link_motions` at (q, qd, qdd).
-        c, virtual: (n,), (n+1, 6) as in `seed_joint_torque`, or zeros.
-        seeds: (n+1, 21) seeds of the links.
+    `c` and `virtual` are those of `seed_joint_torque`, or zeros.
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)

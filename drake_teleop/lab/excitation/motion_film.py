@@ -35,7 +35,6 @@ _CAMERA_POSITION = np.array([0.55, -0.75, 0.3])
 
 
 def write_motion_film(path: Path, found: Excitation) -> None:
-    """Write an HTML file with the 3D replay of one period."""
     robot, trajectory = found.robot, found.trajectory
     times, slow_motion = frame_times(0.0, trajectory.period, 1.0)
     q = trajectory.evaluate(times)[0]

@@ -1,7 +1,6 @@
-"""Optimiser of excitation trajectories.
+"""Optimiser of excitation trajectories: L-BFGS with penalties, then SLSQP.
 
-L-BFGS with penalties moves random candidates to the limits; SLSQP then minimises the criterion. All
-improving feasible iterates are recorded, because SLSQP often ends on an infeasible one.
+All improving feasible iterates are recorded, because SLSQP often ends on an infeasible one.
 """
 
 from __future__ import annotations
@@ -90,7 +89,6 @@ class Problem:
         self._gradients = np.empty((1 + len(LIMITS), 3, samples, n))
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        """Return the trajectory with the unknowns x."""
         n = len(self.task.home)
         sine, cosine = x[n:].reshape(2, n, -1)
         return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
@@ -114,7 +112,6 @@ class Problem:
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
-        """Evaluate criterion and limits at x, with the sharpness of their smooth maxima."""
         task, n = self.task, len(self.task.home)
         coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         joints = self._basis @ coefficients
@@ -189,11 +186,8 @@ def design(
 ) -> list[Iterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    Args:
-        seed: seed of the candidates; without `seconds` the result is reproducible.
-        starts: number of candidates from which a descent starts.
-        seconds: thread CPU time; replaces `starts`.
-        progress: called with completed share and best criterion.
+    `seconds` of thread CPU time replace the number of `starts`; the result is then not
+    reproducible.
     """
     search = _Search(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):
@@ -298,7 +292,6 @@ class _Search:
     def _evaluate_once(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float
     ) -> Evaluation:
-        """Evaluate a point once for SLSQP's separate requests."""
         key = np.array([*x, criterion_sharpness, limit_sharpness]).tobytes()
         if key != self._key:
             self._count_evaluation()

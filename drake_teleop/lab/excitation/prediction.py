@@ -1,7 +1,6 @@
 """Predicted standard deviations of offsets and load after an excitation (T46).
 
-Assumptions: every sensor sample is used, the motion is slow, the load is known, quantisation is
-noise. Not included: gain errors, delay, thermal drift, rounding of encoders, products of noises.
+Gain errors, delay, thermal drift and rounding of encoders are not included.
 """
 
 from __future__ import annotations
@@ -60,20 +59,13 @@ def sensor_noise(
 def predicted_deviations(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the standard deviations (16,) of offsets and phi, see `predicted_covariance`."""
     return np.sqrt(np.diag(predicted_covariance(s, omega, alpha, step, noise, phi)))
 
 
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return the covariance (16, 16) of offsets and phi after the motion.
-
-    Args:
-        s, omega, alpha: (T, 3) samples of the motion, in S.
-        step: sample period [s].
-        phi: (10,) parameters of the load.
-    """
+    """Return the covariance (16, 16) of offsets and phi after a motion s, omega, alpha (T, 3)."""
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.weights[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)

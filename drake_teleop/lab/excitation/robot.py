@@ -57,7 +57,6 @@ class Robot:
         sensor_frame: frame S of the wrist sensor.
         home: (n,) start posture of the search [rad].
         assumptions: assumed values that the model lacks.
-        folders: temporary folders with converted meshes.
     """
 
     name: str
@@ -75,11 +74,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """Return the station's slave with tool, environment, and a table at z = 0.
-
-    Raises:
-        DrakeTeleopError: if the arm cannot reach the scenario's start.
-    """
+    """Return the station's slave with tool, environment, and a table at z = 0."""
     check_scenario(scenario)
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
@@ -121,14 +116,7 @@ def RobotFromModel(
 ) -> Robot:
     """Return a serial arm from a model; free bases are welded, joints beyond the sensor locked.
 
-    Args:
-        sensor_frame: frame or link at which the sensor measures.
-        package_paths: folders for `package://` addresses.
-        acceleration: limits [rad/s^2] if the model has none, one value or one for each joint.
-        payload: mass of the heaviest load [kg], if the model lacks it.
-
-    Raises:
-        DrakeTeleopError: if the model is unreadable or not a serial arm.
+    Acceleration limits [rad/s^2] and payload [kg] are used where the model has none.
     """
     missing: list[str] = []
     folders: list[TemporaryDirectory[str]] = []
@@ -196,10 +184,7 @@ def _make_robot(
     assumptions: list[str],
     folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
-    """Return the robot with its limits; `box` is middle and half size in W [m].
-
-    Shapes that touch in the `start` posture (n,), if known, may touch.
-    """
+    """Return the robot with its limits; `box` is middle and half size in W [m]."""
     arm = scene.arm
     middle, half = arm.middle, (arm.upper - arm.lower) / 2
     random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))

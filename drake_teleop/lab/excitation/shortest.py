@@ -1,12 +1,10 @@
 """Shortest motion that identifies a load within tolerances: `excite --until`.
 
-The logarithm of the period T is one more unknown and is minimised; the tolerance is one more limit,
+The logarithm of the period T is an unknown and is minimised; the tolerance is one more limit,
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
-with standard deviations d_k after one period. With the factor z, all numbers are within their
-tolerances together in `RELIABLE` of the records (Sidak). The optimiser models white noise. A factor
-for each number, from `prediction.py`, adds random walks and filters; the search repeats with it.
+with standard deviations d_k after one period and z of `reliable_factor`.
 """
 
 from __future__ import annotations
@@ -88,11 +86,6 @@ def shortest(
 ) -> Shortest:
     """Design and check the shortest motion that reaches a tolerance.
 
-    Args:
-        harmonics: number N of harmonics in Eq. (9).
-        seed, progress: see `design`.
-        starts: random starts of the first round.
-
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
@@ -147,7 +140,7 @@ def shortest(
 
 
 def reliable_factor(count: int) -> float:
-    """Return the factor z for `count` numbers, see `RELIABLE`."""
+    """Return the factor z with which `count` numbers are within tolerance together (Sidak)."""
     return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
 
 
@@ -175,7 +168,6 @@ class ShortestProblem(Problem):
         self._period, self._shortest = 1.0, task.harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        """Return the trajectory with the unknowns x."""
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
@@ -193,7 +185,7 @@ class ShortestProblem(Problem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return bounds around the unknowns x; only the log of the period, the last, is bounded."""
+        """Return bounds of the unknowns; only the last, the log of the period, is bounded."""
         shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
         around = (
             np.clip(x[-1] + step, shortest_period, largest)
@@ -258,9 +250,8 @@ class ShortestProblem(Problem):
     def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
         """Return variances (k,) d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
 
-        e_k is a row of `errors`; G = sum of R^T R period / samples is the information of weighted
-        least squares; B = sum of R^T S R period / samples contains the noise densities S (sandwich,
-        White, Econometrica 1980).
+        G is the information of weighted least squares; B contains the noise densities; e_k is a row
+        of `errors` (sandwich, White, Econometrica 1980).
         """
         share, flat = period / len(rows), rows.reshape(-1, rows.shape[2])
         G = share * (flat.T @ flat)
@@ -273,10 +264,7 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
-        """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V.
-
-        With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), half of it in the use.
-        """
+        """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V."""
         rows = self._rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
         logs = 0.5 * np.log(variances)
@@ -290,10 +278,7 @@ class ShortestProblem(Problem):
 
 
 def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """Return the white noise densities (6, 6) of wrench and of motion times load.
-
-    They are relative to the wrench's own densities, and do not include filters.
-    """
+    """Return the white noise densities (6, 6) of wrench and motion, relative to the wrench's."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
         at_So = np.eye(6)

@@ -76,20 +76,14 @@ class ContactMotion:
 
 
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
-    """Simulate a free movement and calculate the scaled wrench for each sigma.
-
-    `estimate` (16,): sensor offsets, then phi.
-    """
+    """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
     scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
 def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
-    """Simulate the contact transition with and without the leaf spring.
-
-    `estimate` (16,): sensor offsets, then phi.
-    """
+    """Simulate the contact transition with and without the leaf spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
     free = _simulate(without_sheet(scenario), estimate, free_stage)
@@ -108,10 +102,7 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
 
 
 def ideal_motion(progress: Progress) -> IdealMotion:
-    """Simulate a free movement that moves and rotates the tool about all axes.
-
-    The reaction of the tool's weld comes from Drake's plant and does not use the regressor V.
-    """
+    """Simulate a free movement that moves and rotates the tool about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
     )
@@ -140,10 +131,7 @@ def ideal_motion(progress: Progress) -> IdealMotion:
 
 
 def ideal_values(run: IdealMotion) -> Values:
-    """Return the reaction minus V phi, by the elimination and by the regressor, by name.
-
-    All six components are compared; only rounding errors remain if V is correct.
-    """
+    """Return the errors of the calculated load wrench, by elimination and by regressor."""
     load = regressor(*run.motion) @ run.phi
     left = np.concatenate(
         [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]
@@ -157,12 +145,7 @@ def ideal_values(run: IdealMotion) -> Values:
 
 
 def free_values(run: FreeMotion, component: int, unit: str) -> Values:
-    """Return the values of Fig. 6 or Fig. 7 for one component of the wrench.
-
-    Args:
-        component: index 0 to 5 in the wrench.
-        unit: unit, as suffix of the values' names.
-    """
+    """Return the values of Fig. 6 or Fig. 7; `component`: index 0 to 5 in the wrench."""
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
     scale = run.scenario.force_scaling.force_scale
@@ -178,7 +161,6 @@ def free_values(run: FreeMotion, component: int, unit: str) -> Values:
 
 
 def contact_values(run: ContactMotion) -> Values:
-    """Return the values of Fig. 8 by name."""
     t, force_norm = run.touched.t, _force_norm(run.calculated)
     detected = force_norm > run.threshold
     window = _contact_window(run)
@@ -200,10 +182,7 @@ def contact_values(run: ContactMotion) -> Values:
 
 
 def raw_excess(run: ContactMotion) -> Array:
-    """Return how far f_x, f_y, f_z, |f| leave their contact-free range during contact (4,) [N].
-
-    The raw force is used; -inf without contact.
-    """
+    """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
         for raw in (run.raw[_contact_window(run)], run.raw_free)

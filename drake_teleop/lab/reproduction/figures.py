@@ -32,12 +32,7 @@ def scaling_figure(
 ) -> Figure:
     """Draw Fig. 6 or 7: one component at the slave for each sigma; right axes at the master.
 
-    Args:
-        t: (N,) times [s].
-        values: for each sigma, the scaled component (N,) at the slave, in `unit`.
-        symbol: matplotlib text of the component's symbol.
-        unit: "N" or "N m".
-        downscaling: force at the slave over force at the master, 17.5 in the paper.
+    `symbol` is matplotlib text; `downscaling` is force at the slave over force at the master.
     """
     time, time_unit = _time(t)
     traces = [np.asarray(trace, float) for trace in values]
@@ -74,14 +69,7 @@ def contact_figure(
 ) -> Figure:
     """Draw Fig. 8: measured force and calculated contact force, with shaded contact.
 
-    Args:
-        t: (N,) times [s].
-        measured, contact_force: (N,) components of these forces at the slave [N].
-        symbol: matplotlib text of the component's symbol.
-        contact: (N,) True in true contact.
-        detected_s: time of the detection [s].
-        threshold: force threshold of the detection [N].
-        turning_s: time of the reversal without contact, which is marked [s].
+    `threshold` [N] and `detected_s` are of the detection; `turning_s`: reversal without contact.
     """
     time, time_unit = _time(t)
     per_second = 1e3 if time_unit == "ms" else 1.0

@@ -28,9 +28,9 @@ _PARAMETERS = (
 
 _NOT_REPORTED = "not reported"
 # Pairs of verdicts: for an accepted value, for an unaccepted value.
-_AS_SET = ("as set", "not as set")
+_VERDICTS_OF_SET = ("as set", "not as set")
 _WITHIN_BOUND = ("within our bound", "beyond our bound")
-_AGREES = ("agrees", "differs")
+_VERDICTS_OF_FOUND = ("agrees", "differs")
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,9 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Verdict as text; "agrees" or "differs" only for found values that the paper reports."""
         if self.holds is None:
             return "for the record"
-        words = _AS_SET if self.origin == "set" else _AGREES
+        words = _VERDICTS_OF_SET if self.origin == "set" else _VERDICTS_OF_FOUND
         if self.paper == _NOT_REPORTED:
             words = _WITHIN_BOUND
         return words[0] if self.holds else words[1]
@@ -91,10 +90,7 @@ class ParameterRow:
 
 
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
-    """Return the rows of the table that compares paper and reproduction.
-
-    `summary`: values by full name, such as "free_force.peak_raw_N".
-    """
+    """Return the rows of the table that compares paper and reproduction."""
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     share = s["contact.peak_contact_N"] / s["contact.peak_inertial_N"]
@@ -134,7 +130,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
     ]  # fmt: skip
 
 
-def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return as text the rows whose values are outside the accepted range."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
@@ -153,7 +149,6 @@ def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def captions(summary: Mapping[str, Any]) -> dict[str, str]:
-    """Return the captions of fig6, fig7 and fig8 with the values of this run."""
     s = summary
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     threshold = "a threshold" if s["contact.raw_detectable"] else "no threshold"
@@ -187,10 +182,7 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
 def parameter_rows(
     true: ArrayLike, estimate: ArrayLike, deviation: ArrayLike
 ) -> list[ParameterRow]:
-    """Return the rows of the identification table.
-
-    Arguments (16,): true values, estimates and standard deviations of offsets and phi, Eq. (7), SI.
-    """
+    """Return the rows of the identification table from offsets and phi (16,), SI."""
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
     for (symbol, index, unit, scale), values in zip(_PARAMETERS, columns, strict=True):
@@ -204,7 +196,6 @@ def parameter_rows(
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the numerical libraries."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
 
@@ -218,13 +209,7 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures; equal runs give equal pages.
-
-    Args:
-        setup: description of the run: name -> text.
-        summary: values by full name.
-        replay: file name of the 3D replay beside the page, if any.
-    """
+    """Write the HTML page with embedded figures; equal runs give equal pages."""
     page = render(
         "drake_teleop.lab.reproduction",
         "report.html.j2",

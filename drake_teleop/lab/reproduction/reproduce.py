@@ -1,9 +1,4 @@
-"""`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order.
-
-1. Identification of the load (section IV) by the recursive estimator in the loop.
-2. Figs. 6 and 7: free movements, and one about all axes with the reaction force of Drake's plant.
-3. Fig. 8: contact, and the same movement without the leaf spring.
-"""
+"""`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order."""
 
 from __future__ import annotations
 
@@ -68,12 +63,7 @@ def reproduce_command(
 ) -> Values:
     """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
-    Args:
-        seed: first seed of the noise; None: 0.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-
-    Returns:
-        The summary, and the measured speed, which differs between equal runs.
+    Return the summary, and the measured speed, which differs between equal runs.
     """
     seed = seed or 0
     make_folder(out)  # fail early for a bad path
@@ -113,7 +103,6 @@ def reproduce_command(
 def draw(
     force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Values
 ) -> dict[str, Figure]:
-    """Draw Figs. 6, 7 and 8."""
     pictures = {
         name: scaling_figure(
             run.result.t,

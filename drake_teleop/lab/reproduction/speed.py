@@ -21,7 +21,7 @@ _RUN_S = 0.1  # simulated time of one measurement [s]
 def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
     """Return a simulator of arm and tool under constant holding torque.
 
-    `touching=True` adds the scenario's environment to the plant.
+    `touching=True` adds the scenario's environment.
     """
     builder = DiagramBuilder()
     surroundings = scenario.surroundings if touching else None

@@ -23,10 +23,8 @@ _LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e
 def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
     """Return the indices of the `count` candidates with the largest expected improvement.
 
-    Args:
-        places: (n, d) coordinates of the evaluated points, from 0 to 1.
-        objective: (n,) values to minimise; nan counts as the worst value.
-        candidates: (m, d) coordinates of the possible points, m >= count.
+    `places` (n, d) and `candidates` (m, d) have coordinates from 0 to 1; `objective` (n,) is
+    minimised; nan counts as the worst value.
     """
     y = np.array(objective, dtype=float)
     if not np.isfinite(y).any():

@@ -54,10 +54,7 @@ class Factor:
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: Value) -> list[float]:
-        """Return a value as coordinates from 0 to 1.
-
-        A number has one. A word, flag or vector has one indicator (0 or 1) per listed value.
-        """
+        """Return a number, or one indicator (0 or 1) per listed value of a word, flag or vector."""
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
         elif self.values:
@@ -68,11 +65,6 @@ class Factor:
         return [(value - low) / (high - low) if high > low else 0.0]
 
     def check(self, where: str) -> None:
-        """Check the factor's values without the scenario.
-
-        Raises:
-            DrakeTeleopError: if they are invalid; `where` is the place in the message.
-        """
         ranged = [self.low is not None, self.high is not None]
         lists = (self.values, self.words, self.flags, self.vectors)
         if [*map(bool, lists), any(ranged)].count(True) != 1 or any(ranged) != all(ranged):
@@ -129,11 +121,6 @@ class Study:
     force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "threshold of time_above_force_s")
 
     def check(self, where: str) -> None:
-        """Check the study without the scenario.
-
-        Raises:
-            DrakeTeleopError: if a field is invalid; `where` is the file in the message.
-        """
         check_ranges(self, where)
         for name in self.measures:
             if name not in MEASURES:
@@ -173,17 +160,12 @@ class Study:
             )
 
     def size(self) -> int:
-        """Return the number of points of the design."""
         if self.design == "factorial":
             return math.prod(len(factor.listed()) for factor in self.factors)
         return self.samples
 
     def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Refuse a study with too many runs, before its design is created.
-
-        Raises:
-            DrakeTeleopError: above `MAX_RUNS` runs, or above `MANY_RUNS` without consent (`yes`).
-        """
+        """Raise an error above `MAX_RUNS` runs, or above `MANY_RUNS` without consent (`yes`)."""
         runs = self.size() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
         if runs > MAX_RUNS:
@@ -208,12 +190,7 @@ class Study:
         return self._sobol(1 << (first - 1).bit_length(), self.seed)[: self.samples]
 
     def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
-        """Return the next points of an adaptive design; an empty list at its end.
-
-        Args:
-            points: the n evaluated points.
-            objective: (n,) values at these points; nan where the runs failed.
-        """
+        """Return the next points of an adaptive design; an empty list at its end."""
         count = min(self.batch, self.samples - len(points))
         if self.design != "adaptive" or count <= 0:
             return []
@@ -231,11 +208,7 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """Return one table row, still without measures, for each run of the points.
-
-        `first` is the number of the first point. Every second seed is reserved for the load
-        identification.
-        """
+        """Return one table row, still without measures, for each run of the points."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values

@@ -47,13 +47,9 @@ class Factorial:
     seen: Flags
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the levels of a factor, or the cells of two factors, that can be compared.
+        """Return booleans of comparable levels (or cells of two factors) and of used combinations.
 
-        They are compared over combinations of the other factors' levels at which all have a value.
-
-        Returns:
-            (rows,) True for compared levels or cells; (columns,) True for the used combinations;
-                (kept rows, n) matrix from point values to the means.
+        The matrix (kept rows, n) maps point values to means.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
         (row, rows), (column, columns) = (
@@ -69,13 +65,11 @@ class Factorial:
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return per factor the effects and half widths (kept levels,) of values (n, seeds)."""
         means = [self.compared(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        """Return means and half widths (k,) of values (n, seeds) with `weights` (k, n)."""
         mean, half = interval(weights @ table)
         return mean, np.hypot(half, self._missing_seed_widths(table, weights))
 
@@ -108,7 +102,7 @@ class Factorial:
         return quantile * np.sqrt(variance * np.maximum(spread, 0.0))
 
 
-def filled(values: Array) -> Array:
+def fill_missing(values: Array) -> Array:
     """Replace nan in values (n, seeds) by the least-squares sum of point and seed effect."""
     known = np.isfinite(values)
     if known.all():
@@ -137,10 +131,10 @@ PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Means over seeds at n levels, with half widths of their intervals.
+    """Means over seeds at n levels.
 
     Attributes:
-        mean, half: (n,) mean and its half width.
+        mean, half: (n,) mean and half width of its interval.
         effect_half: (n,) half width of the difference from the mean of all n levels.
     """
 
@@ -197,10 +191,7 @@ class PairMeans:
 def estimated(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """Return the means of values (N,) at each of `count` levels, with intervals; nan is ignored.
-
-    `levels` and `seeds` (N,) are those of each value.
-    """
+    """Return the means of values (N,) at each of `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -215,7 +206,7 @@ def estimated(
 
 
 def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects on all measures as a table: one row per measure, factor and level."""
+    """Return the main effects on all measures: one row per measure, factor and level."""
     import polars as pl
 
     table = [
@@ -240,7 +231,6 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
-    """Return the effect of each factor on a measure: field -> effect."""
     data = _MeasureData(study, rows, measure)
     return (
         {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
@@ -248,7 +238,6 @@ def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, Ma
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
-    """Return the means of a measure at all pairs of levels, for each pair of factors."""
     data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
     return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
@@ -256,7 +245,7 @@ def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans
 
 class _MeasureData:
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
-        self.factors = varied(study)
+        self.factors = varied_factors(study)
         points, values = _values_by_point_and_seed(rows, measure)
         seen = np.isfinite(values)
         self.runs = seen.sum(axis=1)
@@ -265,7 +254,7 @@ class _MeasureData:
         if self.is_empty:
             return
         used = np.ix_(known, seen.any(axis=0))
-        self.table = filled(values[used])
+        self.table = fill_missing(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [levels_of(f, c) for f, c in zip(self.factors, columns, strict=True)]
         self.model: Factorial | LevelModel | None
@@ -340,10 +329,7 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return all points with their means of the `PARETO` measures; None if the study lacks one.
-
-    Only points with all three measures in every run can be on the front.
-    """
+    """Return all points with their means of the `PARETO` measures; None if the study lacks one."""
     import polars as pl
 
     if not set(PARETO) <= set(study.measures) or rows.is_empty():
@@ -367,10 +353,7 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (n,) booleans: True at complete points that no other complete point dominates.
-
-    The k columns of `values` (n, k) are minimised.
-    """
+    """Return True at complete points that no other dominates; columns of `values` are minimised."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]
@@ -379,8 +362,7 @@ def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return found
 
 
-def varied(study: Study) -> list[Factor]:
-    """Return the factors with more than one value."""
+def varied_factors(study: Study) -> list[Factor]:
     return [factor for factor in study.factors if len(factor.listed()) > 1]
 
 

@@ -27,15 +27,10 @@ TOO_FEW = "too few points"
 
 
 def comparable(there: Flags) -> tuple[Flags, Flags]:
-    """Return the largest complete block of a table with missing values.
+    """Return the rows and columns of the largest complete block of a table with missing values.
 
-    Args:
-        there: (rows, columns) True where a level (row) has a value at a combination of the other
-            factors (column).
-
-    Returns:
-        (rows,) True for the rows of the block: the largest pattern, the most frequent if several;
-            (columns,) True for all columns with these rows.
+    `there` (rows, columns) is True where a level (row) has a value at a combination of the other
+    factors (column).
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
@@ -45,10 +40,7 @@ def comparable(there: Flags) -> tuple[Flags, Flags]:
 
 
 def reasons(compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]) -> list[str]:
-    """Return for each of n levels or cells why it has no value; "" where `compared` (n,) is True.
-
-    `runs` and `good` (n,) are the numbers of runs and of successful runs.
-    """
+    """Return for each level or cell why it has no value; "" where `compared` is True."""
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
@@ -122,12 +114,7 @@ class LevelModel:
     solve: Array
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the levels of a factor, or the cells of two factors, that can be compared.
-
-        Returns:
-            As `Factorial.compared`, but only with combinations of factors related to failures, and
-                a matrix (kept rows, p) from coefficients to means.
-        """
+        """Return the same as `Factorial.compared`, with a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
         shape = [len(self.factors[factor].names) for factor in factors]
@@ -141,10 +128,7 @@ class LevelModel:
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return per factor the effects and half widths (kept levels,) of values (n, seeds).
-
-        All intervals hold together with probability `CONFIDENCE` (Bonferroni).
-        """
+        """Return per factor the effects and half widths, which hold together (Bonferroni)."""
         means = [self.compared(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
@@ -157,7 +141,6 @@ class LevelModel:
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
-        """Return means and half widths (kept levels,); `terms` is the matrix of `compared`."""
         seeds = table.shape[1]
         each = terms @ self.solve @ table
         if seeds == 1:
@@ -216,12 +199,8 @@ def level_model(
 ) -> LevelModel | None:
     """Return a regression model that the points determine, or None.
 
-    The model with most terms that leaves half the points for residuals is preferred.
-
-    Args:
-        columns: for each factor, its values (n,) at the points.
-        known: (n,) True where the measure has a value; None: everywhere.
-        by_chance: True if combinations of levels without points are missing by chance.
+    `known` (n,) is True where the measure has a value; `by_chance` is True if combinations of
+    levels without points are missing by chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:

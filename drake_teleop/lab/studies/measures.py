@@ -67,11 +67,7 @@ def default_measures() -> list[str]:
 def measured(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
-    """Return the measures `names` of one run, by name; `force_threshold` in N.
-
-    Raises:
-        DrakeTeleopError: if a task's measure is requested for a scenario without a task.
-    """
+    """Return the measures `names` of one run; `force_threshold` in N."""
     own = [name for name in names if name in _OF_EVERY_RUN]
     found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}
     if len(own) < len(names):

@@ -16,7 +16,7 @@ from drake_teleop.common.files import write_picture
 from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.studies import effects
 from drake_teleop.lab.studies.design import Study
-from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied
+from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied_factors
 from drake_teleop.lab.studies.level_model import (
     CONFIDENCE,
     NO_RUN,
@@ -40,9 +40,9 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
         old.unlink()
     measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]
     pictures: dict[str, Figure | None] = {}
-    if measures and varied(study):
+    if measures and varied_factors(study):
         pictures["main_effects"] = main_effects(study, rows, measures)
-        if len(varied(study)) > 1:
+        if len(varied_factors(study)) > 1:
             pictures |= {f"interactions_{m}": interactions(study, rows, m) for m in measures}
     pictures["pareto"] = pareto_front(study, rows)
     written = []
@@ -54,8 +54,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
-    """Draw the mean of each measure at each level; bars are intervals of the effects."""
-    factors, fitted, reasons = varied(study), False, set[str]()
+    factors, fitted, reasons = varied_factors(study), False, set[str]()
     with plot_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
         figure = Picture(figsize=size)
@@ -118,7 +117,6 @@ def _legend(figure: Figure, reasons: Iterable[str]) -> None:
 
 
 def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
-    """Draw the mean of a measure over pairs of factors; return None without such means."""
     maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None
@@ -154,7 +152,7 @@ def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
         return None
     points = points.filter("complete")
     on_front = points.filter("front")
-    factors = [factor.field for factor in varied(study)]
+    factors = [factor.field for factor in varied_factors(study)]
     with plot_style():
         figure = Picture(figsize=(10.0, 4.2))
         for axes, name in zip(figure.subplots(1, 2), PARETO[1:], strict=True):

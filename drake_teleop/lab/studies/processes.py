@@ -1,7 +1,7 @@
 """Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
-If a run crashes (ends its process), the rows of its chunk are run one by one; a row that crashes
-again gets an error. With one job, a crash ends the study.
+If a run ends its process, the rows of its chunk are run one by one; a row that ends its process
+again gets an error. With one job, this ends the study.
 """
 
 from __future__ import annotations
@@ -41,17 +41,9 @@ _PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 def processes(
     store: Store, jobs: int, cluster: str | None, executor: Executor | None
 ) -> Iterator[Processes]:
-    """Start the processes of a study for the duration of the context.
+    """Start `jobs` processes, a Dask cluster or a custom executor for the context.
 
-    Args:
-        store: where started chunks are marked.
-        jobs: number of processes as in joblib; 1 is this process.
-        cluster: address of a Dask scheduler, or "local".
-        executor: any `concurrent.futures.Executor`, which remains open.
-
-    Raises:
-        DrakeTeleopError: without Dask or scheduler, if processes end before their first run, if
-            the executor ends, or if a Dask worker has another version of this package.
+    `cluster` is the address of a Dask scheduler, or "local"; `executor` remains open.
     """
     if executor is not None:
         if not isinstance(executor, Executor):

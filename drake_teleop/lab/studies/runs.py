@@ -59,16 +59,8 @@ def run_study(
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
-    Args:
-        work: picklable function that executes one run.
-        basis: JSON data of all inputs of the rows besides the study.
-        shard: "K/N" for the runs and rows of this shard only; see `shards.py`.
-        merge: True collects the rows of the shards in `out`, and runs nothing.
-        progress: whether to show a progress bar, or the `Stage` of the caller.
-
-    Raises:
-        DrakeTeleopError: for the reasons of `study_command`.
-        KeyboardInterrupt: its message contains the number of stored runs.
+    `basis` is JSON data of all inputs of the rows besides the study. `shard` "K/N" restricts runs
+    and rows to this shard; `merge` collects the rows of all shards and runs nothing.
     """
     part = None if shard is None else parse_shard(shard)
     if (part or merge) and study.design == "adaptive":
@@ -140,11 +132,9 @@ class StudyProgress:
         self._recent: deque[float] = deque(maxlen=_NUM_RECENT_RUNS)
 
     def start(self, progress: Progress, processes: int) -> None:
-        """Set the progress bar and the number of processes; call this first."""
         self._progress, self._processes = progress, processes
 
     def add_earlier_runs(self, runs: int) -> None:
-        """Count runs that an earlier session has stored."""
         self.done += runs
         self._report()
 

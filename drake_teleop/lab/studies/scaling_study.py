@@ -72,10 +72,7 @@ def scaling_study_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run the remaining runs of the scaling studies; write the best scales and return the summary.
-
-    The arguments are those of `study_command`: jobs, cluster, repeats, yes, quiet, progress.
-    """
+    """Run the remaining runs of the scaling studies; write results; return those of answer.json."""
     make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY):
@@ -105,12 +102,7 @@ def scaling_study_command(
 
 
 def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
-    """Return merits, bootstrap intervals and failures for a selection of criteria.
-
-    Args:
-        tables: for each task, values (s, g, seeds) of each criterion (nan where failed) and of
-            "success".
-    """
+    """Return merits, bootstrap intervals and failures for a selection of criteria."""
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
@@ -228,7 +220,6 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
 def criteria_picture(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    """Draw each criterion over sigma, with a line for each gamma; `rows` by study name."""
     tasks = [task for task in TASKS if "force" in TASKS[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
@@ -253,7 +244,6 @@ def criteria_picture(
 
 
 def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> Figure:
-    """Draw the merit over sigma and gamma for each selection of criteria."""
     known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])
     farthest = np.abs(np.log2(known)).max(initial=0.01)
     # The colour scale is symmetric about 1 in ratios; excluded points are grey.

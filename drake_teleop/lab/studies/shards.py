@@ -1,7 +1,6 @@
 """Shards of a study: disjoint groups of its chunks for computers that share only a file system.
 
-Shard K/N runs every N-th chunk into the folder `shards/K-of-N` of the study. `merge_shards` links
-their parts into the study's own table, so that the bytes are those of one process.
+Shard K/N runs every N-th chunk into the folder `shards/K-of-N` of the study.
 """
 
 from __future__ import annotations
@@ -29,11 +28,9 @@ class Shard(NamedTuple):
     total: int
 
     def folder(self, out: Path) -> Path:
-        """Return the folder of this shard; `out` is the folder of the study."""
         return out / "shards" / f"{self.number}-of-{self.total}"
 
     def chunks(self, chunks: Sequence[Chunk]) -> list[Chunk]:
-        """Return the chunks of this shard; raise DrakeTeleopError if there are none."""
         if self.total > len(chunks):
             raise DrakeTeleopError(
                 f"the study has only {len(chunks)} groups of runs",
@@ -44,7 +41,7 @@ class Shard(NamedTuple):
 
 
 def parse_shard(text: str) -> Shard:
-    """Return the shard of a text such as "3/8"; raise DrakeTeleopError if it is invalid."""
+    """Return the shard of a text such as "3/8"."""
     found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text, re.ASCII)
     if not found or not 1 <= int(found[1]) <= int(found[2]):
         raise DrakeTeleopError(
@@ -54,12 +51,7 @@ def parse_shard(text: str) -> Shard:
 
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
-    """Link the parts of all shards in `out` into its table.
-
-    Raises:
-        DrakeTeleopError: without shards, or if one is of another study or version; or if chunks are
-            missing, with the shards that contain them.
-    """
+    """Link the parts of all shards in `out` into its table, which then has the bytes of one run."""
     names = [_FOLDER.fullmatch(path.name) for path in (out / "shards").glob("*")]
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:

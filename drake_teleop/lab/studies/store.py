@@ -39,7 +39,6 @@ class Store:
         return sorted(self.folder.glob(_PART.format(0).replace("0", "[0-9]")))
 
     def remove_damaged_parts(self) -> None:
-        """Remove unreadable or empty parts."""
         parts = self.parts()
         whole = _runs_in(parts)
         for part in parts:
@@ -47,7 +46,6 @@ class Store:
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
-        """Write the rows of one chunk."""
         write_table(self.folder / _PART.format(rows["run"][0]), rows, aside=self.folder)
 
     def mark(self, run: int) -> None:
@@ -59,7 +57,6 @@ class Store:
                 mark.write(b".")
 
     def unmark(self, run: int) -> None:
-        """Remove the counter of `mark`."""
         (self._marks / str(run)).unlink(missing_ok=True)
 
     def marked(self, times: int) -> set[int]:
@@ -103,11 +100,7 @@ def _runs_in(parts: list[Path]) -> set[int]:
 def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     """Open the store in the folder `out` and lock it for this process.
 
-    Args:
-        identity: JSON data of all inputs of the rows.
-
-    Raises:
-        DrakeTeleopError: if `out` has rows of other inputs, or is in use.
+    `identity` is JSON data of all inputs of the rows; rows of other inputs raise an error.
     """
     store = Store(out / "runs.parquet")
     make_folder(store.folder)
@@ -120,14 +113,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
 
 @contextmanager
 def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
-    """Lock the existing folder `out` for this process.
-
-    Args:
-        identity: JSON data of all inputs of the folder's content.
-
-    Raises:
-        DrakeTeleopError: if the content is from other inputs, or the folder is in use.
-    """
+    """Lock the existing folder `out`; raise an error if its content is from other inputs."""
     handle = os.open(out, os.O_RDONLY)
     try:
         _lock(handle, out)
@@ -147,11 +133,7 @@ def _lock(handle: int, out: Path) -> None:
 
 
 def check_identity(out: Path, identity: dict[str, Any]) -> None:
-    """Write the inputs of the rows into a new folder `out`, or compare them.
-
-    Raises:
-        DrakeTeleopError: if the folder has other inputs.
-    """
+    """Write the inputs of the rows into a new folder `out`; another folder must have the same."""
     path = out / "study.json"
     text = json.dumps(identity, indent=2) + "\n"
     if not path.exists():

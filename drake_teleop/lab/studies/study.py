@@ -1,14 +1,4 @@
-"""`drake-teleop study STUDY.yaml`: runs of one scenario over a design of its fields.
-
-============ =====================================================================================
-study.json   all inputs of the rows
-runs.parquet folder of parts, one table: run, point, repeat, seed, a column for each factor and
-             measure, and error: reason of a failed run
-summary.json number of runs and failed runs; mean, least and largest of each measure
-effects.csv  mean and effect of each level, with half widths of 95 % intervals
-pictures     main effects, interactions of two factors, Pareto front
-============ =====================================================================================
-"""
+"""`drake-teleop study STUDY.yaml`: runs of one scenario over a design of its fields."""
 
 from __future__ import annotations
 
@@ -60,7 +50,6 @@ class StationWork:
     threshold: float
 
     def scenario(self, values: Values, seed: int) -> Scenario:
-        """Return the scenario of one run: the base with the factors' values and the seed."""
         changes = values | {"simulation.seed": seed}
         return ScenarioFromData(_with_changes(self.data, changes), self.where)
 
@@ -90,21 +79,9 @@ def study_command(
 ) -> dict[str, Any]:
     """Run the remaining runs of a study; write summary, effects and pictures; return the summary.
 
-    Args:
-        path: study file, or the name of a shipped study.
-        jobs: number of processes; -1: one for each core.
-        cluster: address of a Dask scheduler, or "local".
-        executor: any `concurrent.futures.Executor` that executes the runs instead; stays open.
-        shard: "K/N" for every N-th group of runs, with a summary in the folder `shards/K-of-N`.
-        merge: True collects the rows of all shards in `out` and runs nothing.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
-        repeats: replaces the value of the file.
-        yes: True permits more than 1e5 runs; or a function that asks the user.
-
-    Raises:
-        DrakeTeleopError: for a wrong file, too many runs, another study's folder, missing Dask, a
-            Dask worker of another version, or shards that are missing.
-        KeyboardInterrupt: its message contains the number of stored runs.
+    `shard` "K/N" is every N-th group of runs; `merge` collects the rows of all shards and runs
+    nothing; `yes` permits more than 1e5 runs, or asks the user. The message of a
+    KeyboardInterrupt contains the number of stored runs.
     """
     for first, second, both in (
         ("shard", "merge", shard and merge),
@@ -144,11 +121,7 @@ def study_command(
 
 
 def LoadStudy(path: str | Path) -> Study:
-    """Load a study file and check everything that does not depend on the scenario.
-
-    Raises:
-        DrakeTeleopError: if it is invalid; with file and field.
-    """
+    """Load a study file and check everything that does not depend on the scenario."""
     path = shipped_file("study", path, studies_dir())
     study = settings_from_data(Study, read_yaml(path), str(path))
     study.check(str(path))

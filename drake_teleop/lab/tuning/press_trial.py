@@ -1,8 +1,4 @@
-"""Trials of settings: a hand swings, presses on a wall and holds, in the whole station or one axis.
-
-Both trials are the work of a study (`lab.studies.runs`); the values of a run are the fields of
-`Settings`, a grip and a wall.
-"""
+"""Trials of settings, in the whole station or one axis: a hand swings, presses and holds."""
 
 from __future__ import annotations
 
@@ -48,9 +44,9 @@ MIN_SHARE = 0.9
 SEARCH_MEASURES = ["gamma_limit", "linear_limit", "share"]
 TRIAL_MEASURES = ["rests", "rest_force_N", "share", "free_force_N", "contact_N", "threshold_N"]
 _REST_S, _JUDGED_S = 1.5, 0.8  # s, from the press to the judged time; length of that time
-_CALM_S = 0.1  # s, from the end of the swing until the hand is at rest
+_HAND_SETTLE_TIME_S = 0.1  # s, from the end of the swing until the hand is at rest
 _MAX_DEPTH, _DEVICE_SHARE = 0.02, 0.6  # m; share of the device's peak force that is used
-_SLIP_SPEED = 1e-3  # m/s, of the leaf; Drake's default
+_SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _LOW_PASS_DELAY = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
 _MIN_GAMMA, _RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _LINEAR_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
@@ -68,14 +64,12 @@ class Settings:
     low_pass_hz: float
 
     def passivity(self, stated: StatedSet) -> PassivityConfig:
-        """Return the passivity method, for the hands of the set."""
         hand = GRIPS[stated.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
         known = dataclasses.replace(charged(), hand_stiffness=stiffness)
         return PassivityConfig(method=self.method, charged_tdpa=known)
 
     def apply(self, base: Scenario, stated: StatedSet) -> Scenario:
-        """Return the scenario with these settings."""
         sensor = base.wrist_sensor
         if not sensor.ideal:
             sensor = dataclasses.replace(sensor, bandwidth_hz=self.low_pass_hz)
@@ -92,8 +86,7 @@ class Settings:
         )
 
 
-def settings_of(values: Values) -> Settings:
-    """Return the settings among the values of a run."""
+def settings_from_values(values: Values) -> Settings:
     names = [entry.name for entry in dataclasses.fields(Settings)]
     return Settings(**{name: values[name] for name in names})  # type: ignore[arg-type]
 
@@ -104,7 +97,7 @@ class StationTrial:
 
     Args:
         given: scenario of the user, with its own passivity and scales.
-        base: the same, see `stated_set.base_of`.
+        base: the same without environment, task and passivity method.
         estimate: (16,) load estimate.
     """
 
@@ -114,10 +107,10 @@ class StationTrial:
     estimate: Array
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return `TRIAL_MEASURES` of one run."""
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
-        as_given = values["method"] == AS_GIVEN
-        scenario = self.given if as_given else settings_of(values).apply(self.base, self.stated)
+        scenario = self.given
+        if values["method"] != AS_GIVEN:
+            scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base.channel
         task = short_task(sum(line.delay for line in channel.lines()))
@@ -129,7 +122,7 @@ class StationTrial:
             task=task,
             depth=press_depth(self.base, grip),
         )
-        setup = replace(setup, sheet_spring__slip=_SLIP_SPEED)
+        setup = replace(setup, sheet_spring__slip=_SLIP_SPEED_M_S)
         station = MakeTeleopStation(setup, load_estimate=self.estimate)
         try:
             result = simulate(station, setup.simulation, progress=False)
@@ -141,7 +134,7 @@ class StationTrial:
         gain = scaling.force_scale * scaling.scales().gamma
         contact = float(result["true_contact_wrench_W"][hold, 2].mean())
         felt = result["force_to_master"][hold, 2]
-        free = (result.t >= task.swung + _CALM_S) & (result.t < task.press)
+        free = (result.t >= task.swung + _HAND_SETTLE_TIME_S) & (result.t < task.press)
         period = result.t[1] - result.t[0]
         free_felt = result["force_to_master"][free, :3].T
         rest_force = max(
@@ -165,7 +158,7 @@ class StationTrial:
 class GammaSearch:
     """Work of a study: the largest gamma that is stable in one axis at all corners of the set.
 
-    `base`: scenario, see `stated_set.base_of`. `caps`: largest gamma by low-pass [Hz].
+    `caps`: largest gamma by low-pass [Hz].
     """
 
     base: Scenario
@@ -173,12 +166,11 @@ class GammaSearch:
     caps: dict[float, float]
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return `SEARCH_MEASURES` of one method, share of inertia and low-pass."""
-        settings = settings_of(values | {"gamma": 1.0})
+        settings = settings_from_values(values | {"gamma": 1.0})
         axis = OneAxisFromScenario(self.base, (0.0, 0.0, 1.0))
         axis = dataclasses.replace(axis, sigma=settings.sigma_inertia, wall_damping=0.0)
         linear = self._linear_limit(axis, settings)
-        cap = self.caps[settings.low_pass_hz] * self.stated.aims.margin
+        cap = self.caps[settings.low_pass_hz] * self.stated.requirements.margin
         if settings.method == "none":
             cap = min(cap, linear)
         shares: dict[float, float] = {}
@@ -201,7 +193,7 @@ class GammaSearch:
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
     def _linear_limit(self, axis: Any, settings: Settings) -> float:
-        """Return the largest gamma without a method, from the Diagram's sampled one-axis loop."""
+        """Return the largest gamma without a method, from the sampled one-axis loop."""
         sampling = sampling_of(self.base)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)

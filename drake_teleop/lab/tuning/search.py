@@ -23,7 +23,7 @@ from drake_teleop.lab.tuning.press_trial import (
     GammaSearch,
     Settings,
     StationTrial,
-    settings_of,
+    settings_from_values,
 )
 
 METHODS = ("none", "ledger", "charged_tdpa", "wave")
@@ -33,7 +33,8 @@ SIGMAS = (0.0, 0.3)
 WALL_FACTORS = (1.2, 2.0)
 """Factors of the stiffest wall, at which the limits of the settings are searched."""
 _LOW_PASSES = (100.0, 50.0)  # Hz, below the sensor's own
-_HALVINGS, _CLOSE = 4, 1.15  # of gamma until the station holds; ratio where the bisection ends
+_HALVINGS = 4  # of gamma, until the station is stable
+_BISECTION_RATIO = 1.15  # of unstable to stable gamma, where the bisection ends
 _QUIET_SHARE = 0.8  # share of the largest force at rest that noise may use
 
 Row = dict[str, Any]
@@ -45,10 +46,9 @@ class Found:
     """Result of the search.
 
     Attributes:
-        settings: chosen settings.
         search: rows of the search in one axis, with the predicted `threshold_N` and `gamma`.
         given: rows of the user's settings at the stiffest wall.
-        inside: rows of the chosen settings at the corners, at the gamma times the margin.
+        inside: rows of the chosen settings at the corners, with gamma times the margin.
         limits: rows at the chosen gamma, at the stiffest wall and beyond it.
     """
 
@@ -60,11 +60,7 @@ class Found:
 
 
 def search_settings(trial: StationTrial, execute: Execute) -> Found:
-    """Return the settings with the smallest detection threshold that the station holds.
-
-    Raises:
-        DrakeTeleopError: if no settings are stable in the whole set.
-    """
+    """Return the stable settings with the smallest detection threshold."""
     base, stated = trial.base, trial.stated
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
@@ -78,7 +74,7 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
     if not base.wrist_sensor.ideal:
-        low_passes += [f for f in _LOW_PASSES if stated.aims.min_low_pass_hz <= f < own]
+        low_passes += [f for f in _LOW_PASSES if stated.requirements.min_low_pass_hz <= f < own]
     noises = {f: noise * float(np.sqrt(f / own)) for f in low_passes}
     highest = 1 / base.force_scaling.force_scale  # 1 N at the hand for 1 N at the tool
     caps = {f: min(_QUIET_SHARE * MAX_REST_FORCE_N / noises[f], highest) for f in low_passes}
@@ -97,9 +93,9 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
     for row in candidates:
         if found and found[0][0] <= row["threshold_N"]:
             break
-        gamma, inside = _station_limit(settings_of(row), trial, execute)
+        gamma, inside = _station_limit(settings_from_values(row), trial, execute)
         if inside:
-            chosen = dataclasses.replace(settings_of(row), gamma=gamma)
+            chosen = dataclasses.replace(settings_from_values(row), gamma=gamma)
             found.append((row["threshold_N"] * row["gamma"] / gamma, chosen, inside))
             found.sort(key=lambda entry: entry[0])
     if not found:
@@ -115,7 +111,6 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
 
 
 def _best_of_each_method(search: list[Row]) -> list[Row]:
-    """Return the row of each method with the smallest threshold, the smallest first."""
     best: dict[str, Row] = {}
     for row in sorted(search, key=lambda row: float(row["threshold_N"])):
         if row["gamma"] > 0.0:
@@ -126,11 +121,8 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
 def _station_limit(
     settings: Settings, trial: StationTrial, execute: Execute
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma that the station holds with the margin, and its rows there.
-
-    gamma is halved until the station holds, then bisected; no rows: it never held.
-    """
-    margin, ends = trial.stated.aims.margin, [c[0] for c in trial.stated.corners]
+    """Return the largest gamma that is stable in the station with the margin, and its rows."""
+    margin, ends = trial.stated.requirements.margin, [c[0] for c in trial.stated.corners]
     hands = list(dict.fromkeys(ends))
     tries = 0
 
@@ -156,7 +148,7 @@ def _station_limit(
         gamma, failed = gamma / 2, gamma
     if not inside:
         return gamma, []
-    while failed > _CLOSE * gamma:
+    while failed > _BISECTION_RATIO * gamma:
         middle = float(np.sqrt(gamma * failed))
         if rows := rows_at(middle):
             gamma, inside = middle, rows
@@ -166,13 +158,13 @@ def _station_limit(
 
 
 def holds(row: Mapping[str, Any], margin: float = 1.0) -> bool:
-    """Return True if the station rests, quietly, and renders the contact force."""
+    """Return True if the station comes to rest, is quiet, and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
     return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)
 
 
 def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
-    """Return a function that runs a named study in a folder of `out`, or continues it."""
+    """Return a function that runs or continues a named study in a folder of `out`."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:
@@ -191,7 +183,7 @@ def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> E
 
 def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
     """Return the row with gamma, reduced by the margin, and the predicted detection threshold."""
-    gamma = row["gamma_limit"] / trial.stated.aims.margin
+    gamma = row["gamma_limit"] / trial.stated.requirements.margin
     human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
     masked = row["sigma_inertia"] * scale * _load_force(trial)
     smallest = max(human.absolute_threshold, human.weber_fraction * masked)

@@ -61,24 +61,19 @@ class StatedSet:
         return [(hand, wall) for wall in self.walls[::-1] for hand in hands]
 
     @property
-    def aims(self) -> TunedTask:
-        """Requirements of the task."""
+    def requirements(self) -> TunedTask:
         return TASKS[self.task]
 
 
 def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
-    """Return the set of these grips, walls [kN/m] and this task.
-
-    Raises:
-        DrakeTeleopError: for an unknown name or a stiffness outside 0.1 to 60 kN/m.
-    """
+    """Return the set of these grips, walls [kN/m] and this task."""
     for what, names, known in (("hands", hands, tuple(GRIPS)), ("task", (task,), tuple(TASKS))):
         for name in names:
             if name not in known:
                 remedy = suggestion(name, known, f"choose among {', '.join(known)}")
                 raise DrakeTeleopError(f"'{name}' is unknown", where=what, remedy=remedy)
     if not hands:
-        raise DrakeTeleopError("there is no grip", where="hands", remedy="give light, for instance")
+        raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
     limits = f"{_MIN_WALL / 1e3:g} to {_MAX_WALL / 1e3:g} kN/m"
     for wall in walls:
         if not (math.isfinite(wall) and _MIN_WALL <= 1e3 * wall <= _MAX_WALL):
@@ -89,18 +84,14 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
             )
     if not walls:
         raise DrakeTeleopError(
-            "there is no wall", where="walls", remedy="give kN/m, such as 0.5,20"
+            "no wall stiffness is given", where="walls", remedy="give kN/m, such as 0.5,20"
         )
     ordered = tuple(name for name in GRIPS if name in hands)
     return StatedSet(ordered, (1e3 * min(walls), 1e3 * max(walls)), task)
 
 
-def base_of(scenario: Scenario, network: str | None) -> Scenario:
-    """Return the scenario over this network, without environment, task and passivity method.
-
-    Raises:
-        DrakeTeleopError: for an unknown network.
-    """
+def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
+    """Return the scenario over this network, without environment, task and passivity method."""
     if network is not None and network not in PRESETS:
         remedy = suggestion(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)

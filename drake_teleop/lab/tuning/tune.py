@@ -1,19 +1,4 @@
-"""`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station.
-
-`summary.json` contains
-
-============ =====================================================================================
-settings     method, gamma, sigma_weight, sigma_inertia, force_scale, low_pass_hz
-stated       hands, walls [N/m], network, task
-figures      share: rendered over scaled contact force, least of the set; threshold_N: smallest
-             contact force at the tool that the operator detects; given_threshold_N: the same with
-             the scenario's own settings, null if it fails; margin: factor of gamma that was stable;
-             fails_at: hand and wall [N/m] of the first failure beyond the set, or null
-sentences    the answer in sentences
-search       list: method, sigma_inertia, low_pass_hz, gamma_limit, linear_limit, share, threshold_N
-trials       list: rows of `press_trial.TRIAL_MEASURES` in the whole station
-============ =====================================================================================
-"""
+"""`drake-teleop tune`: method, sigma, gamma, force scale and filter for a station."""
 
 from __future__ import annotations
 
@@ -38,7 +23,7 @@ from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_st
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
 from drake_teleop.lab.tuning.search import Found, holds, search_settings, studies_in
-from drake_teleop.lab.tuning.stated_set import StatedSet, base_of, stated_set
+from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import commented, write_scenario
 
@@ -68,14 +53,14 @@ def tune(
         quiet: True hides the sentences and progress bars; `progress` False only the bars.
 
     Returns:
-        The content of summary.json; the module lists it.
+        The content of summary.json (docs/choose.md).
 
     Raises:
         DrakeTeleopError: for an invalid set, or if no settings are stable.
     """
     given = scenario if isinstance(scenario, Scenario) else LoadScenario(scenario)
     out, stated = Path(out), stated_set(hands, walls, task)
-    base = base_of(given, network)
+    base = without_task_and_method(given, network)
     make_folder(out)
     shown = progress and not quiet
     with show_progress(shown) as stage:
@@ -128,7 +113,7 @@ def _summary(
         "threshold_N": max(row["threshold_N"] for row in at_edge),
         "given_threshold_N": worst_given if all(map(holds, found.given)) else None,
         "rest_force_N": max(row["rest_force_N"] for row in at_edge),
-        "margin": stated.aims.margin,
+        "margin": stated.requirements.margin,
         "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}
         if failed
         else None,

@@ -1,8 +1,4 @@
-"""Station and stimulus of an experiment's task under a condition.
-
-To render a force F, gamma is scaled by F over the contact force; the other interval has gamma = 0.
-A mass at the hand increases sigma, or eta for a held object.
-"""
+"""Station and stimulus of an experiment's task under a condition."""
 
 from __future__ import annotations
 
@@ -45,11 +41,7 @@ def load_for(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task under a condition.
-
-    Attributes:
-        mass: mass of the load, or of the held object, at the hand's scale [kg].
-    """
+    """Station of a task under a condition; `mass` is that of the load at the hand's scale [kg]."""
 
     task: Task
     condition: Condition
@@ -58,10 +50,9 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return sigma, sigma_object and gamma [%] that render a stimulus `level`.
+        """Return sigma, sigma_object and gamma [%] that render a stimulus of this level.
 
-        `level` is a force at the tool [N] or a mass at the hand [kg], 0 for none; `pressed` is the
-        expected contact force [N].
+        `level` is a force [N] or mass [kg], `pressed` the expected contact force [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -93,11 +84,6 @@ class Apparatus:
 def make_apparatus(
     task: Task, condition: Condition, scenario: Scenario, load: IdentifiedLoad | None
 ) -> Apparatus:
-    """Return the station of a task under a condition.
-
-    Raises:
-        DrakeTeleopError: if no such station is possible.
-    """
     setup = live_scenario(scenario)
     changes: dict[str, object] = {}
     if condition.delay is not None:
@@ -127,11 +113,10 @@ class IntervalLog:
     """Measures of an interval, from the log's rows.
 
     Attributes:
-        time: time of the last row [s].
         done_at: time at which the tool was at the slot's floor [s]; 0 before.
     """
 
-    def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
+    def __init__(self, scenario: Scenario, insert: Insert | None) -> None:
         self.time, self.done_at = 0.0, 0.0
         self._forces: list[Array] = []
         self._rendered: list[Array] = []
@@ -140,7 +125,6 @@ class IntervalLog:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """Add the newest rows of the log: signal name -> values."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
@@ -166,10 +150,7 @@ class IntervalLog:
         return _largest_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def change(self, after: float) -> float:
-        """Return the largest 20 ms mean of the rendered force's change [N] from time `after` [s].
-
-        The reference is the mean of the 0.1 s before `after`.
-        """
+        """Return the largest 20 ms mean of the rendered force's change [N] since `after` [s]."""
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)
         rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)

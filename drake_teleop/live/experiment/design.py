@@ -126,11 +126,6 @@ class Experiment:
     simulated: SimulatedParticipant = field(default_factory=SimulatedParticipant)
 
     def check(self, where: str) -> None:
-        """Check the experiment without its scenarios.
-
-        Raises:
-            DrakeTeleopError: for an invalid field.
-        """
         check_ranges(self, where)
         for name in ("tasks", "conditions"):
             if not getattr(self, name):
@@ -171,11 +166,7 @@ class Experiment:
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
-    """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios.
-
-    Raises:
-        DrakeTeleopError: for an invalid field.
-    """
+    """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios."""
     path = shipped_file("experiment", path, _FOLDER)
     experiment = settings_from_data(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))

@@ -1,7 +1,4 @@
-"""Event handler for an experiment of one participant, in place of `Live`.
-
-Each interval is a recorded `Live`; the page receives only the rendered force.
-"""
+"""Event handler for an experiment of one participant, in place of `Live`."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
 from drake_teleop.live.experiment.simulated import seeded
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.live import FRAME, Live, Show, parse
+from drake_teleop.live.live import FRAME_PERIOD_S, Live, Show, parse
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
@@ -46,9 +43,7 @@ def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 class Guided:
     """Event handler of an experiment, with the interface of `Live`; times `now` in s.
 
-    Attributes:
-        refused: number of invalid messages.
-        requested_scene: always "".
+    Each interval is a recorded live session; the page receives only the rendered force.
     """
 
     def __init__(
@@ -76,7 +71,7 @@ class Guided:
         self._show = self._shows[trial.task]
         insert = self._scenarios[trial.task].operator.task
         insert = insert if isinstance(insert, Insert) else None
-        self._rows = IntervalLog(procedure.task, self._apparatus.scenario, insert)
+        self._rows = IntervalLog(self._apparatus.scenario, insert)
         self._stimulus = self._apparatus.inputs(procedure.present_level, procedure.expected_force)
         name = f"{procedure.number:04}-{procedure.interval}"
         self._live = Live(
@@ -98,7 +93,6 @@ class Guided:
         return self._show(without_forces(rows))
 
     def hello(self) -> dict[str, Any]:
-        """Return the experiment's constants, which a new page receives first."""
         procedure = self._procedure
         known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
         hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
@@ -106,7 +100,6 @@ class Guided:
         return self._live.hello() | known | hidden | {"study": study}
 
     def join(self, client: int, now: float) -> None:
-        """Add a page; the first one drives (its inputs move the hand)."""
         if self._driver is None:
             self._set_driver(client, now)
 
@@ -116,7 +109,6 @@ class Guided:
         self._live.join(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; if it drives, the trial restarts."""
         if client == self._driver:
             self._remove_driver(now)
 
@@ -142,7 +134,6 @@ class Guided:
             self._write_error = str(error)
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        """Handle a message of a page; count invalid messages."""
         message = parse_study(text)
         if message is None:
             self.refused += 1
@@ -169,7 +160,6 @@ class Guided:
             self._live.pace.start(now)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next simulation slice or page frame [s]."""
         return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
 
     @property
@@ -187,11 +177,6 @@ class Guided:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate the due slices of time; return a frame for the pages if one is due.
-
-        Raises:
-            CannotWrite: if the disk is full.
-        """
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
@@ -204,7 +189,7 @@ class Guided:
             return self.frame() if frame_is_due else None
         if now < self._frame_due:
             return None
-        self._frame_due = now + FRAME
+        self._frame_due = now + FRAME_PERIOD_S
         return self.frame()
 
     def _end_interval_if_over(self, now: float) -> None:
@@ -221,7 +206,6 @@ class Guided:
         self._prepare_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
-        """Return the present frame for pages."""
         inner = self._live.frame()
         rendered = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
         task = self._procedure.task
@@ -244,14 +228,13 @@ class Guided:
         }
 
     def close(self) -> None:
-        """End the session and close the device link."""
         self._live.close()
         if self._link is not None:
             self._link.close()
 
 
 def parse_study(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message: set, rates, drive, go, answer; or None."""
+    """Return the valid requests in a page's message, or None."""
     message = parse(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:

@@ -20,12 +20,7 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
 
 @dataclass(frozen=True)
 class Trial:
-    """Planned trial.
-
-    Attributes:
-        task, condition: index in the experiment.
-        signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
-    """
+    """Planned trial; `signal` is the interval with the stimulus, 1 or 2, or 0 for the peg task."""
 
     task: int
     condition: int
@@ -39,7 +34,6 @@ class IntervalResult:
 
     Attributes:
         level: level of the stimulus; 0 without one.
-        force_N: largest contact force at the tool.
         valid: False without contact.
         done: whether the tool reached the floor of the slot.
         time_s: time until the floor.
@@ -55,7 +49,6 @@ class IntervalResult:
 
 
 def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
-    """Return all trials of a participant, in order."""
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -76,8 +69,6 @@ class Procedure:
     """Progress of a participant, continued from the stored trials.
 
     Attributes:
-        phase: `CONSENT` to `END`.
-        interval: 1 or 2.
         level: intended level of the trial's stimulus [N or kg].
         prepared_intervals: number of intervals so far.
         said: whether the last answer was right.
@@ -103,17 +94,14 @@ class Procedure:
 
     @property
     def number(self) -> int:
-        """Number of the trial, from 0."""
         return len(self._rows)
 
     @property
     def trial(self) -> Trial:
-        """Present or next trial."""
         return self.trials[min(self.number, len(self.trials) - 1)]
 
     @property
     def task(self) -> Task:
-        """Task of the present trial."""
         return self.experiment.tasks[self.trial.task]
 
     @property
@@ -138,7 +126,6 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def go(self) -> None:
-        """Leave a phase that shows text."""
         if self.phase == CONSENT:
             self.phase = END if self.number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):
@@ -163,17 +150,15 @@ class Procedure:
             self.phase = ANSWER
 
     def start_second_interval(self) -> None:
-        """Start the trial's second interval."""
         self.phase = INTERVAL
 
     def restart_trial(self) -> None:
-        """Restart the trial after the page that drives has left."""
         if self.phase in (INTERVAL, GAP, ANSWER):
             self._new_trial()
             self.phase = READY
 
     def answer(self, interval: int, time_s: float) -> None:
-        """Store the answer (interval 1 or 2, after `time_s`), if the phase is `ANSWER`."""
+        """Store the answer (interval 1 or 2, after `time_s`), if one is due."""
         if self.phase == ANSWER:
             self._finish_trial(interval, interval == self.trial.signal, time_s)
 
@@ -224,7 +209,6 @@ class Procedure:
             self.phase = READY
 
     def view(self) -> dict[str, Any]:
-        """Return the state that the participant may see."""
         number = self.number - (self.phase == FEEDBACK)  # FEEDBACK belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {

@@ -2,9 +2,7 @@
 
     d'(x) = (x / threshold)^slope,    P(correct) = lapse / 2 + (1 - lapse) Phi(d' / sqrt 2)
 
-Power law: Foley and Legge, Vision Research 21, 1981. Phi: Green and Swets, Signal detection
-theory and psychophysics, 1966. Psi method: Kontsevich and Tyler, Vision Research 39, 1999; with
-marginalised slope and lapse: Prins, J. Vision 13(7), 2013.
+Psi method: Kontsevich and Tyler, Vision Research 39, 1999; Prins, J. Vision 13(7), 2013.
 """
 
 from __future__ import annotations
@@ -72,13 +70,11 @@ class Psi:
         return float(self.levels[np.argmin(lost)])
 
     def update(self, level: float, correct: bool) -> None:
-        """Update the posterior with an answer to any level >= 0."""
         p = self._probability(level)
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()
 
     def threshold(self) -> Estimate:
-        """Return the estimated threshold."""
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])

@@ -1,8 +1,4 @@
-"""Thresholds, d', times and forces of an experiment with 95 % intervals.
-
-Threshold and d' (at the middle level) of a participant are posterior medians (`Psi`), times and
-forces geometric means. Participant 0 is the (geometric) mean of all, with its t interval.
-"""
+"""Thresholds, d', times and forces of an experiment with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.axes import Axes
 
-_Z = 1.959964
+_NORMAL_QUANTILE = 1.959964
 _PICTURED_QUANTITIES = (
     "threshold of contact [N at the tool]",
     "threshold of mass [kg at the hand]",
@@ -47,7 +43,6 @@ class Result(NamedTuple):
 
 
 def results(experiment: Experiment, store: Store) -> list[Result]:
-    """Return all rows of the result table."""
     found = []
     known = {n: [row for row in store.rows(n) if not row.practice] for n in store.participants()}
     for task in experiment.tasks:
@@ -100,14 +95,13 @@ def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Esti
 
 
 def _wilson(successes: int, n: int) -> Estimate:
-    p, z2 = successes / n, _Z**2
+    p, z2 = successes / n, _NORMAL_QUANTILE**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
-    half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
+    half = _NORMAL_QUANTILE / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
     return Estimate(p, max(middle - half, 0.0), min(middle + half, 1.0))
 
 
 def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
-    """Write trials.csv, results.csv and results.png; return the result table."""
     import polars as pl
 
     found = results(experiment, store)

@@ -73,12 +73,7 @@ def serve_experiment(
     browser: bool,
     device: str | None,
 ) -> None:
-    """Serve the page of an experiment until Ctrl-C or SIGTERM.
-
-    Raises:
-        DrakeTeleopError: if the simulation stopped.
-        KeyboardInterrupt: if trials are left.
-    """
+    """Serve the page of an experiment until Ctrl-C or SIGTERM."""
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
     if browser:
         webbrowser.open(live.url)

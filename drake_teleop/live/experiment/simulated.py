@@ -1,8 +1,4 @@
-"""Simulated participants: an observer with noise compares rendered forces.
-
-A scripted hand presses down and up, or moves back and forth. The answer is the interval with the
-larger response: largest change of the rendered force plus normal noise.
-"""
+"""Simulated participants: an observer with noise compares rendered forces of a scripted hand."""
 
 from __future__ import annotations
 
@@ -43,7 +39,6 @@ _ROWS_PERIOD_MS = 200
 def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    """Return the stations: (index of task, index of condition) -> station."""
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
         load = load_for(scenario)
@@ -92,10 +87,7 @@ def take_part(
 def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """Return the interval, 1 or 2, with the larger response [N] after adding noise.
-
-    A difference of `noise` at rest corresponds to d' = 1. A lapse gives a random answer.
-    """
+    """Return the interval, 1 or 2, with the larger response [N] after adding noise."""
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
     noisy = [
@@ -110,7 +102,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     assert not isinstance(task, PegInSlot)
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
     stimulus = apparatus.inputs(procedure.present_level, procedure.expected_force)
-    rows = IntervalLog(task, apparatus.scenario, None)
+    rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
     while session.ms < 1e3 * task.interval:
         t = max(1e-3 * session.ms - _MOTION_START_S, 0.0)

@@ -28,10 +28,8 @@ class Row:
         practice: 1 if the trial is not evaluated.
         level: measured stimulus: contact force at the tool [N], mass at the hand [kg].
         signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
-        answer: chosen interval.
         correct: 1 if the answer is right, or if the tool reached the floor.
         time_s: time until the answer or the floor.
-        force_N: largest contact force at the tool.
         lost_s: simulation time behind the clock.
     """
 
@@ -56,12 +54,11 @@ _SCHEMA: dict[str, type[pl.DataType]] = {
 
 @dataclass(frozen=True)
 class Store:
-    """Stored trials in a folder."""
+    """Trials of an experiment on disk, in one folder."""
 
     folder: Path
 
     def path(self, participant: int) -> Path:
-        """Return the file of a participant."""
         return self.folder / "participants" / f"{participant:02}.csv"
 
     def participants(self) -> list[int]:
@@ -70,11 +67,6 @@ class Store:
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
     def rows(self, participant: int) -> list[Row]:
-        """Return a participant's finished trials.
-
-        Raises:
-            DrakeTeleopError: if the file is damaged.
-        """
         path = self.path(participant)
         if not path.exists():
             return []
@@ -90,13 +82,11 @@ class Store:
         return rows
 
     def write(self, participant: int, rows: list[Row]) -> None:
-        """Replace all stored trials of a participant."""
         make_folder(self.path(participant).parent)
         table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_SCHEMA)
         write_table(self.path(participant), table)
 
     def table(self) -> pl.DataFrame:
-        """Return all trials, with the column participant."""
         rows = [
             {"participant": n} | dataclasses.asdict(row)
             for n in self.participants()
@@ -107,11 +97,7 @@ class Store:
 
 @contextmanager
 def open_results(folder: Path, experiment: Experiment) -> Iterator[Store]:
-    """Yield the results in a folder, locked for this process.
-
-    Raises:
-        DrakeTeleopError: if the folder contains another experiment, or is in use.
-    """
+    """Yield the results in a folder, locked for this process."""
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}
     with claimed(folder, identity):

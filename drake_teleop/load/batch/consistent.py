@@ -1,11 +1,4 @@
-"""Load with the best fit among those a rigid body can have, by a semidefinite program.
-
-Constraints: pseudo-inertia J >= 0 (Eqs. (T1), (T5); Wensing, Kim, Slotine, RA-L 2018), and tr(J E)
->= 0 for an ellipsoid that contains the mass. Costs of a prior with pseudo-inertia J_0:
-
-- entropic: tr(J_0^-1 J) - log det J (Lee, Wensing, Park, T-RO 2020);
-- geodesic: 1/2 tr((J_0^-1 (J - J_0))^2) (Lee, Park, RA-L 2018).
-"""
+"""Least squares fit among loads that a rigid body can have, Eqs. (T1), (T5)."""
 
 from __future__ import annotations
 
@@ -32,11 +25,13 @@ _PRIORS = ("entropic", "geodesic")
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Prior knowledge of the load, as a cost of the fit: "entropic" or "geodesic" (`kind`).
+    """Prior knowledge of the load, which adds a cost to the least squares fit.
 
     Attributes:
         phi: (10,) prior load about So in S, of a body with extent in all directions.
         weight: factor of the cost, a residual variance per sample.
+        kind: cost of the pseudo-inertia J: "entropic" (Lee, Wensing, Park, T-RO 2020) or "geodesic"
+            (Lee, Park, RA-L 2018).
     """
 
     phi: ArrayLike
@@ -58,20 +53,20 @@ class Prior:
             )
         if np.linalg.eigvalsh(pseudo_inertia(self.phi))[0] <= 0.0:
             raise DrakeTeleopError(
-                "its body has no extent in some direction",
+                "is the load of a body that has no extent in some direction",
                 where="prior.phi",
                 remedy="give a body with mass, and inertia about all axes",
             )
 
     def information(self, samples: int) -> Array:
-        """Return the inverse covariance (10, 10) of phi from the prior, for `samples` samples."""
+        """Return the inverse covariance (10, 10) of phi that the prior contributes."""
         parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _BASIS)
         return np.asarray(samples * self.weight * np.einsum("aij,bji->ab", parts, parts))
 
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """Ellipsoid that contains the mass: (r - center)^T matrix (r - center) <= 1.
+    """Ellipsoid that encloses the load's mass: (r - center)^T matrix (r - center) <= 1.
 
     Attributes:
         center: (3,) position of the centre from So, in S [m].
@@ -82,7 +77,7 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def row(self) -> Array:
-        """Return coefficients (10,); their product with a phi of a mass inside is not negative."""
+        """Return a (10,) such that a^T phi >= 0 for each phi whose mass is inside the ellipsoid."""
         A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
             raise DrakeTeleopError(
@@ -101,11 +96,10 @@ def consistent_least_squares(
     prior: Prior | None = None,
     ellipsoid: Ellipsoid | None = None,
 ) -> Array:
-    """Return the [offsets; phi] (16,) with the best fit that a rigid body can have.
+    """Return the parameters [offsets; phi] (16,) with the best fit that a rigid body can have.
 
-    Args:
-        gram, right: (16, 16), (16,) weighted normal equations; per sample if there is a prior.
-        theta: (16,) their solution, returned if it satisfies the constraints.
+    `theta` (16,) is the unconstrained solution of the weighted normal equations `gram` and
+    `right`.
     """
     row = None if ellipsoid is None else ellipsoid.row()
     inside = row is None or row @ theta[6:] >= 0.0
@@ -137,7 +131,7 @@ def _parameter_units(phi: Array) -> Array:
 
 
 def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None) -> Array:
-    """Return phi / unit that minimises phi^T H phi / 2 - b^T phi + prior for a consistent phi."""
+    """Return phi / unit of the consistent load with the least phi^T H phi / 2 - b^T phi + prior."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
@@ -195,10 +189,7 @@ def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
 
 
 def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return matrix (11, 11) and vector (11,) of the cone t >= |R x - d|, R^T R = H, R^T d = b.
-
-    The squared distance as cost would be less accurate.
-    """
+    """Return matrix and vector of the cone t >= |R x - d|, with R^T R = H and R^T d = b."""
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale

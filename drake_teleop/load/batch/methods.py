@@ -1,15 +1,4 @@
-"""Batch estimators by name for the load and the sensor's offsets.
-
-| name | method |
-|---|---|
-| `ordinary` | least squares, equal weights, Eqs. (7)-(8) |
-| `whitened` | rows divided by each channel's noise, specified or estimated |
-| `total` | `whitened`, with noise in the motion |
-| `robust` | `total` without impacts and short contacts |
-| `consistent` | `robust`, limited to loads that a rigid body can have; default |
-
-Details: docs/theory.md, "Details of the estimators".
-"""
+"""Batch estimators by name for the load and the sensor's offsets."""
 
 from __future__ import annotations
 
@@ -75,7 +64,6 @@ class BatchResult:
         noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
         rejected: (N,) True for rejected samples.
         note: warning for the user, or "".
-        equations: sums of the used samples.
     """
 
     identification: Identification
@@ -196,17 +184,11 @@ def identify_batch(
     """Return load and sensor offsets of a free motion, by a batch estimator.
 
     Args:
-        wrench, s, omega, alpha, delay_s: as for `normal_equations.identify`, in the order of time.
-        method: "ordinary", "whitened", "total", "robust", "consistent" or a registered name.
-        noise: of wrench and motion; None: estimated wrench noise, exact motion.
+        noise: noise of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
         shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
         resolution: (2,) quantisation step of forces and torques [N, N m], with `shared_noise` only.
-        prior, ellipsoid: only for "consistent".
-        gain_std: standard deviation of the sensor's 36 gains (relative).
-
-    Raises:
-        DrakeTeleopError: for unsuitable options, fewer than 3 samples, or a zero wrench.
+        gain_std: relative standard deviation of the sensor's 36 gains.
     """
     METHODS.check(method, "method")
     expect((Noise, type(None)), noise, "noise")

@@ -1,9 +1,6 @@
-"""Least squares that allows for noise of wrench and motion (total least squares), Eq. (T4).
+"""Total least squares, which allows for noise of wrench and motion, Eq. (T4).
 
-The estimate minimises lambda = tr(W S(theta)) / tr(W R(theta)): residual covariance S over that of
-the specified noise, R (Van Huffel, Vandewalle, The Total Least Squares Problem, 1991, chapters 3
-and 8). W = R(theta)^-1 is iterated (Kukush, Van Huffel, Metrika 59, 2004). Directions in which the
-motion is indistinguishable from noise are omitted.
+Source: Van Huffel, Vandewalle, The Total Least Squares Problem, 1991, chapters 3 and 8.
 """
 
 from __future__ import annotations
@@ -35,14 +32,13 @@ _MIN_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
 class NormalForm(NamedTuple):
-    """Equations gram theta = right, per sample, and their solution theta = [offsets; phi] (16,).
+    """Normal equations gram theta = right, and their solution theta = [offsets; phi] (16,).
 
     Attributes:
-        gram: (16, 16) Gram matrix, compensated for noise.
-        weights: (6, 6) weights W between channels.
-        scale: lambda, residual over specified noise variance.
+        gram: (16, 16) Gram matrix per sample, compensated for noise.
+        weights: (6, 6) weights between wrench channels.
+        scale: ratio of residual variance to specified noise variance.
         transfer: (16, 16) matrix from the ordinary least squares solution to theta.
-        undetermined: (16,) True for parameters whose variance is mostly in omitted directions.
     """
 
     gram: Array
@@ -57,13 +53,9 @@ class NormalForm(NamedTuple):
 def total_least_squares(
     moments: Moments, noise: Noise, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
-    """Return load and offsets that allow for noise of wrench and motion.
+    """Return the load and offsets that allow for noise of the motion.
 
-    Args:
-        moments: of the record.
-        noise: of the motion.
-        wrench_noise: (6,) standard deviations [N, N m].
-        offsets: False fixes the offsets at 0.
+    `wrench_noise` (6,) [N, N m] are standard deviations; `offsets` False fixes the offsets at 0.
     """
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:
@@ -116,7 +108,7 @@ def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> Norm
 
 
 def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """Return the smallest lambda at which the augmented normal equations are singular."""
+    """Return the smallest noise scale at which the augmented normal equations are singular."""
 
     def excess(ratio: float) -> float:
         return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))
@@ -153,22 +145,18 @@ class Record:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Wrench (N, 6), and s, omega and alpha (N, 3)."""
         return self.wrench, self.s, self.omega, self.alpha
 
     @cached_property
     def moments(self) -> Moments:
-        """Second moments of all samples."""
         moments = Moments()
         moments.add(*self.arrays)
         return moments
 
     def every(self, step: int) -> Record:
-        """Return every `step`-th sample."""
         return Record(*(table[::step] for table in self.arrays))
 
     def residual(self, theta: Array, part: slice) -> Array:
-        """Return the residuals (n, 6) of the samples in `part` for theta = [offsets; phi] (16,)."""
         F, s, omega, alpha = (table[part] for table in self.arrays)
         return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
 

@@ -1,8 +1,4 @@
-"""Uncertainty of an identified load: covariance, intervals, prior, determined combinations.
-
-Details: docs/theory.md, "Details of the estimators". The covariance ignores the physical constraint
-of `consistent`.
-"""
+"""Uncertainty of an identified load (docs/theory.md, "Details of the estimators")."""
 
 from __future__ import annotations
 
@@ -45,10 +41,7 @@ _NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
 
 
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
-    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi] [SI].
-
-    By Student's t distribution; (-inf, inf) for undetermined parameters.
-    """
+    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi]."""
     if not 0.0 < level < 1.0:
         raise DrakeTeleopError(
             f"{level} is not between 0 and 1", where="level", remedy="give, say, 0.95"
@@ -62,7 +55,6 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
 def prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Return (n,) True where a standard deviation is at least `share` of the prior's."""
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
@@ -80,9 +72,8 @@ class Combination:
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading: index of the leading parameter in `PARAMETERS`.
-        value, standard_deviation: of the combination, in this unit.
-        share: standard deviation over the natural scale.
-        words: the sum as text; "..." stands for terms below a tenth of the largest.
+        share: standard deviation relative to the natural scale of the combination.
+        words: the sum as text.
     """
 
     coefficients: Array
@@ -93,20 +84,17 @@ class Combination:
     words: str
 
     def __str__(self) -> str:
-        """Return text such as "I_zz + 0.2 m c_x = 0.31 +- 0.01 kg m^2"."""
         numbers = f"{self.value:.4g} +- {self.standard_deviation:.2g} {_UNITS[self.leading]}"
         return f"{self.words} = {numbers}"
 
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Base parameters: the combinations of load and offsets that a record determines.
-
-    Gautier, Khalil, IEEE Trans. Robotics and Automation 6(3), 1990; Gautier, ICRA 1990.
+    """Combinations of load and offsets that a record determines (Gautier, Khalil, 1990).
 
     Attributes:
         without_influence: names of parameters without influence on the wrench.
-        directions: principal combinations of determined but not identified parameters.
+        directions: combinations of those parameters that are not identified one by one.
         slow_noise: names of wrench channels with drift.
     """
 
@@ -117,11 +105,9 @@ class BaseParameters:
 
     @property
     def rank(self) -> int:
-        """Number of determined combinations, at most 16."""
         return len(self.combinations)
 
     def lines(self) -> list[str]:
-        """Return a text summary."""
         lines = [f"{self.rank} of 16 combinations of offsets and load are determined"]
         if self.without_influence:
             names = ", ".join(self.without_influence)
@@ -142,7 +128,6 @@ class BaseParameters:
 
 
 def base_parameters(equations: NormalEquations) -> BaseParameters:
-    """Return the base parameters of a record."""
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scale(load.phi)
@@ -202,17 +187,12 @@ def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     return text + " + ..." if small.any() else text
 
 
-ARM = 0.06
+TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
 def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the covariance (16, 16) of data and prior, and (16,) True if the prior dominates.
-
-    Args:
-        covariance: (16, 16) of [offsets; phi] from the data.
-        information: (10, 10) inverse covariance of phi from the prior.
-    """
+    """Return the covariance (16, 16) of data and prior; (16,) True where the prior dominates."""
     determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
     used = determined | (np.arange(16) >= 6)
     # Scaled so that all entries have similar size.
@@ -232,10 +212,7 @@ def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np
 
 
 def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
-    """Return the covariance (16, 16) of a fit with weights W between channels and noise W^-1.
-
-    `plain` is that for uncorrelated channels.
-    """
+    """Return the covariance (16, 16) of a fit with noise that is correlated between channels."""
     W, Z = fit.form.weights, fit.moments.mean
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -259,7 +236,7 @@ def _inverse_gram(fit: Fit) -> Array:
 def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
-    `kept` (N,) marks used samples; `steps` (6, 6): covariance of the resulting wrench steps.
+    `steps` (6, 6) is the covariance of the wrench change per sample.
     """
     covariance = np.zeros((16, 16))
     if not steps.any():
@@ -281,21 +258,15 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
 
 
 def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
-    """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains.
-
-    Args:
-        products: (bands, 6, n, 6) moments of column j in channel c with channel k of the wrench.
-        W: (bands, 6, 6) weights between the channels.
-        inverse: (n, n) inverse Gram matrix.
-    """
+    """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains."""
     right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
-    length = np.repeat([1.0, ARM], 3)
+    length = np.repeat([1.0, TORQUE_ARM_M], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
     return np.asarray(effect.reshape(len(inverse), 36))
 
 
 def gain_covariance(fit: Fit, offsets: bool) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] for gain errors of deviation 1."""
+    """Return the covariance (16, 16) of [offsets; phi] for gain errors of standard deviation 1."""
     Z, W = fit.moments.mean, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = inverse_root(normal_equations(Z, W)[0], used)
@@ -305,7 +276,7 @@ def gain_covariance(fit: Fit, offsets: bool) -> Array:
 
 
 def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """Return the covariance (16, 16) of the solution `form`; `plain` is that of least squares."""
+    """Return the covariance (16, 16) of the solution `form`, from that of least squares."""
     unknown = np.isinf(np.diag(plain))
     covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
     if not offsets:  # covariance for known offsets

@@ -1,15 +1,10 @@
-"""Contact detection in a wrench from which the load's wrench is removed, sample by sample.
+"""Contact detection, sample by sample, in a wrench from which the load's wrench is removed.
 
-A statistic of the normalised wrench z and its innovations e (see `noise_floor`) reaches a threshold
-when contact begins::
+The statistics are functions of the normalised wrench z and its unpredictable part e::
 
     level    |z|; its square is chi-squared with six degrees of freedom
-    cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics
-             30, 1988)
-    glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)), n = 1, 2, 4 ... `WINDOW`:
-             generalised likelihood ratio (Lorden 1971; Willsky and Jones 1976)
-
-Contact ends after `hold` samples with a level below `leave`; then the sums restart.
+    cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|) (Crosier, Technometrics 30, 1988)
+    glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)) (Willsky and Jones 1976)
 """
 
 from __future__ import annotations
@@ -44,12 +39,12 @@ COUNT, FLAG, QUIET_FOR, FIRST_STATISTIC = 0, 3, 4, 5
 Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
 SIZE = RING + 6 * WINDOW
 """Length of the memory of `detection_update`."""
-SLACK = 1.0
+DEFAULT_SLACK = 1.0
 """Default slack of the cumulative sum [standard deviations]. In white noise, half of the smallest
 shift to be detected is best; this value tolerates lasting errors of the load."""
-RARE = 6.2
+MAX_NOISE_LEVEL = 6.2
 """Level that normal noise reaches once in a million samples."""
-LEAVE = 0.7 * RARE
+END_LEVEL = 0.7 * MAX_NOISE_LEVEL
 """Level below which contact may end."""
 
 
@@ -57,14 +52,9 @@ LEAVE = 0.7 * RARE
 def detection_update(
     memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
 ):
-    """Process one sample and write the `STATISTICS` to memory[5:8].
+    """Process one sample and write level, cusum and glr to memory[5:8].
 
-    Args:
-        memory: (SIZE,), zeros before the first sample.
-        contact: (6,) contact wrench F_c, Eq. (13) [N, N m].
-        s, omega, alpha, acceleration: (3,) motion, as in `Samples`.
-        parameters: `NoiseFloor.parameters`.
-        slack, following, quiet: `slack`, `following`, `leave` of `ContactDetector`.
+    `memory` (SIZE,) is zero before the first sample; `quiet` is `leave` of `ContactDetector`.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -126,15 +116,12 @@ def _statistics(rows, parameters, slack, following, quiet, out):
 
 
 def statistics(
-    floor: NoiseFloor, *samples: ArrayLike, slack: float = SLACK, following: float = 0.0
+    floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK, following: float = 0.0
 ) -> Array:
-    """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations.
-
-    `slack` and `following` are as for `ContactDetector`.
-    """
+    """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations."""
     rows = checked_samples(*samples)
     out = np.empty((len(rows[0]), 3))
-    sums = float(positive("slack", slack)), float(following), LEAVE
+    sums = float(positive("slack", slack)), float(following), END_LEVEL
     _statistics(tuple(rows), floor.parameters, *sums, out)
     return out
 
@@ -155,14 +142,7 @@ def _last_sum(memory, hold, widths):
 
 @njit(cache=True)
 def hysteresis_update(memory, statistic, enter, leave, hold, widths):
-    """Return whether there is contact, after `detection_update` of the same memory.
-
-    Args:
-        statistic: index into `STATISTICS`.
-        enter: threshold of this statistic at which contact begins.
-        leave, hold: contact ends after `hold` samples with a level below `leave`.
-        widths: `NoiseFloor.widths`.
-    """
+    """Return whether there is contact, after `detection_update` of the same memory."""
     if memory[FLAG] == 0.0:
         if memory[FIRST_STATISTIC + statistic] >= enter:
             memory[FLAG], memory[QUIET_FOR] = 1.0, 0.0
@@ -178,10 +158,7 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 @njit(cache=True)
 def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Process one sample and return whether there is contact.
-
-    The last two arguments are `ContactDetector.settings`.
-    """
+    """Process one sample and return whether there is contact."""
     slack, following, statistic, enter, leave, hold = decision
     detection_update(
         memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
@@ -201,7 +178,7 @@ class ContactDetector:
     """Contact detector with hysteresis for a stream of samples.
 
     Args:
-        threshold: of the statistic at which contact begins, such as `NoiseFloor.threshold`.
+        threshold: value of the statistic at which contact begins.
         statistic: "level", "cusum" or "glr".
         leave, hold: contact ends after `hold` samples with a level below `leave`.
         slack: slack of the cumulative sum [standard deviations].
@@ -215,9 +192,9 @@ class ContactDetector:
         threshold: float,
         *,
         statistic: str = "cusum",
-        leave: float = LEAVE,
+        leave: float = END_LEVEL,
         hold: int = 20,
-        slack: float = SLACK,
+        slack: float = DEFAULT_SLACK,
         following: float = 0.0,
     ) -> None:
         column = statistic_index(statistic)
@@ -236,17 +213,15 @@ class ContactDetector:
 
     @staticmethod
     def initial_memory() -> Array:
-        """Return the memory (SIZE,) before the first sample."""
         return np.zeros(SIZE)
 
     def update(self, *sample: ArrayLike) -> bool:
-        """Process one sample (fields of `Samples`); return whether there is contact."""
         named = zip(Samples._fields, sample, strict=True)
         arrays = [checked(name, x, 6 if name == "contact" else 3) for name, x in named]
         return bool(flag_update(self._memory, *arrays, *self.settings))
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
-        """Update by the N `Samples` of a log; return (N,) True for contact."""
+        """Process N samples of a log; return (N,) True for contact."""
         rows = checked_samples(*samples)
         out = np.empty(len(rows[0]), np.bool_)
         _flags(self._memory, tuple(rows), self.settings, out)
@@ -254,11 +229,7 @@ class ContactDetector:
 
 
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return the central axis of wrenches (..., 6) in S (Poinsot); NaN where the force is 0.
-
-    Returns:
-        direction of the force (..., 3), point nearest to So (..., 3) [m], and pitch (...) [m].
-    """
+    """Return direction, point nearest to So and pitch [m] of the central axis of wrenches in S."""
     w = checked("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
     square = np.sum(f * f, axis=-1)
@@ -283,16 +254,6 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
-    """Return the noise floor of a record of free motion; fast motion gives the best estimate.
-
-    Args:
-        contact, s, omega, alpha, acceleration: see `Samples`.
-        covariance: (16, 16) from `finite_covariance`.
-        fade: as in `NoiseFloor`.
-
-    Raises:
-        DrakeTeleopError: for fewer than 100 samples.
-    """
     from scipy.optimize import nnls
 
     rows = checked_samples(contact, s, omega, alpha, acceleration)

@@ -1,10 +1,8 @@
-"""Noise floor: standard deviation sigma of the contact wrench r = F - F_o - V phi in free motion.
+"""Noise floor: standard deviation sigma of the contact wrench in free motion.
 
     sigma_c^2 = n_c^2 + (J P J^T)_cc + k_c^2 |a|^2 + l_c^2 |alpha|^2,    J = [E V]
 
-n is the noise at rest, P the covariance of [offsets; phi]; a, alpha are accelerations of S without
-gravity, whose peaks are held and fade. z is r / sigma, decorrelated between channels, with the
-innovations e_k = (z_k - rho z_{k-1}) / sqrt(1 - rho^2).
+n is the noise at rest, P the covariance of [offsets; phi]; a and alpha are accelerations of S.
 """
 
 from __future__ import annotations
@@ -37,7 +35,6 @@ less often than that value, which is reached about once in a record of the same 
 
 
 def statistic_index(statistic: str) -> int:
-    """Return the column of a statistic: "level", "cusum" or "glr"."""
     if statistic not in STATISTICS:
         raise DrakeTeleopError(
             f"{statistic!r} is not a statistic",
@@ -63,21 +60,20 @@ class Samples(NamedTuple):
     acceleration: Array
 
     def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
-        """Return the samples in `rows`."""
         return Samples(*(x[rows] for x in self))
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseFloor:
-    """Noise of the contact wrench in free motion (symbols: module `noise_floor`).
+    """Noise of the contact wrench in free motion.
 
     Attributes:
         noise: (6,) noise n at rest [N, N m].
         covariance: (16, 16) finite covariance P of [offsets; phi].
         per_acceleration: (6, 2) factors k [N, N m per m/s^2] and l [per rad/s^2].
         correlation: (6, 6) correlation between channels.
-        rho: (6,) lag-one correlation of z.
-        widths: (8,) w_n of sums of 1, 2, 4 ... `WINDOW` innovations; 1 for white ones.
+        rho: (6,) lag-one correlation of the normalised wrench.
+        widths: (8,) standard deviations of sums of 1, 2, 4 ... innovations over sqrt(number).
         fade: factor per sample on the held peaks of the acceleration, 0 for no hold.
         reached: (3,) largest value of each statistic in the fitted motion.
     """
@@ -130,7 +126,7 @@ class NoiseFloor:
         return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
 
     def sigma(self, *motion: ArrayLike) -> Array:
-        """Return the noise sigma (N, 6) [N, N m] along a free motion, see `Samples`."""
+        """Return the noise sigma (N, 6) [N, N m] along a free motion."""
         rows = checked_samples(*motion)
         out = np.empty((len(rows[0]), 6))
         write_sigmas(*rows, *self.parameters[:3], self.fade, out)
@@ -144,14 +140,13 @@ def _square(x):
 
 @njit(cache=True)
 def hold_peaks(memory, acceleration, alpha, fade):
-    """Update the held squared accelerations in a detector's memory."""
     memory[HELD_A] = max(_square(acceleration), fade * memory[HELD_A])
     memory[HELD_ALPHA] = max(_square(alpha), fade * memory[HELD_ALPHA])
 
 
 @njit(cache=True)
 def parameter_variance(s, omega, alpha, P, V, out):
-    """Write the variances (6,) due to uncertain [offsets; phi] into out; V (6, 10) is scratch."""
+    """Write the wrench variances (6,) due to uncertain [offsets; phi] into `out`."""
     regressor_into(s, omega, alpha, V)
     for c in range(6):
         value = P[c, c]
@@ -167,7 +162,7 @@ def parameter_variance(s, omega, alpha, P, V, out):
 
 @njit(cache=True)
 def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out):
-    """Write the noise sigma (N, 6) of a record's contact wrench into out."""
+    """Write the noise sigma (N, 6) of a record's contact wrench into `out`."""
     memory, V = np.zeros(3), np.empty((6, 10))
     for k in range(s.shape[0]):
         hold_peaks(memory, acceleration[k], alpha[k], fade)
@@ -178,15 +173,13 @@ def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out)
 
 
 def checked_samples(*arrays: ArrayLike) -> list[Array]:
-    """Return the five arrays of `Samples`, or the last four, as tables of equal length."""
     named = zip(Samples._fields[-len(arrays) :], arrays, strict=True)
     return checked_rows(**{name: (x, 6 if name == "contact" else 3) for name, x in named})[1]
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] with bounded standard deviations.
+    """Return the covariance (16, 16) of [offsets; phi], limited to natural scales.
 
-    The bound is `natural_scale`.
     `tared` means that offsets are from the same record: their variance is 0.
     """
     P, natural = covariance.copy(), natural_scale(phi)

@@ -1,11 +1,9 @@
-"""Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24).
+"""Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24)::
 
-    known       the known load explains the mean wrench of blocks of `BLOCK` seconds
-    disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
-    changed     a new load has explained it for `HOLD` seconds
-    identified  mass and first moments of the new load are identified: it is now the known load
-
-Method: docs/theory.md, "Another load".
+known       the known load explains the mean wrench of blocks of samples
+disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
+changed     a new load explains it
+identified  mass and first moments of the new load are identified
 """
 
 from __future__ import annotations
@@ -37,10 +35,10 @@ STATES = ("known", "disturbed", "changed", "identified")
 """States of the monitor, by index."""
 KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
 
-BLOCK, WINDOW, HOLD, MEMORY = 0.016, 2.0, 0.2, 0.3
+BLOCK_S, WINDOW_S, HOLD_S, MODEL_ERROR_S = 0.016, 2.0, 0.2, 0.3
 """Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
 error."""
-BOUND = 0.0025
+DEFAULT_BOUND = 0.0025
 """Default of `bound`: four standard deviations are 1 % of the change of mass."""
 OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
@@ -71,15 +69,7 @@ _RESOLUTION = 1e-10
 
 @njit(cache=True)
 def whitening(motion, phi, noise, model_var, n):
-    """Return a matrix (6, 6) that maps the wrench noise of a block mean to unit covariance.
-
-    Args:
-        motion: (9,) mean [s, omega, alpha].
-        phi: (10,) load.
-        noise: (15 or more,) long-run variances per sample of wrench and motion.
-        model_var: squared relative model error.
-        n: samples of the block.
-    """
+    """Return a matrix (6, 6) that maps the wrench noise of a block mean to unit covariance."""
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
@@ -113,13 +103,9 @@ def whitening(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def update_estimate(estimate, V, wrench, root):
-    """Update an estimate by the mean of a block, Eq. (T6); return chi-squared of its innovation.
+    """Update an estimate [theta (16); covariance (256)] by the mean of a block, Eq. (T6).
 
-    Args:
-        estimate: [theta (16); covariance (256)], theta = [offsets; phi], updated.
-        V: (6, 10) mean regressor.
-        wrench: (6,) mean wrench [N, N m].
-        root: (6, 6) from `whitening`.
+    Return chi-squared of its innovation.
     """
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
@@ -151,10 +137,7 @@ def update_estimate(estimate, V, wrench, root):
 
 @njit(cache=True)
 def _update_filter(memory, place, block, noise):
-    """Update a filter by a block; return chi-squared of its innovation.
-
-    Model errors count once in the test, but for their duration in the update.
-    """
+    """Update a filter by a block; return chi-squared of its innovation."""
     phi = memory[place + 6 : place + 16].copy()
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
     V = memory[_V:_KNOWN].reshape(6, 10)
@@ -202,17 +185,7 @@ def _inflate_inertia_variances(memory, noise, block):
 
 @njit(cache=True)
 def change_update(memory, sample, block, noise, window, hold, bound):
-    """Process one sample in the change detector.
-
-    Args:
-        memory: from `change_memory`, updated.
-        sample: (15 or more,) [wrench, s, omega, alpha].
-        block: samples of a block.
-        noise: (17,) long-run variances per sample of wrench (6) and motion (9), squared relative
-            model error, and its duration [blocks].
-        window, hold: durations `WINDOW` and `HOLD` [blocks].
-        bound: see `change_parameters`.
-    """
+    """Process one sample in the change detector, without checks; `memory` is updated."""
     V = np.empty((6, 10))
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
     regressor_into(s, omega, alpha, V)
@@ -299,14 +272,13 @@ def change_parameters(
     model_error: float = 0.0,
     bound: float | None = None,
 ) -> Parameters:
-    """Return the arguments block, noise, window, hold, bound of `change_update`.
+    """Return the parameters of the change detector.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
         period: time between samples [s].
-        model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
-        bound: required standard deviation of a new load's mass, relative to the change of mass;
-            default `BOUND`, or twice the model error if larger.
+        model_error: relative error of the load's wrench.
+        bound: required standard deviation of a new load's mass, relative to the change of mass.
     """
     positive("period", period)
     if not 0.0 <= model_error < 1.0:
@@ -315,9 +287,13 @@ def change_parameters(
             where="model_error",
             remedy="give the relative error of the model",
         )
-    bound = max(BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
-    block = max(1, round(BLOCK / period))
-    window, hold, memory = (max(1, round(x / (block * period))) for x in (WINDOW, HOLD, MEMORY))
+    bound = (
+        max(DEFAULT_BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
+    )
+    block = max(1, round(BLOCK_S / period))
+    window, hold, memory = (
+        max(1, round(x / (block * period))) for x in (WINDOW_S, HOLD_S, MODEL_ERROR_S)
+    )
     std = positive("wrench_std", wrench_std, 6), checked("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
     return block, np.append(noise, memory), window, hold, bound
@@ -326,10 +302,7 @@ def change_parameters(
 def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT) -> Array:
     """Return the initial memory of the change detector for a known load.
 
-    Args:
-        theta, covariance: (16,), (16, 16) of [offsets; phi]; standard deviations are limited to
-            `PRIOR_STD`.
-        offset_drift: (6,) standard deviation of the drift since the identification [N, N m].
+    `offset_drift` (6,) is the standard deviation of the drift since the identification [N, N m].
     """
     prior = np.square(PRIOR_STD)
     P = covariance.copy()
@@ -350,7 +323,6 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
 
 @njit(cache=True)
 def known_load(memory):
-    """Return [offsets; phi] (16,) of the known load, a view into the memory."""
     return memory[_KNOWN : _KNOWN + 16]
 
 
@@ -362,7 +334,6 @@ def change_state(memory):
 
 @njit(cache=True)
 def new_load(memory):
-    """Return [offsets; phi] (16,) of the new load, a view into the memory."""
     return memory[_NEW : _NEW + 16]
 
 
@@ -380,13 +351,7 @@ def watch_load(
     omega: ArrayLike,
     alpha: ArrayLike,
 ) -> NDArray[np.int_]:
-    """Return the detector's states (N,) for N samples of a log, as indices into `STATES`.
-
-    Args:
-        memory: from `change_memory`, updated.
-        parameters: from `change_parameters`.
-        wrench, s, omega, alpha: as for `identify`.
-    """
+    """Return the detector's states (N,) for N samples of a log, as indices into `STATES`."""
     _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
     _watch(memory, np.concatenate(rows, axis=1), states, *parameters)
@@ -394,11 +359,7 @@ def watch_load(
 
 
 def identified_load(memory: Array, known: Identification) -> Identification:
-    """Return the last new load that the detector identified, or `known` if there is none.
-
-    Inertias without excitation keep their former values with a large standard deviation;
-    `condition_number` and `delay_s` are those of `known`.
-    """
+    """Return the last new load that the detector identified, or `known` if there is none."""
     if memory[_BASE] == KNOWN:
         return known
     phi, P = memory[_KNOWN + 6 : _KNOWN + 16].copy(), memory[_KNOWN + 16 : _WATCH]

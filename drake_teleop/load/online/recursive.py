@@ -1,8 +1,4 @@
-"""Recursive least squares for load and offsets, Eq. (T6).
-
-Each sample is six rank-one updates (Ljung, System Identification, section 11.2). Without forgetting
-the result equals batch least squares with a weak prior.
-"""
+"""Recursive least squares for load and offsets, Eq. (T6) (Ljung, System Identification, 11.2)."""
 
 from __future__ import annotations
 
@@ -29,7 +25,7 @@ from drake_teleop.load.regressor import (
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Standard deviations of the default prior about zero [N, N m, kg, kg m, kg m^2]."""
 
-SETTLED = 0.05
+MAX_SETTLED_STD = 0.05
 """Default of `bound`, relative to the natural scale."""
 
 # Smallest relative eigenvalue that is not rounding.
@@ -41,15 +37,10 @@ _MIN_RELATIVE_VARIANCE = 1e-10
 
 @njit(cache=True)
 def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
-    """Update a recursive least squares estimate by N samples, without checks.
+    """Update estimate theta (16,) and covariance P (16, 16) by N samples, without checks.
 
-    Args:
-        theta: (16,) estimate [offsets; phi], updated.
-        P: (16, 16) covariance, exactly symmetric, updated.
-        samples: (N, at least 15) rows [wrench, s, omega, alpha].
-        noise_std, forgetting: as for `RecursiveEstimator`.
-        largest: (16,) upper bound of the variances during forgetting.
-        squares: (6,) sums of squared residuals, updated [N^2, N^2 m^2].
+    `largest` (16,) limits the variances during forgetting; `squares` (6,) are the sums of squared
+    residuals.
     """
     V, gain = np.empty((6, 10)), np.empty(16)
     step = 1.0 / math.sqrt(forgetting)
@@ -95,7 +86,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
 class RecursiveEstimator(ABC):
     """Recursive estimator of load and sensor offsets, theta = [offsets; phi] (16,).
 
-    Its state is theta and a `memory` array; both can be external, such as a Drake state.
+    Its state, theta and a `memory` array, can be external.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
@@ -114,7 +105,7 @@ class RecursiveEstimator(ABC):
         noise_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = SETTLED,
+        bound: float = MAX_SETTLED_STD,
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise DrakeTeleopError(
@@ -136,25 +127,19 @@ class RecursiveEstimator(ABC):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveEstimator:
-        """Return an estimator for standard deviations of wrench (6,) and motion (9,).
-
-        Noise of the motion is ignored if unsupported.
-        """
+        """Return an estimator for standard deviations of wrench (6,) and motion (9,)."""
         return cls(noise_std, forgetting=forgetting, bound=bound)
 
     @property
     def phi(self) -> Array:
-        """Load (10,) about So in S [kg, kg m, kg m^2]."""
         return self._theta[6:].copy()
 
     @property
     def offsets(self) -> Array:
-        """Sensor offsets (6,) [N, N m]."""
         return self._theta[:6].copy()
 
     @property
     def covariance(self) -> Array:
-        """Covariance (16, 16) of [offsets; phi] for white noise [SI]."""
         return self.covariance_of(self._theta, self._memory)
 
     @property
@@ -163,43 +148,29 @@ class RecursiveEstimator(ABC):
         return self.settled_at(self._theta, self._memory)
 
     def settled_at(self, theta: Array, memory: Array) -> bool:
-        """Return `settled` for an external theta and memory."""
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
         return bool(self._is_certain(deviations, theta, self._bound).all())
 
     @abstractmethod
-    def initial_memory(self, theta: Array) -> Array:
-        """Return the memory for an initial estimate theta (16,)."""
+    def initial_memory(self, theta: Array) -> Array: ...
 
     @abstractmethod
-    def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance (16, 16) of an external theta and memory [SI]."""
+    def covariance_of(self, theta: Array, memory: Array) -> Array: ...
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
-        """Process one sample with an external theta and memory, without checks.
-
-        Args:
-            theta: (16,) estimate, updated.
-            memory: C-contiguous array from `initial_memory`, updated.
-            sample: array that begins with [wrench, s, omega, alpha].
-        """
+        """Process one sample with an external theta and memory, without checks."""
         self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
     @abstractmethod
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None: ...
 
     @abstractmethod
-    def _residual_rms(self) -> Array:
-        """Return the RMS (6,) of the residuals [N, N m]."""
+    def _residual_rms(self) -> Array: ...
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Process one sample of a free motion: wrench (6,), others (3,), as for `identify`.
-
-        Raises:
-            DrakeTeleopError: for invalid input; the estimate is then unchanged.
-        """
+        """Process one sample of a free motion: wrench (6,), others (3,)."""
         parts = (wrench, s, omega, alpha)
         shapes = [np.shape(part) for part in parts]
         if shapes != [(6,), (3,), (3,), (3,)]:
@@ -215,13 +186,12 @@ class RecursiveEstimator(ABC):
         self._samples += 1
 
     def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Update by N samples of a free motion, (N, 6) and (N, 3); faster than `update`."""
+        """Process N samples of a free motion, (N, 6) and (N, 3); faster than `update`."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
     def identification(self) -> Identification:
-        """Return the present estimate."""
         if self._theta[6] == 0.0:
             raise DrakeTeleopError(
                 "has not received a sample", where="estimator", remedy="call update first"
@@ -262,11 +232,9 @@ class RecursiveLeastSquares(RecursiveEstimator):
         self._squares = np.zeros(6)
 
     def initial_memory(self, theta: Array) -> Array:
-        """Return the covariance (16, 16) of the prior."""
         return np.diag(self._prior)
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance (16, 16), a copy of the memory."""
         return memory.copy()
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:

@@ -1,12 +1,10 @@
 """Recursive total least squares: load and offsets for noise of wrench and motion, Eq. (T18).
 
-The estimate minimises lambda, the squared residuals over their expected value (Kubus, Kroeger,
-Wahl, IROS 2008). As in `moments`, row c of the regressor [E V] is T_c z, with the wrench F
-last:
+The estimate minimises the squared residuals over their expected value (Kubus, Kroeger, Wahl, IROS
+2008). Row c of the regressor [E V] is T_c z with constant T_c; [G g] are the normal equations, and
+Z (19, 19) is the sum of z z^T:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
-
-G, g are the normal equations, N is the noise in G. Compiled functions check no input.
 """
 
 from __future__ import annotations
@@ -23,8 +21,8 @@ from drake_teleop.common.numeric import Array, checked
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.moments import coefficients
 from drake_teleop.load.online.recursive import (
+    MAX_SETTLED_STD,
     PRIOR_STD,
-    SETTLED,
     RecursiveEstimator,
     RecursiveLeastSquares,
 )
@@ -36,7 +34,7 @@ RIDGE = 1e-13
 _WRENCH, _PRODUCTS = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
-_EXCESS = 4.0
+_MIN_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
 _MIN_PIVOT = 1e-13
 # Fewest samples for the noise scale from residuals.
@@ -54,7 +52,6 @@ def terms() -> tuple[NDArray[np.uintp], Array]:
 
 @njit(cache=True)
 def scratch():
-    """Return working arrays of `rtls_normal_equations`."""
     return (
         np.empty((13, 6, 16)),
         np.empty(16),
@@ -68,11 +65,6 @@ def scratch():
 
 @njit(cache=True)
 def write_z(wrench, motion, z):
-    """Write z = [1, s, alpha, products of omega, wrench] (19,).
-
-    Args:
-        wrench, motion: (6,) [N, N m], and (9,) [s, omega, alpha].
-    """
     s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
     for i in range(3):
@@ -105,13 +97,7 @@ def forget(memory, theta, information, forgetting):
 
 @njit(cache=True)
 def residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L, L Z and S = L Z L^T, the sum of r r^T, for the residual r = F - [E V] theta = L z.
-
-    Args:
-        Z: (19, 19) sum of z z^T, or noise covariance of z.
-        index, factors: from `terms`.
-        L, LZ, S: (6, 19), (6, 19), (6, 6), written.
-    """
+    """Write L, L Z and S = L Z L^T (6, 6) for the residual r = F - [E V] theta = L z."""
     L[:] = 0.0
     LZ[:] = 0.0
     for c in range(6):
@@ -134,7 +120,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the expected noise of Z, the sum of z z^T (19, 19), into Q."""
+    """Write the expected noise of Z into Q."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
@@ -150,14 +136,7 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 @njit(cache=True)
 def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z.
-
-    Args:
-        Z: (19, 19) sum of y z^T.
-        W: (6, 6) weights between the channels.
-        index, factors: from `terms`.
-        E: (13, 6, 16) scratch.
-    """
+    """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z."""
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
@@ -178,10 +157,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def weighted_right(LZ, W, index, factors, g):
-    """Write the right-hand side g (16,), the sum of X^T W r with X = [E V] of z.
-
-    LZ (6, 19) is the sum of r z^T; r is the wrench or the residual.
-    """
+    """Write the right-hand side g (16,), the sum of X^T W r with X = [E V] of z."""
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -237,7 +213,6 @@ class MomentEstimator(RecursiveEstimator):
     """Recursive estimator whose memory is the sum of z z^T, and a row for the prior."""
 
     def initial_memory(self, theta: Array) -> Array:
-        """Return the memory (20, 19): sum of z z^T; in the last row the prior's right-hand side."""
         memory = np.zeros((20, 19))
         memory[-1, :16] = theta / self._prior
         return memory
@@ -254,10 +229,7 @@ class MomentEstimator(RecursiveEstimator):
 
 @njit(cache=True)
 def select_compensated(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise can be compensated, otherwise to 0.
-
-    Restricted to these, G - strength N is positive definite. K (16, 16) is scratch.
-    """
+    """Set `taper` (16,) to 1 for parameters whose noise can be compensated, otherwise to 0."""
     taper[:] = 1.0
     for i in range(16):
         for j in range(16):
@@ -289,14 +261,7 @@ def select_compensated(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write [G g] into G (16, >= 17) and the noise of G into N (16, 16); return lambda.
-
-    Args:
-        Z: (19, 19) sum of z z^T.
-        noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
-        index, factors, space: from `terms` and `scratch`.
-        Q: (19, 19) scratch.
-    """
+    """Write [G g] into G and the noise of G into N; return the noise scale."""
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
     residual_products(Q, theta, index, factors, L, LZ, S)
@@ -321,14 +286,10 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
 def rtls_update(
     theta, memory, samples, noise_std, motion_std, forgetting, information, index, factors
 ):
-    """Update a recursive total least squares estimate by N samples.
+    """Update theta (16,) and memory (20, 19) of recursive total least squares by N samples.
 
-    Args:
-        theta: (16,) estimate [offsets; phi], updated.
-        memory: (20, 19) of `MomentEstimator`, updated.
-        samples: (N, at least 15) rows [wrench, s, omega, alpha].
-        noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
-        forgetting, information: factor per sample, and (16,) inverse variances of the prior.
+    `noise_std` (6,) and `motion_std` (9,) are standard deviations of the wrench and of [s, omega,
+    alpha]; `information` (16,) are inverse variances of the prior.
     """
     space, Q, z, taper = scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
@@ -342,7 +303,7 @@ def rtls_update(
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        gain = 1.0 - _EXCESS * math.sqrt(2.0 / Z[0, 0])
+        gain = 1.0 - _MIN_EXCESS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
             select_compensated(G, N, scale / gain, K, taper)
             for i in range(6, 16):
@@ -356,9 +317,7 @@ def rtls_update(
 class RecursiveTotalLeastSquares(MomentEstimator):
     """Recursive total least squares, which allows for noise of the measured motion.
 
-    Args:
-        noise_std, forgetting, prior_std, bound: as for `RecursiveEstimator`.
-        motion_std: (9,) noise of s [m/s^2], omega [rad/s], alpha [rad/s^2]; zeros: least squares.
+    `motion_std` (9,) is the noise of s [m/s^2], omega [rad/s], alpha [rad/s^2].
     """
 
     method = "recursive total least squares"
@@ -370,7 +329,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         motion_std: ArrayLike,
         forgetting: float = 1.0,
         prior_std: ArrayLike = PRIOR_STD,
-        bound: float = SETTLED,
+        bound: float = MAX_SETTLED_STD,
     ) -> None:
         self._motion_std = checked("motion_std", motion_std, 9)
         if (self._motion_std < 0.0).any():
@@ -385,26 +344,24 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveTotalLeastSquares:
-        """Return an estimator for standard deviations of wrench (6,) and motion (9,)."""
         return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property
     def noise_scale(self) -> float:
-        """Ratio lambda of observed to specified noise variances."""
+        """Ratio of observed to specified noise variances."""
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance lambda H^-1 G H^-1 (16, 16), H = G - lambda N.
-
-        Directions without sufficient information get the prior's variance.
-        """
+        """Return the covariance (16, 16); poorly excited directions have the prior's variance."""
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
         root = np.linalg.inv(_cholesky(G + information))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        excited = (shares < _MIN_PIVOT) | (excess > _EXCESS * math.sqrt(2.0 / max(samples, 1.0)))
+        excited = (shares < _MIN_PIVOT) | (
+            excess > _MIN_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
+        )
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
         factor = inverse @ _cholesky(scale * G + information)
         unknown = directions[:, ~excited]

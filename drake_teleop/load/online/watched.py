@@ -1,13 +1,8 @@
 """Monitor of a known load in use, which selects the load to eliminate, sample by sample::
 
-    settled     the known load explains the wrench and is used
-    disturbed   contact, or the moment of a grasp; the known load is used
-    changed     another load: the fallback (gripper or nothing) is used until the known load
-                explains the wrench again or the new load is identified
-
-A new load counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for `EXPLAINED`
-seconds, with a centre of mass within `MAX_COM_DISTANCE_M`: a constant push at rest looks like a
-weight. At rest, the offsets follow residuals below `MAX_OFFSET_RESIDUAL`.
+settled     the known load explains the wrench and is used
+disturbed   contact, or the moment of a grasp; the known load is used
+changed     another load; the fallback (gripper or nothing) is used
 """
 
 from __future__ import annotations
@@ -39,7 +34,7 @@ LOAD_STATES = ("learning", "settled", "disturbed", "changed")
 """States of a load estimator, by index; "learning": the load is not identified yet."""
 LEARNING, SETTLED, DISTURBED, OTHER_LOAD = range(4)
 
-FADE, REST, FOLLOW, EXPLAINED = 0.1, 0.3, 3.0, 0.1
+FADE_TIME_S, MIN_REST_S, OFFSET_TIME_S, MIN_EXPLAINED_S = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
 and explanation of a changed force by a new load."""
 MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
@@ -64,7 +59,6 @@ SIZE = _CHANGE + change.SIZE
 
 
 def watched_memory(theta: Array, covariance: Array) -> Array:
-    """Return the initial memory for a known [offsets; phi] (16,) and its covariance (16, 16)."""
     rest = np.zeros(_CHANGE)
     rest[_STATE] = SETTLED
     return np.concatenate([rest, change.change_memory(theta, covariance)])
@@ -90,7 +84,7 @@ def _is_at_rest(memory, sample, period):
         memory[_REST_SAMPLES] = 0.0
         put(memory, _REST_S, memory, _S, 3)
     memory[_REST_SAMPLES] += 1.0
-    return memory[_REST_SAMPLES] * period > REST
+    return memory[_REST_SAMPLES] * period > MIN_REST_S
 
 
 @njit(cache=True)
@@ -107,7 +101,7 @@ def _force_has_changed(memory, residual, age, period):
     put(highest, 0, np.maximum(highest, low_passed), 0, 3)
     differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
     memory[_CHANGED_SAMPLES] = memory[_CHANGED_SAMPLES] + 1.0 if differs else 0.0
-    return memory[_CHANGED_SAMPLES] * period > EXPLAINED
+    return memory[_CHANGED_SAMPLES] * period > MIN_EXPLAINED_S
 
 
 @njit(cache=True)
@@ -118,15 +112,10 @@ def _is_within_reach(known, new):
 
 @njit(cache=True)
 def watched_update(out, memory, sample, fallback, period, block, noise, window, hold, bound):
-    """Process one sample: monitor the known load and write the load to eliminate; no checks.
+    """Process one sample: monitor the known load and write the load to eliminate into `out` (16,).
 
-    Args:
-        out: (16,) [offsets; phi] to eliminate, updated.
-        memory: from `watched_memory`, updated.
-        sample: (15 or more,) [wrench, s, omega, alpha].
-        fallback: (10,) phi that is used for a changed load.
-        period: time between samples [s].
-        block, noise, window, hold, bound: from `change.change_parameters`.
+    `fallback` (10,) is the phi for a changed load; the last arguments are from
+    `change_parameters`.
     """
     watch = memory[_CHANGE:]
     change_update(watch, sample, block, noise, window, hold, bound)
@@ -142,11 +131,11 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
         memory[_STATE] = SETTLED
         if at_rest and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
-                known[i] += period / FOLLOW * residual[i]
+                known[i] += period / OFFSET_TIME_S * residual[i]
     elif memory[_STATE] != OTHER_LOAD:
         other = verdict == CHANGED and force_changed and _is_within_reach(known, new_load(watch))
         memory[_STATE] = OTHER_LOAD if other else DISTURBED
     put(target, 0, known, 0, 16)
     if memory[_STATE] == OTHER_LOAD:
         put(target, 6, fallback, 0, 10)
-    out += period / (FADE + period) * (target - out)
+    out += period / (FADE_TIME_S + period) * (target - out)

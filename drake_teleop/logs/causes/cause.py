@@ -78,7 +78,9 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
         out.append(_factor(state))
     out += [_gain(state, c) for c in model.gains]
     changes = [_change(state, i) for i in range(len(model.steps))]
-    changes += [_contact(*span) for span in state.spans if not _is_hand_contact(span, model.times)]
+    margin = state.data.dt  # one row more than the contact is omitted at both ends
+    contacts = [span for span in state.spans if not _is_hand_contact(span, model.times)]
+    changes += [_contact(start + margin, stop - margin) for start, stop in contacts]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 

@@ -193,7 +193,7 @@ def _is_step_significant(state: State, i: int) -> bool:
 
 
 _KEPT_SHARES, _ITERATIONS, _FEWEST_BLOCKS, _GROWTH = (0.12, 0.3, 0.55), 15, 8, 1.3
-_START_LENGTHS = (8, 16, 32)
+_START_LENGTHS, _END_LENGTHS = (8, 16, 32), (2, 4, 8)
 _CONTACT_LEVEL, _CALM_RATIO, _SPREAD = 8.0, 5.0, 1.3
 _MAX_LOADS, _MAX_STEPS, _SHORTEST_RUN, _MAX_UNCOVERED = 4, 4, 4, 0.12
 _LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
@@ -275,7 +275,8 @@ class _Blocks:
             return None
         level, calm, move = found
         excess = np.sqrt(np.maximum(level**2 - (_SPREAD * calm) ** 2, 0.0))
-        by_motion = _motion_error_level(self._state, self._state.x + move, excess, among)
+        quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CALM_RATIO * calm)))
+        by_motion = _motion_error_level(self._state, self._state.x + move, excess, among, quantile)
         usual = np.hypot(calm, by_motion)
         return np.asarray((level > _CONTACT_LEVEL) & (level > _CALM_RATIO * usual) & among)
 
@@ -292,10 +293,27 @@ class _Blocks:
             found.append((level, move))
             if share == _KEPT_SHARES[1]:
                 usual = min(usual, float(np.median(level[last])))
+        for length in _END_LENGTHS:
+            level, move, last = self._trimmed_fit(
+                blocks, np.r_[blocks[:length], blocks[-length:]], 0.0
+            )
+            calm = float(np.median(level[last]))
+            if self._is_clear(level, last, np.setdiff1d(blocks, last), calm):
+                found.append((level, move))
+                usual = min(usual, calm)
         limit = max(_CONTACT_LEVEL**2, (_CALM_RATIO**2) * usual)
         level, move = min(found, key=lambda x: float(np.minimum(x[0][blocks], limit).sum()))
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
+
+    def _is_clear(
+        self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
+    ) -> bool:
+        """Return whether a fit to `kept` blocks predicts the `others`, and most of them differ."""
+        covariance = regularized_inverse(self._gram[kept].sum(axis=0))
+        share = np.einsum("bij,ji->b", self._gram[others], covariance)
+        predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))
+        return bool(np.mean(level[others] > _CALM_RATIO**2 * predicted) > 1.0 - _MAX_UNCOVERED)
 
     def _trimmed_fit(
         self, blocks: NDArray[np.intp], kept: NDArray[np.intp], share: float
@@ -313,7 +331,9 @@ class _Blocks:
         return level, move, kept
 
 
-def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) -> Array:
+def _motion_error_level(
+    state: State, x: Array, level: Array, usable: NDArray[np.bool_], quantile: float
+) -> Array:
     data, rows = state.data, state.data.block
     y = data.with_steps(state.model.times)
     wrench = y @ state.model.wrench(x[None])[0].T
@@ -327,7 +347,7 @@ def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np
     if accelerates_enough.sum() < 8:
         return np.zeros(len(level))
     ratio = level[accelerates_enough] / np.maximum(fast[accelerates_enough], 1e-12)
-    return np.asarray(2.0 * np.quantile(ratio, 0.25) * fast)
+    return np.asarray(2.0 * np.quantile(ratio, quantile) * fast)
 
 
 def replace_steps_by_contact(state: State) -> State:
@@ -365,11 +385,12 @@ def _contact_span(state: State, span: tuple[float, float]) -> tuple[float, float
     inside = np.flatnonzero(data.used & in_spans(data, (span,)))
     y = data.with_steps(state.model.times)[:, state.model.columns]
     usual = np.maximum(np.maximum(data.white, state.rows.rms(state.fit.residual)), 1e-12)
-    contact_blocks = np.abs(y[inside] @ state.fit.residual.T) > _CALM_RATIO * usual
-    at = inside[contact_blocks.any(axis=1)]
-    if not len(at):
+    large = (np.abs(y[inside] @ state.fit.residual.T) > _CALM_RATIO * usual).any(axis=1)
+    first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
+    if not len(first):
         return span
-    return float(data.t[at[0]]) - 0.5 * data.dt, float(data.t[at[-1]]) + 0.5 * data.dt
+    start, stop = data.t[inside[[first[0], first[-1] + 1]]]
+    return float(start) - 0.5 * data.dt, float(stop) + 0.5 * data.dt
 
 
 def _median_residual_ratio(state: State, span: tuple[float, float]) -> float:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.uncertainty import ARM
+from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.candidates import Candidate, similar_factors
 from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
@@ -83,7 +83,7 @@ def gain_covariance(state: State) -> Array:
     """
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
-    unit = np.repeat([1.0, ARM], 3)
+    unit = np.repeat([1.0, TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
     wrench = (rows.columns == np.arange(FORCES.start, FORCES.stop)[:, None]) - fit.residual
     J, inverse = state.model.derivative(state.x), fit.covariance
@@ -115,7 +115,7 @@ def gain_covariance(state: State) -> Array:
 
 
 def factor_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] by other plausible units of the torque."""
+    """Return the covariance (16, 16) of [offsets; phi] caused by an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in similar_factors(state):
         distance = other.x[LOAD] - state.x[LOAD]
@@ -124,7 +124,7 @@ def factor_covariance(state: State) -> Array:
 
 
 def attenuation(state: State) -> Array:
-    """Return the bias (16,) of [offsets; phi] by white noise of the angular acceleration."""
+    """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
     variance = white_noise(data.y[data.used][:, ALPHA]) ** 2

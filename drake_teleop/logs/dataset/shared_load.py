@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
-from drake_teleop.load.contact.detection import RARE, fit_noise_floor
+from drake_teleop.load.contact.detection import MAX_NOISE_LEVEL, fit_noise_floor
 from drake_teleop.load.contact.noise_floor import NoiseFloor, Samples, finite_covariance
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.logs.dataset.episode_verdict import (
@@ -92,7 +92,7 @@ def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     free = [_free_samples(episodes[k], x, phi, typical) for k, x in zip(chosen, usual, strict=True)]
     pooled = Samples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     floor = fit_noise_floor(*pooled, finite_covariance(phi, load.covariance, tared=True), fade=0.0)
-    threshold = max(RARE, _MARGIN * float(floor.reached[0]))
+    threshold = max(MAX_NOISE_LEVEL, _MARGIN * float(floor.reached[0]))
     return SharedLoad(load, phi, spacing, lag, typical, floor, threshold)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.batch.uncertainty import ARM, gain_effects
+from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, gain_effects
 from drake_teleop.load.moments import centripetal_matrix, coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
 from drake_teleop.logs.pose_motion.spectra import FORCES, MOMENTS_SIZE, RATES, Levels
@@ -317,7 +317,7 @@ def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float
     B, levels = solution.B, record.levels
     effects = _gain_effects(B, record.Z, solution.W, solution.inverse)
     left = -np.einsum("cjk,ji->cik", B, effects)
-    length = np.repeat([1.0, ARM], 3)
+    length = np.repeat([1.0, TORQUE_ARM_M], 3)
     left = left.reshape(6, 6, 6, MOMENTS_SIZE)  # of channel c by gain d, k
     for c in range(6):
         left[c, c, :, FORCES] += np.diag(length[c] / length)

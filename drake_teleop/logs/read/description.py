@@ -343,7 +343,6 @@ class Description(Strict):
 
 
 def json_schema() -> str:
-    """Return the JSON schema of a log description."""
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     schema |= Description.model_json_schema()
     # With a topic, only the file is required.

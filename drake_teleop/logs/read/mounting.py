@@ -303,7 +303,6 @@ class Mounting:
 
     @property
     def angle_deg(self) -> float:
-        """Rotation angle of R_SI [deg]."""
         return _angle_deg(self.R_SI)
 
     @property

@@ -66,7 +66,6 @@ def on_clock(t: Array, stream: Stream, values: Array) -> Array:
 
 
 def in_S(R_WS: Array, vectors_W: Array) -> Array:
-    """Return the vectors `vectors_W` (N, 3), given in W, in the axes of S."""
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 

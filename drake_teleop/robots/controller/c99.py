@@ -27,7 +27,7 @@ CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 KERNEL = ("wrench_compensator.h", "wrench_compensator.c")
 _VECTOR_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
 _VECTOR_READINGS = 1000
-_TORQUES_SMALLER = np.repeat([1.0, 0.05], 3)
+_VECTOR_AMPLITUDES = np.repeat([1.0, 0.05], 3)
 _SETTINGS = (
     *("phi", "offsets", "sigma_weight", "sigma_inertia", "gamma", "low_pass", "low_pass_count"),
     *("range", "largest", "noise_limits", "stale_steps", "tare_steps"),
@@ -38,7 +38,6 @@ Files = Mapping[str, str | bytes]
 
 @cache
 def kernel() -> str:
-    """Return the text of wrench_compensator.c."""
     c = Translator()
     row, out = (VALUES + 6,), (12,)
     c.add(step.value_problem, values=(VALUES,), largest=(VALUES,), limits=(6,))
@@ -67,7 +66,6 @@ def kernel() -> str:
 
 
 def header() -> str:
-    """Return the text of wrench_compensator.h."""
     return template("wrench_compensator.h")
 
 
@@ -76,7 +74,6 @@ class Target(NamedTuple):
 
     Attributes:
         dt: period of the readings [s].
-        cutoff_hz, largest: see `Compensator`.
         sign: -1 if the sensor reports the wrench of the load on the sensor, else 1.
         notes: warnings for the user.
     """
@@ -101,13 +98,11 @@ class Target(NamedTuple):
         return "".join(f"    {_literal(values[name])}, /* {name} */\n" for name in _SETTINGS)
 
     def loop(self, largest: Array | None = None, **scales: Any) -> Compensator:
-        """Return a compensator for this load."""
         largest = self.largest if largest is None else largest
         return Compensator(self.found, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
 
 
 def c99_files(target: Target) -> Files:
-    """Return the files of the format `c99` by name."""
     return {
         **kernel_files(target),
         "test_vector.h": _test_vector(target),
@@ -124,13 +119,11 @@ def c99_files(target: Target) -> Files:
 
 
 def kernel_files(target: Target) -> Files:
-    """Return the C code and the load's header by name."""
     load = rendered("load.h", dt=repr(target.dt), settings=target.settings(), notes=target.notes)
     return dict(zip((*KERNEL, "load.h"), (header(), kernel(), load), strict=True))
 
 
 def template(name: str) -> str:
-    """Return the text of a shipped template."""
     return resources.files(PACKAGE).joinpath(f"templates/{name}").read_text(encoding="utf-8")
 
 
@@ -163,16 +156,13 @@ def _test_vector(target: Target) -> str:
 
 
 def _simulated_readings(target: Target) -> tuple[Array, Array]:
-    """Return rows [wrench, s, omega, alpha, gravity] (N, 18) in S and a sensor range (6,).
-
-    Some rows are in contact, exceed the range or are invalid.
-    """
+    """Return rows [wrench, s, omega, alpha, gravity] (N, 18) in S and a sensor range (6,)."""
     phase = 2.0 * np.pi * np.arange(_VECTOR_READINGS)[:, None] / _VECTOR_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
     alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])
     down = np.array([3.0, -4.0, -8.0]) + omega
     motion = 5.0 * alpha - down, omega, alpha
-    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TORQUES_SMALLER
+    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _VECTOR_AMPLITUDES
     wrench = non_contact_wrench(*motion, target.found.phi) + target.found.offsets + contact
     readings = np.round(np.hstack([wrench, *motion, down]), 6)
     largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)

@@ -35,17 +35,9 @@ def export_controller(
     sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> list[str]:
-    """Write the files of the format `to`, a key of `FORMATS`; return warnings.
+    """Write the files of the format `to`; return warnings.
 
-    Args:
-        rate_hz: rate of the readings.
-        cutoff_hz: cut-off of the low-pass; None: no low-pass.
-        largest: range of the sensor: force [N], torque [N m].
-        sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
-
-    Raises:
-        DrakeTeleopError: without a rate, for a sensor's pose, for a wrench without the load's
-            weight, or for a folder that is not writable.
+    `sign` is -1 if the sensor reports the wrench of load on sensor (usual), else 1.
     """
     if rate_hz is None:
         raise DrakeTeleopError(

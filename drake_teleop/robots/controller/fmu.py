@@ -31,10 +31,7 @@ _PLATFORMS = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 
 def fmu_files(target: Target) -> Files:
-    """Return two FMUs by name: sources, and binaries for Linux if there is a C compiler.
-
-    A missing compiler is added to the notes of `target`.
-    """
+    """Return two FMUs by name: sources, and binaries for Linux if there is a C compiler."""
     compiler = shutil.which("cc")
     if platform.system() != "Linux" or platform.machine() != "x86_64":
         compiler = None
@@ -128,7 +125,6 @@ def _description(target: Target, version: str, token: str, compiled: list[str]) 
 
 
 def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
-    """Add the outputs to the model structure: by value reference (FMI 3.0) or index (FMI 2.0)."""
     for tag in ("Output", "InitialUnknown"):
         group = structure if new else SubElement(structure, f"{tag}s")
         for k in outputs:
@@ -139,7 +135,6 @@ def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
 
 
 def _variables(target: Target) -> list[tuple[str, str, str, float | None]]:
-    """Return name, causality, unit and start value in the order of fmu.h."""
     wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]

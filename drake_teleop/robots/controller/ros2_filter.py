@@ -9,7 +9,6 @@ _FOLDER = "ros2_filter"
 
 
 def ros2_filter_files(target: Target) -> Files:
-    """Return the files of the package by name."""
     shipped = {
         f"{_NAME}.xml": f"{_NAME}.xml",
         "package.xml": "package.xml",

@@ -1,9 +1,6 @@
-"""C99 text of compiled functions, with the same operations in the same order.
+"""Translation of compiled functions to C99, with the same operations in the same order.
 
-The translator reads the source of numba functions. A function of `njit` becomes a C function. A
-function of `register_jitable`, which may return tuples, is expanded at its call. Supported are
-arithmetic, branches, `for` over `range`, tuples and slices of arrays of doubles; other syntax
-raises `ValueError`.
+A numba function of `njit` becomes a C function; one of `register_jitable` is expanded at its call.
 """
 
 from __future__ import annotations
@@ -70,15 +67,13 @@ class Translator:
 
     @property
     def text(self) -> str:
-        """C text of all functions."""
         return "\n".join(function.text for function in self._functions.values())
 
     def add(self, function: Any, **parameters: str | tuple[int | str, ...]) -> _Function:
         """Translate a function of `njit`.
 
-        Args:
-            parameters: "double", "int" or the shape of an array, for each parameter in order. A
-                name as the first size becomes an `int` parameter.
+        `parameters` are, in order, "double", "int" or the shape of an array, which may begin with
+        a name.
         """
         key = (function, *parameters.items())
         if key not in self._functions:
@@ -373,7 +368,6 @@ def _text(value: Any) -> str:
 
 
 def _bare(text: str) -> str:
-    """Return an expression without its outer parentheses."""
     depth = 0
     for k, letter in enumerate(text):
         depth += (letter == "(") - (letter == ")")

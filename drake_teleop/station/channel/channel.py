@@ -1,7 +1,4 @@
-"""Channel between master and slave: network and passivity method at both ends (long: one step).
-
-In every period both ends run one step of the method; their packets pass the network.
-"""
+"""Channel between master and slave: network and passivity method at both ends (long: one step)."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -74,11 +71,7 @@ class Channel(NetworkConfig):
     )
 
     def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
-        """Return the networks of both directions: forward (master to slave) and backward.
-
-        Raises:
-            DrakeTeleopError: if a preset is combined with other fields.
-        """
+        """Return the networks of both directions: forward (master to slave) and backward."""
         names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
         if self.network == "custom":
@@ -135,11 +128,7 @@ _NO_LOAD = np.zeros(6)
 def initial_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the state vector of both ends before their first step.
-
-    Args:
-        start: (7,) pose X_WS of the slave and of its command.
-    """
+    """Return the state of both ends before their first step; `start` (7,) is the slave's X_WS."""
     ends = np.zeros(_SIZE)
     ends[_POSE_M][:7] = ends[_POSE_S][:7] = start
     ends[_VALID_TIME] = STOP_TIME
@@ -176,13 +165,11 @@ def channel_step(
     """Run one step of both ends and of both directions of the network.
 
     Args:
-        steps: result of `methods.steps_of(method)`.
         pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
             `TeleopChannel`.
         T: time between steps [s].
         timeout: time without packets before the safe state [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
-        forward_parameters, backward_parameters: results of `network.parameters`.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
         ports: (PORTS,) port energies, updated; times without packets, written.
@@ -211,14 +198,10 @@ def master_end(
     steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends, work, packet,
     wrench_received,
 ):  # fmt: skip
-    """Run one step of the master's end.
+    """Run one step of the master's end; arguments are those of `channel_step`.
 
-    Args:
-        received: (PACKET_SIZE,) newest packet of the slave.
-        fresh: True if it is new.
-        work: (2,) energy input of the hand, updated.
-        packet: (PACKET_SIZE,) written: packet to the slave.
-        wrench_received: (7,) as the other arguments: see `channel_step`.
+    `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
+    hand is added to `work` (2,) [J].
     """
     before, held = ends[_POSE_M], ends[_WRENCH_M]
     watch, memory = ends[_WATCH_M], ends[MEMORY_M]
@@ -251,13 +234,7 @@ def slave_end(
     steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
-    """Run one step of the slave's end.
-
-    Args:
-        received: (PACKET_SIZE,) newest packet of the master.
-        fresh: True if it is new.
-        packet: (PACKET_SIZE,) written: packet to the master; other arguments: see `channel_step`.
-    """
+    """Run one step of the slave's end; arguments are those of `channel_step` and `master_end`."""
     before, held = ends[_POSE_S], ends[_WRENCH_S]
     watch, memory, work = ends[_WATCH_S], ends[MEMORY_S], ports[_WORK_S]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
@@ -338,9 +315,7 @@ def _to_master(wrench, frame, out):
 class TeleopChannel(LeafSystem):
     """Network with a passivity method at both ends; a packet takes at least one period.
 
-    Both ends have a safe state for silence and faults (`station.passivity.safe_state`). While the
-    wrist sensor is saturated, the last valid wrench is used. The rendered wrench depends on the
-    inputs without delay, so that wrench times increment of the command is the work at the device.
+    While the wrist sensor is saturated, the last valid wrench is used.
 
     .. pydrake_system::
 
@@ -364,9 +339,8 @@ class TeleopChannel(LeafSystem):
     Args:
         R_WB: (3, 3) alignment of the master's base with the world.
         scales: (2,) scale of translation and rotation, slave over master.
-        force_scale: scale of the contact force (force scale times gamma), slave to master.
+        force_scale: scale of the contact force, slave to master.
         start: (7,) pose X_WS of the slave at the start.
-        period: time between packets [s].
     """
 
     __slots__ = ONE_DICT
@@ -453,10 +427,8 @@ class TeleopChannel(LeafSystem):
     ) -> None:
         """Start in a running station, without packets in transit and with a constant slave command.
 
-        Args:
-            command: (7,) present command X_WS of the slave; the master's command must be equal.
-            slave: (7,) actual pose X_WS of the slave.
-            fills: time with open clutch [s], in which the slave of method `wave` keeps its command.
+        `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
+        time in which the slave of method `wave` keeps its command.
         """
         ends = initial_ends(*self._initial_arguments, command)
         ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills

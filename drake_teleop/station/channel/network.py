@@ -1,8 +1,7 @@
 """Simulated network; it returns the newest packet at each step (docs/theory.md, (T26), (T27)).
 
-Delays are random and independent, so jitter reorders packets; `gamma`: Mukherjee 1992; Chen et al.,
-ROBIO 2008. Losses follow a Gilbert-Elliott chain. Random numbers are hashes of (seed, direction,
-step).
+Delays are independent, so jitter reorders packets. Losses follow a Gilbert-Elliott chain. Random
+numbers are hashes of (seed, direction, step).
 """
 
 import math
@@ -65,7 +64,6 @@ class NetworkConfig:
     )
 
     def check(self, where: str = "network") -> None:
-        """Check all fields except the trace; raise a DrakeTeleopError for an invalid one."""
         check_ranges(self, where)
         if self.loss > self.burst_loss:
             raise DrakeTeleopError(
@@ -121,10 +119,6 @@ def parameters(
         least: smallest delay of a packet [steps].
         delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace;
             repeated after its end.
-
-    Raises:
-        DrakeTeleopError: for a value out of range, or with file, column and row of an invalid
-            trace.
     """
     config.check()
     trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)
@@ -179,8 +173,8 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     time = table.numbers(["time"], 1, str(path))[:, 0]
     delay = table.single("delay", str(path))
     if len(delay) != len(time):
-        what = f"has {len(delay)} rows, and time {len(time)}"
-        raise DrakeTeleopError(what, where=f"{path}:delay")
+        what = f"has {len(delay)} values, the column time has {len(time)}"
+        raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
     lost, age = np.isnan(delay), time - time[0]
     for column, bad, what in (
         ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
@@ -246,10 +240,7 @@ def initial_state(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
-    Args:
-        p: result of `parameters`.
-        neutral: (N,) values at the receiver before the first packet. Only the first N numbers of a
-            packet are transmitted.
+    `neutral` (N,) contains the values at the receiver before the first packet.
     """
     slots = int(p[_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
@@ -258,10 +249,7 @@ def initial_state(
 
 @njit(cache=True)
 def send(p, state, k, packet):
-    """Send the packet (N,) of step `k`; steps count from 0 without gaps.
-
-    `p` is from `parameters`; `state`, from `initial_state`, is updated.
-    """
+    """Send the packet of step `k` and update `state`; steps count from 0 without gaps."""
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
     receiver[_BAD], first, second = _advance_chain(p, k, receiver[_BAD])
@@ -277,14 +265,9 @@ def send(p, state, k, packet):
 
 @njit(cache=True)
 def receive(p, state, k, packet):
-    """Read the newest packet at step k, after `send` of the same step.
+    """Write the newest packet (N,) at step `k` into `packet`, after `send` of the same step.
 
-    Args:
-        p, state, k: as for `send`.
-        packet: (N,) written: the newest packet. If it is not new, the policy `silence` changes it.
-
-    Returns:
-        The step at which the newest packet was sent, or -1; True if this packet is new.
+    Return the step at which it was sent, or -1, and True if it is new.
     """
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
@@ -320,10 +303,7 @@ def _fill_silence(policy, silent, packet):
 def packet_delays(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive.
-
-    Other arguments as for `parameters`.
-    """
+    """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive."""
     return _all_delays(parameters(config, seed, direction, period), steps)
 
 
@@ -338,10 +318,7 @@ def _all_delays(p, steps):
 def newest_packets(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return the number of the newest received packet at each step, (steps,); -1 for none.
-
-    Other arguments as for `parameters`.
-    """
+    """Return the number of the newest received packet at each step, (steps,); -1 for none."""
     p = parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT])
     for travel in _all_delays(p, steps).T:
@@ -353,10 +330,7 @@ def newest_packets(
 
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
-    """Return the longest time without a new packet in a simulated minute [s].
-
-    `direction` and `period` are as for `parameters`. The random seed is fixed.
-    """
+    """Return the longest time without a new packet in a simulated minute with a fixed seed [s]."""
     steps = math.ceil((_MINUTE_S + longest_delay(config)) / period)
     newest = newest_packets(config, _SILENCE_SEED, direction, steps, period)
     fresh = np.flatnonzero(np.diff(newest, prepend=-1) > 0)

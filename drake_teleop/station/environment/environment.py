@@ -31,7 +31,7 @@ class Stand(NamedTuple):
 
 
 class Environment(ABC):
-    """Object that the tool can touch; a scenario may have several. Subclasses are dataclasses.
+    """Object that the tool can touch; subclasses are dataclasses.
 
     Its bodies may be fixed or move, with any shape that Drake supports. The wrist sensor's own
     contact law is faster; it supports boxes and a single `moving_part`.
@@ -40,10 +40,7 @@ class Environment(ABC):
     @property
     @abstractmethod
     def slip(self) -> float:
-        """Slip speed at which friction is fully developed [m/s].
-
-        The smallest of all environments applies.
-        """
+        """Slip speed of full friction [m/s]; the smallest one applies to all objects."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
@@ -56,7 +53,6 @@ class Environment(ABC):
         return
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError for invalid combinations of fields; `where` is their path."""
         return
 
     @property
@@ -71,15 +67,14 @@ class Environment(ABC):
 
     @property
     def moving_part(self) -> tuple[float, float, float] | None:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a sprung prismatic joint.
+        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a sprung joint, or None.
 
-        The joint's position is 0 at rest. None if there is no such body.
+        The joint is prismatic; its position is 0 at rest.
         """
         return None
 
     @property
     def stand(self) -> Stand | None:
-        """Box that a 3D replay shows below the environment, if any."""
         return None
 
 
@@ -113,7 +108,6 @@ class Several(Environment):
 
 
 def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
-    """Add a model instance with this name, numbered if the name exists, and return it."""
     number, free = 2, name
     while plant.HasModelInstanceNamed(free):
         free, number = f"{name}_{number}", number + 1
@@ -129,7 +123,6 @@ def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) ->
 
 
 def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
-    """Return the indices of the tool's body and the bodies welded to it, after Finalize."""
     return [body.index() for body in plant.GetBodiesWeldedTo(plant.get_body(tool))]
 
 
@@ -154,7 +147,6 @@ def ExcludeContact(
     shapes: Iterable[GeometryId],
     bodies: Iterable[BodyIndex],
 ) -> None:
-    """Exclude contact between `shapes` and the shapes of `bodies`."""
     others = [
         shape
         for body in bodies

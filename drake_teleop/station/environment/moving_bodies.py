@@ -1,8 +1,6 @@
 """Compiled poses of moving bodies from the plant's state, for contact between plant steps.
 
-From parent P (joint frame F) to child B (joint frame M), and likewise for velocities:
-
-    X_WB = X_WP X_PF X_FM(q) X_MB
+From parent P (joint frame F) to child B (joint frame M): X_WB = X_WP X_PF X_FM(q) X_MB.
 """
 
 from __future__ import annotations
@@ -47,17 +45,11 @@ POSE_AND_TWIST = 13
 
 
 def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
-    """Return a table of the joints between the bodies and the world, and the body of each row.
+    """Return a table (m, 21) of the joints between moving bodies and the world, and their bodies.
 
-    Args:
-        plant: finalized plant.
-        bodies: bodies that are not anchored.
-
-    Returns:
-        Table (m, 21) with a joint in each row, parents first: 0 row of the parent, or -1 if it is
-            anchored; 1 type of joint; 2 and 3 first index of positions and velocities in the state
-            [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an anchored parent) and 14-20 X_MB, a quaternion
-            and a position each. Body index of each row: `bodies` and their parents.
+    A row contains: 0 row of the parent, or -1 if it is anchored; 1 type of joint; 2 and 3 first
+    index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an anchored
+    parent) and 14-20 X_MB, a quaternion and a position each. Parents are first.
     """
     # Indices instead of joints: a stored joint and its plant would keep each other alive.
     above: dict[int, tuple[int, int]] = {}
@@ -172,7 +164,7 @@ def _quaternion_rate(spin, turn):
 def interpolate_bodies(joints, h, u, start, end, out):
     """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`, by cubics.
 
-    `joints` is a `JointTable`; `start` and `end` are the plant's states at both ends of the step.
+    `start` and `end` are the plant's states at both ends of the step.
     """
     for k in range(joints.shape[0]):
         q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]

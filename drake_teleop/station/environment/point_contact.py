@@ -1,10 +1,8 @@
 """Drake's compliant point contact between the tool's spheres and boxes, compiled.
 
-Normal force f_n and friction f_t (Hunt and Crossley 1975; regularised Coulomb friction) are
+With depth x, stiffness k, dissipation d, slip velocity v_t and slip speed v_s of full friction::
 
     f_n = k x (1 + d x') >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
-
-with depth x, stiffness k, dissipation d, slip velocity v_t, slip speed v_s of full friction.
 """
 
 from __future__ import annotations
@@ -51,9 +49,8 @@ class Pairs(NamedTuple):
         known: (k, 28), pairs of a sphere of the tool and a box: 0-2 centre of the sphere in S [m],
             3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead of W if
             the body moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
-            moves in W (zero if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25
-            static and dynamic friction, 26 slip speed v_s of full friction [m/s], 27 row of the
-            body in a `JointTable`, or -1.
+            moves in W (zero if fixed), 22 stiffness [N/m], 23 dissipation [s/m], 24 and 25 static
+            and dynamic friction, 26 slip speed [m/s], 27 row of the body in a `JointTable`, or -1.
         watched: (l, 40), bounding boxes of all other pairs. As above, with 0-2 the centre of the
             tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
         unknown: reason why the first of the other pairs is not in `known`.
@@ -75,7 +72,6 @@ def ContactPairs(
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
-        plant: finalized plant.
         tool: shapes of the tool -> poses of their bodies in S.
         slip: slip speed of full friction [m/s]; the plant's stiction tolerance.
         moving: indices of the bodies of a `JointTable`, row by row.
@@ -165,7 +161,7 @@ def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[fl
     for shape in (ball, box):
         if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
             raise DrakeTeleopError(
-                "has no stiffness or no dissipation",
+                "the contact material has no stiffness or no dissipation",
                 where="drake:proximity_properties",
                 remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
             )
@@ -184,7 +180,6 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 
     Args:
         pair: (28,) row of `Pairs.known`.
-        p_WS, R_WS: (3,) position [m] and (3, 3) rotation of the sensor frame S in W.
         deflection: deflection of the sheet spring [m].
         normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
@@ -231,12 +226,8 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    It is the largest gap along an edge of either box (Gottschalk 1996, without the cross products).
-
-    Args:
-        pair: (40,) row of `Pairs.watched`, for the tool's box.
-        box: (28,) this row with the present pose of the other box.
-        p_WS, R_WS, deflection: as for `indentation`.
+    `pair` (40,) is a row of `Pairs.watched`, for the tool's box; `box` (28,) is this row with the
+    present pose of the other box. The bound is the largest gap along an edge of either box.
     """
     R, between = rows(R_WS), minus(three(p_WS, 0), three(box, 13))
     between = plus(between, apply(R, three(pair, 0)))
@@ -271,11 +262,8 @@ def _friction(static: float, dynamic: float, slip: float) -> float:
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
     """Write the contact force on a sphere in its box into `force` (3,) [N].
 
-    Args:
-        pair: (28,) row of `Pairs.known`.
-        x: depth [m].
-        normal: (3,) direction out of the box.
-        velocity: (3,) velocity of the sphere at the point of contact, relative to the box [m/s].
+    `pair` (28,) is a row of `Pairs.known`, `x` the depth [m], `normal` the direction out of the
+    box, `velocity` that of the sphere at the contact, relative to the box [m/s].
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)

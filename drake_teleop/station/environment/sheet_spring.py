@@ -1,7 +1,4 @@
-"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits.
-
-The first bending mode is one degree of freedom.
-"""
+"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits."""
 
 from dataclasses import dataclass
 from xml.etree import ElementTree
@@ -41,7 +38,9 @@ class SheetSpring(Environment):
     damping_ratio: float = quantity(
         0.03, "1", 0.0, 100.0, "damping ratio of the first mode; above 1 it creeps back"
     )
-    slip: float = quantity(1e-4, "m/s", 1e-6, 1.0, "at which friction is complete (E)")
+    slip: float = quantity(
+        1e-4, "m/s", 1e-6, 1.0, "slip speed at which friction is fully developed (E)"
+    )
 
     @property
     def stiffness(self) -> float:
@@ -51,12 +50,11 @@ class SheetSpring(Environment):
 
     @property
     def effective_mass(self) -> float:
-        """Mass of the mode, 33/140 of the leaf's mass [kg] (Rayleigh, static deflection shape)."""
+        """Mass of the first bending mode, 33/140 of the leaf's mass [kg] (Rayleigh)."""
         return 33 / 140 * self.density * self.length * self.width * self.thickness
 
     @property
     def damping(self) -> float:
-        """Viscous damping of the bending mode [N s/m]."""
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
 
     @property
@@ -66,7 +64,6 @@ class SheetSpring(Environment):
 
     @property
     def moving_part(self) -> tuple[float, float, float]:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of the leaf's end."""
         return self.effective_mass, self.stiffness, self.damping
 
     @property
@@ -75,10 +72,7 @@ class SheetSpring(Environment):
         return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the leaf to a plant that is registered with a scene graph, before Finalize.
-
-        The joint "bending" is the deflection of the leaf's end along z_W [m], 0 at rest.
-        """
+        """Add the leaf to a plant; the joint "bending" is its end's deflection along z_W [m]."""
         tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
         # Drake fixes a body's mass when it parses it, so the mass is written into the text.
         tree.find(".//link[@name='leaf']/inertial/mass").text = repr(self.effective_mass)  # type: ignore[union-attr]
@@ -97,7 +91,6 @@ class SheetSpring(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude contact of the sheet's deep collision shape with all bodies except the tool."""
         leaf = plant.GetBodyByName("leaf")
         tool_bodies = BodiesOfTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]

@@ -40,19 +40,23 @@ class Slot(Environment):
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of the slot's mouth, in W"
     )
-    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "of the slot about z_W; 0: it runs along x_W")
+    yaw: float = quantity(
+        0.0, "rad", -3.15, 3.15, "angle of the slot about z_W; 0: it runs along x_W"
+    )
     clearance: float = quantity(1e-3, "m", 1e-6, 0.05, "width of the slot less the peg's")
     depth: float = quantity(0.040, "m", 0.02, 0.05, "from the mouth to the floor")
     chamfer: float = quantity(
         3e-3, "m", 5e-4, 0.015, "depth of the chamfers of 45 degrees, and their width on each side"
     )
     stiffness: float = quantity(
-        1e4, "N/m", 1e2, 1e6, "of a ball on a face, with what gives way in part and fixture (E)"
+        1e4, "N/m", 1e2, 1e6, "stiffness of a ball on a face, including part and fixture (E)"
     )
     dissipation: float = quantity(
-        1.0, "s/m", 0.0, 100.0, "of the contact, by Hunt and Crossley; as of the leaf (E)"
+        1.0, "s/m", 0.0, 100.0, "Hunt-Crossley dissipation of the contact, as of the leaf (E)"
     )
-    friction: float = quantity(0.2, "1", 0.0, 2.0, "of a ball on a face, at rest and in motion (E)")
+    friction: float = quantity(
+        0.2, "1", 0.0, 2.0, "friction coefficient of a ball on a face, at rest and in motion (E)"
+    )
 
     @property
     def width(self) -> float:
@@ -61,7 +65,6 @@ class Slot(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     @property
@@ -79,10 +82,6 @@ class Slot(Environment):
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the slot, fixed in the world, and the tool's second ball to a plant, before Finalize.
-
-        The ball has no mass. Without a scene graph there are no shapes.
-        """
         body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
         if not plant.geometry_source_is_registered():
@@ -98,7 +97,6 @@ class Slot(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Assign the slot's contact material to the tool's balls."""
         source = plant.get_source_id()
         for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
             scene_graph.AssignRole(source, ball, _material(self), RoleAssign.kReplace)

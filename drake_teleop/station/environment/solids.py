@@ -1,7 +1,4 @@
-"""Solids with Drake's point contact: fixed wall and box, movable block on a table.
-
-The block stands on balls in its corners, because a contact of two boxes is a single point.
-"""
+"""Solids with Drake's point contact: fixed wall and box, movable block on a table."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -37,27 +34,37 @@ _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 class Surface(Environment):
     """Object with a contact surface; Drake combines it with the surface of the other object.
 
-    Stiffnesses are springs in series, k1 k2 / (k1 + k2). Friction is the harmonic mean,
-    2 mu1 mu2 / (mu1 + mu2). The tool's ball has stiffness 4e5 N/m and friction 0.2.
+    Stiffnesses are springs in series; friction is the harmonic mean. The tool's ball has stiffness
+    4e5 N/m and friction 0.2.
     """
 
     stiffness: float = quantity(
-        1e4, "N/m", 1e2, 1e7, "of its surface, in series with that of the other object (E)"
+        1e4,
+        "N/m",
+        1e2,
+        1e7,
+        "stiffness of its surface, in series with that of the other object (E)",
     )
     dissipation: float = quantity(
-        1.0, "s/m", 0.0, 100.0, "of its surface, by Hunt and Crossley: damping k x d (E)"
+        1.0,
+        "s/m",
+        0.0,
+        100.0,
+        "Hunt-Crossley dissipation d of its surface: damping k x d at depth x (E)",
     )
     friction: float = quantity(
-        0.2, "1", 0.0, 2.0, "of its surface, at rest and in motion; tool and surface average (E)"
+        0.2,
+        "1",
+        0.0,
+        2.0,
+        "friction coefficient of its surface; its mean with that of the tool applies (E)",
     )
 
     @property
     def slip(self) -> float:
-        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     def material(self) -> ProximityProperties:
-        """Return the surface properties for Drake's point contact."""
         return ContactMaterial(self.stiffness, self.dissipation, self.friction)
 
 
@@ -75,7 +82,6 @@ class Box(Surface):
     size: list[float] = quantity([0.3, 0.3, 0.1], "m", 1e-3, 4.0, "lengths of its edges")
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the box to the plant, fixed in the world."""
         X_WBox = RigidTransform(RollPitchYaw(self.rotation), self.position)
         AddFixedBox(plant, "box", X_WBox, self.size, self)
 
@@ -83,14 +89,7 @@ class Box(Surface):
 def AddFixedBox(
     plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
 ) -> None:
-    """Weld a box to the world; without a scene graph it has no shape.
-
-    Args:
-        plant: not finalized.
-        name: name of body and model instance, numbered if it exists.
-        X_WBox: pose of the box.
-        size: (3,) lengths of its edges [m].
-    """
+    """Weld a box with edges `size` (3,) [m] to the world; without a scene graph it has no shape."""
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
     if plant.geometry_source_is_registered():
@@ -108,21 +107,21 @@ class Wall(Surface):
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, the middle of its face, in W"
     )
     normal: list[float] = quantity(
-        [0.0, 0.0, 1.0], "1", -1.0, 1.0, "out of the wall, in W; its length does not matter"
+        [0.0, 0.0, 1.0], "1", -1.0, 1.0, "direction out of the wall, in W, of any length"
     )
-    size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "of its face; it is 0.1 m thick")
+    size: list[float] = quantity(
+        [0.4, 0.4], "m", 1e-3, 4.0, "lengths of its face; the wall is 0.1 m thick"
+    )
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the normal is zero."""
         if np.linalg.norm(self.normal) < 1e-3:
             raise DrakeTeleopError(
-                "has no direction",
+                "is the zero vector, which has no direction",
                 where=f"{where}.normal",
                 remedy="point it to where the tool comes from, such as [0, 0, 1]",
             )
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the wall as a box behind its face, with z along the normal."""
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
         behind = RigidTransform([0.0, 0.0, -_THICKNESS / 2])
@@ -137,15 +136,14 @@ class Block(Surface):
     position: list[float] = quantity(
         [0.6, 0.0, 0.2], "m", -2.0, 2.0, "the middle of its underside at the start, in W"
     )
-    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "of the block about z_W at the start")
+    yaw: float = quantity(0.0, "rad", -3.15, 3.15, "angle of the block about z_W at the start")
     size: list[float] = quantity([0.1, 0.1, 0.1], "m", 0.01, 1.0, "lengths of its edges")
-    mass: float = quantity(0.5, "kg", 0.01, 100.0, "of the block, evenly distributed")
+    mass: float = quantity(0.5, "kg", 0.01, 100.0, "mass of the block, evenly distributed")
     table: list[float] = quantity(
         [0.5, 0.5], "m", 0.0, 4.0, "size of the table below it, of the same surface; 0: none"
     )
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the table is smaller than the block."""
         if 0.0 < min(self.table) < max(self.size[:2]):
             raise DrakeTeleopError(
                 "the table is smaller than the block",
@@ -155,13 +153,11 @@ class Block(Surface):
 
     @property
     def stand(self) -> Stand | None:
-        """Box that a 3D replay shows below the block's table; None without a table."""
         x, y, top = self.position
         across = 0.6 * min(self.table)
         return Stand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add block and table to the plant; without a scene graph they have no shapes."""
         if min(self.table) > 0.0:
             below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS / 2]
             AddFixedBox(

@@ -1,4 +1,4 @@
-"""Contact detection at the slave from the wrench without the load's part."""
+"""Contact detection at the slave: the wrench without the load's part exceeds its noise floor."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from drake_teleop.station.slave.arm import ArmModel, acceleration_into
 @settings
 @dataclass
 class ContactDetectionConfig:
-    """Settings of the contact detector; a scenario without this block has no detector."""
+    """Settings of the contact detector."""
 
     statistic: str = choice("glr", STATISTICS, "statistic that is compared with the threshold")
     margin: float = quantity(
@@ -56,9 +56,8 @@ def _update_flag(memory, sample, estimate, arm, settings):
 def update_flag(memory, sample, estimate, acceleration, settings):
     """Update the detector's memory with a sample; return whether there is contact.
 
-    Args:
-        acceleration: (3,) acceleration a of So, in S [m/s^2].
-        settings: those of a `load.contact.detection.ContactDetector`.
+    `acceleration` (3,) is the acceleration of So, in S [m/s^2]; `settings` are those of a
+    `ContactDetector`.
     """
     if not (sound(sample) and sound(estimate)):
         return memory[FLAG] != 0.0
@@ -70,7 +69,7 @@ def update_flag(memory, sample, estimate, acceleration, settings):
 
 
 class ContactDetection(LeafSystem):
-    """Detector of contact between slave and environment.
+    """Detector of contact between slave and environment, for a noise `floor` fitted at its rate.
 
     The flag keeps its value while the wrist sensor is saturated or the sensor's low-pass recovers.
 
@@ -82,13 +81,6 @@ class ContactDetection(LeafSystem):
         - load_estimate: (16,) load estimate of Eq. (7), [offsets; phi]
         output_ports:
         - contact: (1,) 1 in contact, else 0
-
-    Args:
-        floor: noise floor in free motion, fitted at the rate of this block.
-        period: time between samples [s].
-
-    Raises:
-        DrakeTeleopError: if the floor was not fitted to a motion.
     """
 
     __slots__ = ONE_DICT

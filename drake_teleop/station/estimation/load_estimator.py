@@ -59,13 +59,9 @@ class LoadEstimatorConfig:
     )
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError if the method's covariance is too small for `watch`.
-
-        `where` is the block's path for the message.
-        """
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
-                f"the covariance of '{self.method}' is too small to notice a change by",
+                f"the covariance of '{self.method}' is too small to detect a change of load",
                 where=f"{where}.method",
                 remedy="set method: rtls, or watch: false",
             )
@@ -81,21 +77,15 @@ class LoadEstimator(LeafSystem):
         - sample: the wrist sensor's sample
         output_ports:
         - load_estimate: (16,) Eq. (7), [offsets (6); phi (10)] in S about So
-        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATES`; 1, settled,
-          once the predicted uncertainty of every parameter is within the config's bound
+        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATES`
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
         motion_std: (9,) standard deviations of specific force [m/s^2], angular velocity [rad/s] and
             angular acceleration [rad/s^2], for "rtls" and for `watch`.
-        period: sampling period [s].
-        sample_size: length of the sample.
         initial: (16,) initial estimate.
         covariance: (16, 16) covariance of `initial`; with it, monitoring begins at once.
         fallback: (10,) phi to use after a change of load.
-
-    Raises:
-        DrakeTeleopError: for `watch` without `enabled` and without a covariance.
     """
 
     __slots__ = ONE_DICT
@@ -114,7 +104,7 @@ class LoadEstimator(LeafSystem):
         super().__init__()
         if config.watch and not config.enabled and covariance is None:
             raise DrakeTeleopError(
-                "there is no load to watch",
+                "there is no load to monitor: none is estimated or given with a covariance",
                 where="load_estimator.watch",
                 remedy="set load_estimator.enabled, or pass load_estimate with load_covariance",
             )

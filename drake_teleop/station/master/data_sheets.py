@@ -1,7 +1,4 @@
-"""Haptic devices by name: the paper's Phantom, and others by data sheets.
-
-A comment above the table has the sources of the numbers. Grippers and buttons are not modelled.
-"""
+"""Haptic devices by name: the paper's Phantom, and others by data sheets."""
 
 import copy
 import dataclasses
@@ -150,11 +147,7 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """Return the dynamics of the device with the hand's mass [kg] and inertia about E [kg m^2].
-
-        Raises:
-            DrakeTeleopError: if the model of a leader arm cannot be used, see `Leader.device`.
-        """
+        """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
         numbers = np.zeros(NUMBERS)
@@ -175,11 +168,10 @@ class Master:
 
     @property
     def leads_joints(self) -> bool:
-        """True if the master is a leader arm that commands the slave's joints."""
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError if a leader arm commands joints; `what`: name of the caller."""
+        """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
         if self.leads_joints:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",
@@ -200,7 +192,7 @@ class Master:
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction(self) -> "Master":
-        """Return a copy with a linear device: no Coulomb friction, no encoder steps."""
+        """Return a copy without Coulomb friction and encoder steps."""
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -212,7 +204,6 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":
-        """Return a copy in which the file paths of a leader arm are resolved from `folder`."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))
@@ -221,22 +212,21 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError for invalid combinations of fields; `where` is their path."""
         if self.model == PHANTOM and self.figures is not None:
             raise DrakeTeleopError(
-                "the Phantom's own dynamics are used, not a data sheet's",
+                "the model of the Phantom is fixed and has no data sheet",
                 where=f"{where}.figures",
                 remedy="leave them out, or choose another model, such as custom",
             )
         if self.model != PHANTOM and self.friction != JointFriction():
             raise DrakeTeleopError(
-                "these are the joints of a Phantom",
+                f"only the Phantom has joint friction, not '{self.model}'",
                 where=f"{where}.friction",
                 remedy="leave it out, and set figures.friction and figures.damping",
             )
         if (self.leader is None) == (self.model == LEADER):
             raise DrakeTeleopError(
-                "a leader arm and `model: leader` belong together",
+                "a leader arm requires `model: leader`, and this model a leader arm",
                 where=f"{where}.leader",
                 remedy="give both, with leader.file and leader.hand_frame, or none",
             )
@@ -244,13 +234,14 @@ class Master:
             self.leader.check(f"{where}.leader")
             if self.figures is not None:
                 raise DrakeTeleopError(
-                    "a leader arm has its own dynamics",
+                    "the dynamics of a leader arm are from its model file, not a data sheet",
                     where=f"{where}.figures",
                     remedy="leave them out",
                 )
         if self.figures is not None and self.figures.turn[1] > _MAX_PITCH_RAD:
             raise DrakeTeleopError(
-                f"a pitch of {self.figures.turn[1]:g} rad: there yaw and roll are the same",
+                f"the largest pitch of {self.figures.turn[1]:g} rad is too near to 90 degrees, "
+                "where the axes of yaw and roll are parallel",
                 where=f"{where}.figures.turn",
                 remedy=f"choose at most {_MAX_PITCH_RAD:g} rad",
             )
@@ -260,5 +251,4 @@ _MAX_PITCH_RAD = 1.5  # rad
 
 
 def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    """Return the data sheet of the device that a scenario's block `master` names, or None."""
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

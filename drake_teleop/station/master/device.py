@@ -1,4 +1,4 @@
-"""The haptic device as a Drake block that advances its dynamics once per period."""
+"""Haptic device as a Drake block that advances its dynamics once per period."""
 
 from __future__ import annotations
 
@@ -32,12 +32,7 @@ def _advance(device, work, stages, state, pose, twist, display, hand_wrench, dri
 def check_period(
     device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
 ) -> None:
-    """Check that one step per period [s] is stable at the joint positions q.
-
-    Raises:
-        DrakeTeleopError: if the period is above 1 ms or too long for the friction, or if q violates
-            a joint limit.
-    """
+    """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
             f"a period of {period:g} s is too long for the haptic device",
@@ -57,9 +52,9 @@ def check_period(
 
 
 class MasterDevice(DeviceBlock):
-    """Haptic device with the hand's passive mass, advanced once per period.
+    """Haptic device with the hand's passive mass.
 
-    Each period is one classical Runge-Kutta step of the nonlinear dynamics with held inputs.
+    Each period, at most 1 ms, is one classical Runge-Kutta step with held inputs.
 
     .. pydrake_system::
 
@@ -72,14 +67,6 @@ class MasterDevice(DeviceBlock):
         - pose_master: (7,) X_BE of the stylus E in the device's base B
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - for_display: (27,) joint positions (6) [rad; m], the display's memory
-
-    Args:
-        period: sampling period [s], at most 1 ms.
-        q_initial: (6,) joint positions at the start, at rest [rad; in task space m, rad].
-
-    Raises:
-        DrakeTeleopError: if the period is too long for the device or its friction, or the start
-            violates a joint limit.
     """
 
     __slots__ = ()
@@ -96,10 +83,6 @@ def AddDevice(
     device: HapticDevice | LeaderDevice,
     q_initial: NDArray[np.float64],
 ) -> tuple[LeafSystem, LeafSystem]:
-    """Add, connect and return the blocks "master_device" and "force_display" of a haptic device.
-
-    Arguments as for `MasterDevice`. The caller connects the hand's wrench and the wrench to render.
-    """
     check_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):
         block: LeafSystem = LeaderArm(period, device, q_initial)

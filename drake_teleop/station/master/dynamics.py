@@ -1,7 +1,4 @@
-"""Compiled dynamics of a haptic device: the Phantom, or a device in task space.
-
-B is the device's base frame, E the stylus frame.
-"""
+"""Compiled dynamics of a haptic device with base frame B and stylus frame E."""
 
 from __future__ import annotations
 
@@ -26,7 +23,7 @@ from drake_teleop.station.master.numbers import (
 
 @njit(cache=True)
 def jacobian_into(q, device, J):
-    """Write the Jacobian of the stylus E, rows [v; omega] in the base B, into J (6, 6)."""
+    """Write the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B, into J."""
     if device[IN_TASK_SPACE] != 0.0:
         task_space.jacobian_into(q, J)
     else:
@@ -44,7 +41,7 @@ def gravity_torque_into(q, device, out):
 
 @njit(cache=True)
 def pose_into(q, device, pose):
-    """Write the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] into `pose`."""
+    """Write the stylus pose X_BE (7,) into `pose`."""
     if device[IN_TASK_SPACE] != 0.0:
         task_space.pose_into(q, pose)
     else:
@@ -53,10 +50,7 @@ def pose_into(q, device, pose):
 
 @njit(cache=True)
 def twist_into(q, v, device, J, twist):
-    """Write the twist [v; omega] of the stylus E in the base B, J v, into `twist` (6,).
-
-    The Jacobian `J` (6, 6) is scratch.
-    """
+    """Write the twist (6,) [v; omega] of the stylus E in B into `twist`, its Jacobian into `J`."""
     jacobian_into(q, device, J)
     for i in range(6):
         twist[i] = 0.0
@@ -66,13 +60,10 @@ def twist_into(q, v, device, J, twist):
 
 @njit(cache=True)
 def step(state, hand_wrench, motor, device, period, work, stages):
-    """Advance `state` (12,) [q; v] in place by one classical Runge-Kutta step with held inputs.
+    """Advance `state` (12,) [q; v] in place by one Runge-Kutta step of `period` [s].
 
-    Args:
-        hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        motor: (6,) motor torques (or forces) at the joints.
-        period: length of the step [s].
-        work, stages: (2, 6, 6) and (3, 12) scratch.
+    `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `motor` (6,) are the motor
+    torques or forces at the joints.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
     put(stage, 0, state, 0, 12)
@@ -117,9 +108,6 @@ class HapticDevice(DisplayDevice):
     """Haptic device (Phantom or in task space) with the hand's passive mass.
 
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
-
-    Attributes:
-        numbers: (NUMBERS,) device parameters, see `numbers`.
     """
 
     numbers: NDArray[np.float64]
@@ -129,51 +117,46 @@ class HapticDevice(DisplayDevice):
 
     @property
     def friction_field(self) -> str:
-        """Name of the scenario field that contains the friction."""
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions (6,) for the force display: q (6,) itself."""
         return q
 
     @property
     def is_phantom(self) -> bool:
-        """True for the Phantom, False for a device in task space."""
         return not self.numbers[IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the joint positions (6,) for a stylus pose X_BE (7,); raise if out of reach."""
+        """Return the joint positions (6,) for a stylus pose X_BE (7,)."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
         return task_space.inverse_kinematics(pose, self.numbers)
 
     def forward_kinematics(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the stylus pose X_BE (7,) in the base B at the joint positions q (6,)."""
+        """Return the stylus pose X_BE (7,) at the joint positions q (6,)."""
         pose = np.empty(7)
         pose_into(q, self.numbers, pose)
         return pose
 
     def check_limits(self, q: NDArray[np.float64]) -> None:
-        """Raise a DrakeTeleopError if a joint position of q (6,) is outside its limits."""
         if self.is_phantom:
             phantom.check_limits(q)
         else:
             task_space.check_limits(q, self.numbers)
 
     def at_an_end(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return (N,) booleans: True where an end stop is active at q (N, 6)."""
+        """Return for each row of q (N, 6) whether an end stop is active."""
         if self.is_phantom:
             return phantom.at_an_end(q)
         return task_space.at_an_end(q, self.numbers)
 
     def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B."""
         J = np.empty((6, 6))
         jacobian_into(q, self.numbers, J)
         return J
 
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mass matrix (6, 6), including the hand, at the joint positions q (6,)."""
+        """Return the mass matrix (6, 6), including the hand."""
         if self.is_phantom:
             return phantom.mass_matrix(q, self.numbers[HAND_MASS], self.numbers[HAND_INERTIA])
         M = np.empty((6, 6))
@@ -181,7 +164,7 @@ class HapticDevice(DisplayDevice):
         return M
 
     def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
-        """Return the damping matrix D (6, 6) at q (6,): the joint forces are -D dq/dt.
+        """Return the damping matrix D (6, 6): the joint forces are -D dq/dt.
 
         With `creeping`, D includes the slope of the Coulomb friction at standstill.
         """

@@ -55,7 +55,7 @@ class Encoders(LeafSystem):
 
 
 class SampleHold(LeafSystem):
-    """Sample and hold with `period` [s]; unlike Drake's ZeroOrderHold it has a start value.
+    """Sample and hold with `period` [s]; unlike Drake's ZeroOrderHold it has a start value (n,).
 
     .. pydrake_system::
 

@@ -44,7 +44,6 @@ def _peak_wrench(numbers):
 
 
 def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the force display's input (27,) for the first period, at joint positions q (6,)."""
     display = np.zeros(_WATCH.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
     display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
@@ -53,12 +52,7 @@ def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDA
 
 @njit(cache=True)
 def limit_wrench_into(wrench, numbers, J, displayed):
-    """Write `wrench` (6,), reduced to the device's limits, into `displayed` (6,).
-
-    Both are [f; tau] at E, in B. The force is scaled to the peak force, the torque to the peak
-    torques of the wrist motors. A wrench that is not finite gives zero. J is the device's Jacobian
-    (6, 6).
-    """
+    """Write `wrench` (6,) [f; tau] at E, in B, reduced to the device's limits, into `displayed`."""
     for k in range(6):
         if not math.isfinite(wrench[k]):
             displayed[:] = 0.0
@@ -79,10 +73,7 @@ def limit_wrench_into(wrench, numbers, J, displayed):
 
 @njit(cache=True)
 def motor_torque_into(displayed, q, numbers, J, torque):
-    """Write J^T F plus gravity compensation (6,) into `torque`; F is `displayed` (6,).
-
-    J (6, 6) is the Jacobian at q (6,).
-    """
+    """Write J^T F plus gravity compensation (6,) at q (6,) into `torque`; F is `displayed` (6,)."""
     gravity_torque_into(q, numbers, torque)
     for i in range(6):
         for k in range(6):
@@ -91,14 +82,9 @@ def motor_torque_into(displayed, q, numbers, J, torque):
 
 @njit(cache=True, borrows=True)
 def display_into(wrench, device, numbers, period, J, drive):
-    """Advance the force display by one period; see `ForceDisplay` for its safe state.
+    """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
-    Args:
-        wrench: (6,) F_E_B to render.
-        device: (27,) port `for_display` of `MasterDevice`.
-        period: sampling period [s].
-        J: (6, 6) scratch.
-        drive: (27,) written: input of `MasterDevice`, with the displayed wrench and a `Fault`.
+    `device` (27,) is the port `for_display` of `MasterDevice`; `drive` (27,) is written.
     """
     q, fault = device[_POSITIONS], _NO_FAULT
     put(drive, 6, device, 6, _WATCH.stop - 6)
@@ -137,13 +123,9 @@ def _fade(device, numbers, period, drive):
 
 
 class DeviceBlock(LeafSystem):
-    """Base class of haptic devices as blocks: state, pose, twist and vector for the display.
+    """Base class of haptic devices as blocks, at rest at `q_initial` at the start.
 
-    Args:
-        device: `HapticDevice` or `LeaderDevice`.
-        q_initial: joint positions at the start, at rest.
-        advance: compiled function of `constants`, the four states, hand wrench, drive and period;
-            it writes the states after one period.
+    `advance` writes the states after one period.
     """
 
     __slots__ = ONE_DICT
@@ -188,9 +170,8 @@ class DeviceBlock(LeafSystem):
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    Safe state: with an invalid command or invalid joint positions, the displayed wrench fades to
-    zero in 50 ms; gravity compensation uses the last valid positions. Afterwards the wrench returns
-    as after silence in a channel (`station.passivity.safe_state`).
+    With invalid data, the displayed wrench fades to zero in 50 ms and returns as after silence in a
+    channel.
 
     .. pydrake_system::
 
@@ -202,10 +183,7 @@ class ForceDisplay(LeafSystem):
         - drive: (27,) for the device: J_M^T F + gravity compensation (6) [N m], memory
         - force_to_master: (6,) wrench F, displayed within the device's limits [N, N m]
         - fault_at_hand: a `Fault`
-        - displayed_and_fault: (7,) the last two ports in one vector, for a log
-
-    Args:
-        period: sampling period of the device [s].
+        - displayed_and_fault: (7,) the last two ports in one vector
     """
 
     __slots__ = ONE_DICT

@@ -1,8 +1,6 @@
-"""Leader arm: any serial arm that the operator holds as a haptic device.
+"""Leader arm: any serial arm that the operator holds at E as a haptic device.
 
-    M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
-
-The hand holds the arm at E, whose axes equal those of the base frame B at home.
+M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
 """
 
 from __future__ import annotations
@@ -56,15 +54,9 @@ _STOP_HZ = 12.0
 
 @njit(cache=True)
 def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
-    """Write the joint accelerations (n,) of leader and hand (forward dynamics) into `vdot`.
+    """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
 
-    Args:
-        arm: `ArmModel.table` of the chain from B to E, with the hand's mass.
-        joints: (8, n) joint parameters, see `LeaderDevice`.
-        q, v: (n,) joint positions and speeds [rad, rad/s].
-        applied: (6,) wrench [f; tau] on E, in B: the hand's wrench minus the hand's weight.
-        motor: (n,) motor torques [N m].
-        vdot: (n,) written [rad/s^2].
+    `applied` (6,) is the hand's wrench minus its weight [f; tau] on E, in B.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -126,16 +118,10 @@ def motors_into(bare, arm, joints, q, F, torque):
 def step_leader(
     bare, arm, joints, hand_weight, state, pose, twist, display, hand_wrench, drive, period
 ):  # fmt: skip
-    """Advance `state` (2 n,) by one Runge-Kutta step with held inputs; update pose and twist.
+    """Advance `state` (2 n,) by one Runge-Kutta step of `period` [s]; update pose and twist.
 
-    Args:
-        bare, arm: `ArmModel.table` without and with the hand.
-        joints: (8, n) joint parameters, see `LeaderDevice`.
-        hand_weight: weight of the hand [N], carried by the operator.
-        state, pose, twist, display: see the ports of `LeaderArm`; updated.
-        hand_wrench: (6,) wrench of the hand on E, in B.
-        drive: from the force display: wrench F [f; tau_z, tau_y, tau_x] (6), memory.
-        period: step [s].
+    `bare` and `arm` are `ArmModel.table` without and with the hand, whose weight `hand_weight` [N]
+    the operator carries.
     """
     n = joints.shape[1]
     put(display, 6, drive, 6, drive.shape[0] - 6)
@@ -210,12 +196,10 @@ class LeaderDevice(DisplayDevice):
 
     @property
     def num_joints(self) -> int:
-        """Number of joints n."""
         return self.arm.num_joints
 
     @property
     def constants(self) -> tuple[Array, Array, Array]:
-        """Tables of the arm without and with the hand, and `joints`, for compiled functions."""
         return self.bare.table, self.arm.table, self.joints
 
     def display_axes(self, q: Array) -> Array:
@@ -223,11 +207,7 @@ class LeaderDevice(DisplayDevice):
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """Return joint positions (n,) for X_BE (7,), searched from home.
-
-        Raises:
-            DrakeTeleopError: if the pose is out of reach.
-        """
+        """Return joint positions (n,) for X_BE (7,), searched from home."""
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
@@ -241,13 +221,11 @@ class LeaderDevice(DisplayDevice):
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
-        """Return the pose X_BE (7,) of the held point E in the base B at q (n,)."""
         pose = np.array([1.0, *np.zeros(6)])
         _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
 
     def check_limits(self, q: Array) -> None:
-        """Raise a DrakeTeleopError if a joint position of q (n,) is outside its limits."""
         for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
             raise DrakeTeleopError(
                 f"joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, its limits are"
@@ -257,21 +235,17 @@ class LeaderDevice(DisplayDevice):
             )
 
     def at_an_end(self, q: Array) -> NDArray[np.bool_]:
-        """Return (N,) booleans: True where an end stop is active at q (N, n)."""
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
-        """Return the Jacobian (6, n) of the held point E, rows [v; omega] in the base B."""
         J = np.empty((6, self.num_joints))
         jacobian(self.arm.table, np.asarray(q), J)
         return J
 
     def mass_matrix(self, q: Array) -> Array:
-        """Return the mass matrix (n, n), including the operator's hand, at q (n,)."""
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        """Return the damping matrix (n, n); `creeping` adds Coulomb friction at standstill."""
         own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 
@@ -279,10 +253,10 @@ class LeaderDevice(DisplayDevice):
 def joint_parameters(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
-    """Return the array (8, n) `LeaderDevice.joints`; end stops scale with the inertia at home.
+    """Return `LeaderDevice.joints` (8, n); the end stops scale with the inertia at home.
 
-    Vectors are (n,): start `home` [rad], friction `coulomb` [N m], `viscous` damping in addition to
-    the model's [N m s/rad], torque `limit` [N m]. `carried` is the compensated share of the weight.
+    `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
+    the model's [N m s/rad], each (n,); `carried` is the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
@@ -290,23 +264,19 @@ def joint_parameters(
 
 
 class LeaderArm(DeviceBlock):
-    """Leader arm with the hand's passive mass, advanced once per period.
+    """Leader arm with n joints and the hand's passive mass, advanced once per period.
 
     .. pydrake_system::
 
         name: LeaderArm
         input_ports:
-        - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand at E, in B [N, N m]
+        - hand_wrench_E: (6,) as for `MasterDevice`
         - drive: (27,) from `LeaderDisplay`: wrench F (6) to display, the display's memory
         output_ports:
         - state: (2 n,) [q; qdot] [rad, rad/s]
         - pose_master: (7,) X_BE
-        - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
+        - twist_master: (6,) [v; omega] of E in B
         - for_display: (27,) position of E (3), three unused zeros, the display's memory
-
-    Args:
-        period: sampling period [s].
-        q_initial: (n,) joint positions at the start, at rest.
     """
 
     __slots__ = ()
@@ -328,14 +298,14 @@ class LeaderDisplay(ForceDisplay):
 
         name: LeaderDisplay
         input_ports:
-        - wrench_command: (6,) F_E_B, [f; tau] to render at E, in B [N, N m]
+        - wrench_command: (6,) F_E_B to render
         - for_display: from `LeaderArm`
         - state: (2 n,) of `LeaderArm`
         output_ports:
         - drive: for `LeaderArm`
         - force_to_master: (6,) wrench F, displayed within the limits [N, N m]
         - fault_at_hand: a `Fault`
-        - displayed_and_fault: (7,) the last two ports in one vector, for a log
+        - displayed_and_fault: (7,) the last two ports in one vector
     """
 
     __slots__ = ()

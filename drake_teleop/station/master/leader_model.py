@@ -1,4 +1,4 @@
-"""Leader arm, which the operator holds as a haptic device, from a model file."""
+"""Leader arm from a model file, as a part of the scenario."""
 
 import dataclasses
 import math
@@ -74,10 +74,6 @@ class Leader:
     )
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError for invalid fields, without reading the model file.
-
-        `where` is the block's path for the message.
-        """
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
                 raise DrakeTeleopError(
@@ -94,7 +90,6 @@ class Leader:
                 )
 
     def found_from(self, folder: Path) -> "Leader":
-        """Return a copy in which relative paths are resolved from `folder`, as absolute paths."""
         return dataclasses.replace(
             self,
             file=str((folder / self.file).resolve()) if self.file else "",
@@ -102,24 +97,16 @@ class Leader:
         )
 
     def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
-        """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world.
-
-        Raises:
-            DrakeTeleopError: if the model cannot be read, see `ParseModel`.
-        """
+        """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world."""
         X_BBase = RigidTransform(RollPitchYaw(self.base_rotation), np.zeros(3))
         X_WBase = X_BBase if X_Table is None else X_Table @ X_BBase
         packages = tuple(map(Path, self.package_paths))
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
-        """Return the arm's dynamics with the hand's mass and inertia about E [kg, kg m^2].
+        """Return the arm's dynamics with the hand's mass [kg] and inertia about E [kg m^2].
 
         At home the hand's point E is at `position` (3,) [m] in the base frame B.
-
-        Raises:
-            DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or a list has
-                a wrong length.
         """
         plant = MultibodyPlant(0.0)
         parsed = self.parse(plant)

@@ -1,9 +1,8 @@
 """The Phantom Premium 1.5 HighForce/6DoF: kinematics and dynamics in closed form.
 
-B: base frame at the intersection of yaw and shoulder axis, z_B up, x_B towards the operator. E:
-stylus frame at the gimbal point. At `HOME` inner link and stylus point along x_B, the outer link
-down. q (6,) [rad]: yaw; inner link up from the horizontal; outer link from the downward vertical
-towards x_B (absolute: q2 rotates only the inner link); wrist yaw, pitch, roll.
+B: base frame at the intersection of yaw and shoulder axis, z up, x towards the operator. E: stylus
+frame at the gimbal point. q (6,) [rad]: yaw; inner link up from the horizontal; outer link from the
+downward vertical towards x_B (absolute); wrist yaw, pitch, roll.
 
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
     R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
@@ -99,7 +98,6 @@ def _main_mass_matrix_into(q, M):
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Write the Jacobian of the stylus E, rows [v; omega] in the base B, into J (6, 6)."""
     s1, c1 = math.sin(q[0]), math.cos(q[0])
     s2, c2 = math.sin(q[1]), math.cos(q[1])
     s3, c3 = math.sin(q[2]), math.cos(q[2])
@@ -122,11 +120,7 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
-    """Write the mass matrix with wrist, hand and reflected motors into M (6, 6).
-
-    J is the Jacobian at q. Wrist links and hand are point masses at the stylus with equal moments
-    of inertia.
-    """
+    """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
     _main_mass_matrix_into(q, M)
     M[0, 0] += _MOTOR_1
     M[1, 1] += _MOTOR_2
@@ -145,7 +139,6 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 
 @njit(cache=True)
 def gravity_torque_into(q, out):
-    """Write the torque (6,) that compensates the weight of device and wrist, without the hand."""
     weight = WRIST_MASS * GRAVITY
     out[0] = 0.0
     out[1] = (_GRAVITY_2 + weight * L1) * math.cos(q[1])
@@ -221,10 +214,7 @@ def _add_friction_and_stops(q, v, coulomb, viscous, torque):
 def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     """Write the joint accelerations (6,) of device and hand into `vdot`.
 
-    Args:
-        q, v, motor_torque: (6,) joint positions, speeds and motor torques.
-        hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        work: (2, 6, 6) scratch.
+    `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `work` is scratch.
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
@@ -241,7 +231,6 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at q (6,) into `pose`."""
     s1, c1 = math.sin(0.5 * q[0]), math.cos(0.5 * q[0])
     s3, c3 = math.sin(-0.5 * q[2]), math.cos(0.5 * q[2])
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
@@ -262,7 +251,6 @@ def pose_into(q, pose):
 
 
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Jacobian (6, 6) of the stylus E at q (6,), rows [v; omega] in the base B."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     return J
@@ -271,32 +259,25 @@ def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
 def mass_matrix(
     q: NDArray[np.float64], hand_mass: float = 0.0, hand_inertia: float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the mass matrix (6, 6) at q (6,) with wrist, reflected motors and hand."""
     M = np.empty((6, 6))
     mass_matrix_into(q, jacobian(q), hand_mass, hand_inertia, M)
     return M
 
 
 def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the torque (6,) [N m] that compensates the weight of device and wrist at q (6,)."""
     torque = np.empty(6)
     gravity_torque_into(q, torque)
     return torque
 
 
 def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
     pose = np.empty(7)
     pose_into(q, pose)
     return pose
 
 
 def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees.
-
-    Raises:
-        DrakeTeleopError: if the pose is out of reach or needs a joint beyond its limit.
-    """
+    """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees."""
     x, y, z = pose[4:7]
     reach = math.hypot(x, y)
     # Two-link arm whose second link points along q3 - 90 degrees; elbow = q2 - (q3 - 90 degrees).
@@ -320,24 +301,19 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6).
-
-    Its third joint is relative to the inner link; the device's q3 is absolute.
-    """
+    """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6)."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
 
 
 def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True where a joint or the five-bar is at an end stop, for q (N, 6)."""
     folded = q[:, 1] - q[:, 2]
     beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
     return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])
 
 
 def check_limits(q: NDArray[np.float64]) -> None:
-    """Raise a DrakeTeleopError if one of six joint angles [rad], or q2 - q3, is out of range."""
     margin = 1e-9
     for i in range(6):
         if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:

@@ -1,9 +1,6 @@
 """Haptic device defined by its data sheet: dynamics of the grip in task space.
 
-    q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
-
-Isotropic mass and inertia, friction, damping, end stops at the faces of the workspace, balanced
-weight.
+q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
 """
 
 from __future__ import annotations
@@ -39,7 +36,6 @@ _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/r
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Write the Jacobian of the grip E, rows [v; omega] in the base B, into J (6, 6)."""
     s4, c4 = math.sin(q[3]), math.cos(q[3])
     s5, c5 = math.sin(q[4]), math.cos(q[4])
     J[:, :] = 0.0
@@ -50,7 +46,6 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, device, M):
-    """Write the mass matrix (6, 6) of device and hand into M; `J` is the Jacobian at q."""
     M[:, :] = 0.0
     inertia = device[INERTIA] + device[HAND_INERTIA]
     for i in range(3):
@@ -84,7 +79,6 @@ def _penetration(x, half):
 
 @njit(cache=True)
 def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
-    """Write the accelerations (6,) of device and hand; arguments as `phantom.acceleration_into`."""
     J = work[0]
     jacobian_into(q, J)
     mass = device[MASS] + device[HAND_MASS]
@@ -124,7 +118,6 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write the grip pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at q (6,) into `pose`."""
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
@@ -140,7 +133,6 @@ def pose_into(q, pose):
 def damping_matrix(
     q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
 ) -> NDArray[np.float64]:
-    """Return the damping matrix (6, 6) at q (6,): `HapticDevice.damping_matrix` in task space."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     of_tanh = np.array([FRICTION_SPEED, FRICTION_ANGULAR_SPEED])
@@ -151,7 +143,6 @@ def damping_matrix(
 def inverse_kinematics(
     pose: NDArray[np.float64], device: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the axis positions q (6,) for the pose X_BE (7,); raise outside the workspace."""
     turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
     turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
     q = np.concatenate([pose[4:7], turns])
@@ -167,17 +158,12 @@ def _outside_workspace(
 
 
 def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True where an end stop is active at q (N, 6).
-
-    Fixed rotations have no end stop.
-    """
     return (_outside_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
         axis=1
     )
 
 
 def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
-    """Raise a DrakeTeleopError if the axis positions q (6,) are outside the workspace."""
     if _outside_workspace(q, device, 1e-9).any():
         low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))

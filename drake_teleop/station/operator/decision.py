@@ -1,7 +1,6 @@
 """Decisions of the simulated operator during a task, from vision and perceived force.
 
-The hand moves by planned displacements, and waits until their effect is visible (Ferrell 1965). All
-assumptions and sources: `docs/operator.md`.
+The hand moves by planned displacements, and waits until their effect is visible (Ferrell 1965).
 """
 
 from __future__ import annotations
@@ -60,7 +59,6 @@ class Training:
         translation_scale: displacement of the tool over displacement of the hand.
         force_gain: rendered force over true contact force.
         forward, backward: mean one-way delays [s].
-        seed: random seed of the operator's noise.
     """
 
     R_WB: Array
@@ -72,7 +70,6 @@ class Training:
 
 
 def pack_person(training: Training, perception: Perception, movement: Movement) -> Array:
-    """Return the operator's parameters (23,) for the compiled `decide`."""
     there_and_back = training.forward + training.backward + _EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
     key = float(random_bits(np.uint64(training.seed % 2**64), _STREAM))
@@ -90,7 +87,6 @@ def pack_person(training: Training, perception: Perception, movement: Movement) 
 
 
 def pack_task(task: Task) -> Array:
-    """Return the task's parameters (15,) for the compiled `decide`."""
     packed = np.zeros(_TASK)
     packed[[_KIND, _T_START, _TIMEOUT]] = KINDS.index(type(task)), task.t_start, task.timeout
     packed[_GOAL : _GOAL + 3] = task.translation
@@ -138,7 +134,6 @@ _FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floo
 
 
 def initial_memory() -> Array:
-    """Return the memory (MEMORY,) for `decide` at the start."""
     memory = np.zeros(MEMORY)
     memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
     return memory
@@ -161,8 +156,7 @@ def _random_number(person, step, draw):
 def look_into(person, step, displacement_W, seen_W):
     """Write the seen displacement of the tool from its start (3,), in W [m], into `seen_W`.
 
-    Its random error is constant for 50 steps, a fixation of the eyes. `person` is from
-    `pack_person`, `displacement_W` (3,) is the true displacement.
+    Its random error is constant for 50 steps, a fixation of the eyes.
     """
     for i in range(3):
         noise = person[_VISION_NOISE] * _random_number(person, step // _FIXATION_STEPS, 4 + i)
@@ -185,7 +179,7 @@ def _submovement(person, memory, step, time, error_W):
 
 @njit(cache=True)
 def _pressed_force(task, person, felt):
-    """Return the contact force on the tool against the axis [N], from the excess force `felt`."""
+    """Return the contact force on the tool against the axis [N]."""
     along = 0.0
     for i in range(3):
         axis_B = 0.0
@@ -217,12 +211,9 @@ def _enter_phase(state, memory, phase, ready):
 
 @njit(cache=True)
 def decide(task, person, time, seen_W, felt, state, memory):
-    """Update the operator's decisions by one step of `PERIOD`; inputs are not checked.
+    """Update the operator's decisions by one step of `PERIOD`.
 
     Args:
-        task: from `pack_task`.
-        person: from `pack_person`.
-        time: now [s].
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
         felt: (5,) output of `perceive_into`, delayed by the reaction time.
         state: (5,) phase; 1 done or -1 given up; 1 while contact is detected; detection threshold

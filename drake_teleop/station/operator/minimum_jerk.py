@@ -17,10 +17,7 @@ STOP = 0.15  # s, stopping time of the hand, estimate
 
 @njit(cache=True)
 def plan_at(plan, time, i):
-    """Return position [m], speed and acceleration of axis `i` in a plan (20,) at `time` [s].
-
-    After the plan the speed is constant.
-    """
+    """Return position [m], speed and acceleration of axis `i` in a plan (20,) at `time` [s]."""
     h = plan[1]
     u = min((time - plan[0]) / h, 1.0)
     c = plan[2 + 6 * i : 8 + 6 * i]
@@ -45,10 +42,10 @@ def add_plan_into(memory, time, pose, twist):
 
 @njit(cache=True)
 def plan_move(memory, time, length, change, end_speed):
-    """Plan a minimum-jerk motion by the displacement `change` (3,) [m] in the time `length` [s].
+    """Plan a minimum-jerk motion by `change` (3,) [m] in the time `length` [s].
 
-    It continues the present motion and ends without acceleration, with the velocity `end_speed`
-    (3,).
+    It continues the present motion and ends with the velocity `end_speed` (3,), without
+    acceleration.
     """
     plan, h = memory[PLAN : PLAN + PLAN_SIZE], length
     for i in range(3):
@@ -64,7 +61,7 @@ def plan_move(memory, time, length, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
-    """Plan a stop of the hand within `STOP` seconds, from `time` [s] on."""
+    """Plan a stop of the hand within `STOP` seconds."""
     plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]

@@ -106,7 +106,7 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
     """Return the segments of the intended motion as an array (n, 12) for compiled functions.
 
     Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
-    (3), rotation (3). A minimum-jerk move has no ramp out and the factor sin(pi / 2).
+    (3), rotation (3).
     """
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
@@ -136,8 +136,8 @@ def _ramp(time, length):
 def intent_into(packed, start, t, pose, twist):
     """Write the intended pose X_BE (7,) and twist [v; omega] (6,) of the hand at time t [s].
 
-    `packed` (n, 12) is from `pack_intent`, `start` (7,) is X_BE before the first segment.
-    Translations add; rotations apply in the order of the list, each about axes of B.
+    `start` (7,) is X_BE before the first segment. Translations add; rotations apply in the order of
+    the list, each about axes of B.
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
@@ -166,10 +166,7 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write a pose (7,) with unit quaternion into `out`; return whether the input was valid.
-
-    Valid are a finite pose and twist (6,) with a quaternion that is not zero.
-    """
+    """Write the pose (7,) with unit quaternion into `out`; return whether the input is valid."""
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -195,18 +192,13 @@ def _limit(vector, limit):
 
 @njit(cache=True)
 def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
-    """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
+    """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B, at most 60 N and 2 N m.
 
-    f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector of the shorter
-    rotation. Both are limited to 60 N and 2 N m.
-
-    Args:
-        impedance: (4,) [K, B, rotational K, rotational B].
-        intent_pose, pose: (7,) intended and actual pose X_BE.
-        intent_twist, twist: (6,) intended and actual twist [v; omega] of E in B.
+    f = K (x_intent - x) + B (v_intent - v); tau likewise. `impedance` (4,) is [K, B, rotational K,
+    rotational B].
     """
-    wanted = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
-    error = logarithm(multiply(wanted, conjugate((pose[0], pose[1], pose[2], pose[3]))))
+    intended = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
+    error = logarithm(multiply(intended, conjugate((pose[0], pose[1], pose[2], pose[3]))))
     for k in range(3):
         wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
@@ -226,17 +218,17 @@ def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
 
 
 @njit(cache=True, borrows=True)
-def _wrench_now(
-    packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
+def _hand_wrench_at(
+    packed, start, moving, memory, time, impedance, intent_pose, intent_twist, pose, twist, wrench
 ):  # fmt: skip
-    _intended_motion_into(packed, start, moving, memory, time, wanted, wanted_twist)
-    hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
+    _intended_motion_into(packed, start, moving, memory, time, intent_pose, intent_twist)
+    hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench)
 
 
 @njit(cache=True)
-def _look_feel_decide(
+def _perceive_and_decide(
     task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
-    memory, feelings, sights, touches,
+    memory, force_memory, seen_displacements, perceived_forces,
 ):  # fmt: skip
     step = int(memory[0])
     R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -245,15 +237,27 @@ def _look_feel_decide(
         displacement[i] = p_WS[i] - tip[3 + i]
         for k in range(3):
             displacement[i] += R_WS[i, k] * tip[k]
-    decision.look_into(person, step, displacement, sights[step % sights.shape[0]])
+    decision.look_into(
+        person, step, displacement, seen_displacements[step % seen_displacements.shape[0]]
+    )
     # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE] > decision.MOVING
-    felt = touches[step % touches.shape[0]]
+    felt = perceived_forces[step % perceived_forces.shape[0]]
     perceive_into(
-        feelings, senses, decision.PERIOD, hand_mass, hand_wrench[:3], twist[:3], attentive, felt
+        force_memory,
+        senses,
+        decision.PERIOD,
+        hand_mass,
+        hand_wrench[:3],
+        twist[:3],
+        attentive,
+        felt,
     )
     # The next entry to be overwritten is the oldest.
-    seen, felt = sights[(step + 1) % sights.shape[0]], touches[(step + 1) % touches.shape[0]]
+    seen, felt = (
+        seen_displacements[(step + 1) % seen_displacements.shape[0]],
+        perceived_forces[(step + 1) % perceived_forces.shape[0]],
+    )
     decision.decide(task, person, time, seen, felt, task_state, memory)
 
 
@@ -279,13 +283,8 @@ class Operator(LeafSystem):
         - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold of
           the rendered force [N], trust (with a task)
 
-    Args:
-        start: (7,) X_BE to which the intent is relative.
-        training, arm, tip: required for a task: station properties, the slave's arm, and the
-            position of the tool's tip in S and at the start in W (6,) [m].
-
-    Raises:
-        DrakeTeleopError: during simulation, if the intended motion is not finite.
+    The intent is relative to `start` (7,), X_BE. A task requires training, the slave's arm, and
+    `tip` (6,), the position of the tool's tip in S and at the start in W [m].
     """
 
     __slots__ = ONE_DICT
@@ -335,8 +334,10 @@ class Operator(LeafSystem):
     ) -> DependencyTicket:
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
-        self._sights = _ring_buffer(senses.vision_delay + training.backward, np.zeros(3))
-        self._touches = _ring_buffer(senses.reaction_time, nothing_felt)
+        self._seen_displacements = _ring_buffer(
+            senses.vision_delay + training.backward, np.zeros(3)
+        )
+        self._perceived_forces = _ring_buffer(senses.reaction_time, nothing_felt)
         self._task_parameters = (
             decision.pack_task(task),
             decision.pack_person(training, senses, config.movement),
@@ -351,8 +352,8 @@ class Operator(LeafSystem):
             np.zeros(decision.STATE),
             decision.initial_memory(),
             feeling.initial_memory(),
-            self._sights.ravel(),
-            self._touches.ravel(),
+            self._seen_displacements.ravel(),
+            self._perceived_forces.ravel(),
         )
         self._groups = [self.DeclareDiscreteState(part) for part in state]
         self.DeclareStateOutputPort("task_state", self._groups[0])
@@ -361,9 +362,9 @@ class Operator(LeafSystem):
 
     def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = [discrete_state.get_mutable_value(group) for group in self._groups]
-        state[3] = state[3].reshape(self._sights.shape)
-        state[4] = state[4].reshape(self._touches.shape)
-        _look_feel_decide(
+        state[3] = state[3].reshape(self._seen_displacements.shape)
+        state[4] = state[4].reshape(self._perceived_forces.shape)
+        _perceive_and_decide(
             *self._task_parameters,
             context.get_time(),
             self._wrench.Eval(context),
@@ -392,7 +393,7 @@ class Operator(LeafSystem):
         return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        _wrench_now(
+        _hand_wrench_at(
             *self._intention(context),
             self._memory(context),
             context.get_time(),

@@ -1,12 +1,7 @@
 """Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
-The expected force (internal model: Shadmehr and Mussa-Ivaldi, J. Neurosci. 14, 1994) is
-
-    u_expected = m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0
-
-A Kalman filter estimates m, b, c, u_0 without contact. Contact is detected if the excess u -
-u_expected reaches the absolute threshold and the Weber fraction of recent expected forces. See
-`docs/operator.md`.
+A Kalman filter estimates the expected force m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 without
+contact (`docs/operator.md`). A larger force beyond the threshold is contact.
 """
 
 import math
@@ -51,9 +46,15 @@ class Perception:
     bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "bandwidth of perceived force and motion")
     reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "from a force to the hand's reaction")
     vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "from vision to the hand's reaction")
-    vision_noise: float = quantity(0.5e-3, "m", 0.0, 0.1, "of a perceived position, at the tool")
-    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "of the perceived distance of a surface")
-    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of the perceived position of a slot, lateral")
+    vision_noise: float = quantity(
+        0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
+    )
+    depth_error: float = quantity(
+        2e-3, "m", 0.0, 0.1, "standard deviation of the perceived distance of a surface"
+    )
+    aim_error: float = quantity(
+        1e-3, "m", 0.0, 0.1, "standard deviation of the perceived lateral position of a slot"
+    )
 
     def parameters(self, dt: float) -> Array:
         """Return (4,) Weber fraction, threshold [N], and decay and smoothing factors per step."""
@@ -63,7 +64,6 @@ class Perception:
 
 
 def initial_memory() -> Array:
-    """Return the memory (MEMORY_SIZE,) of the force perception at the start."""
     memory = np.zeros(MEMORY_SIZE)
     memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
     return memory
@@ -71,15 +71,12 @@ def initial_memory() -> Array:
 
 @njit(cache=True)
 def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, attentive, out):
-    """Update the operator's force perception by one step; inputs are not checked.
+    """Update the operator's force perception by one step of `dt` [s].
 
     Args:
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
-        parameters: (4,) from `Perception.parameters`.
-        dt: time since the last step [s].
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
-        hand_force: (3,) force of the hand on the stylus [N].
-        velocity: (3,) velocity of the stylus, in the same axes [m/s].
+        hand_force, velocity: (3,) force of the hand on the stylus [N], its velocity [m/s].
         attentive: if false, update only the expectation and detect no contact.
         out: (5,) written: force on the hand beyond the expected one (3) [N], threshold [N], 1 if
             contact is detected.
@@ -161,17 +158,13 @@ def perceive(
 
     Args:
         t: (N,) evenly spaced times [s].
-        hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s], in the
-            same axes, as in the signals `hand_wrench_E` and `twist_master`.
+        hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s].
         hand_mass: mass of the hand that moves with the stylus [kg].
         attentive: start time of detection [s]; before, only the expectation is updated.
 
     Returns:
         (N, 5) force on the hand beyond the expected one (3) [N], threshold [N], 1 while contact is
             detected.
-
-    Raises:
-        DrakeTeleopError: for wrong shapes, values that are not finite, or times not increasing.
     """
     rows = {"hand_force": (hand_force, 3), "velocity": (velocity, 3)}
     _, (force, speed) = checked_rows(**rows)

@@ -105,14 +105,11 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Raise a DrakeTeleopError if the target is too near to the tool's start.
-
-    The least distance is the target's radius or the standoff. `where` is the block's path.
-    """
+    """Raise a DrakeTeleopError if the target's radius or standoff contains the tool's start."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:
         raise DrakeTeleopError(
-            f"the target is {task.distance:g} m away, not more than {least:g} m",
+            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m",
             where=f"{where}.translation",
-            remedy="set the target farther from where the tool starts",
+            remedy="choose a target farther from the tool's start",
         )

@@ -1,6 +1,6 @@
 """Least-squares fit of a contact's stiffness k and damping b, with forgetting.
 
-Each piece of displacement adds one equation: change of force = k displacement + b change of speed.
+Each displacement adds one equation: change of force = k displacement + b change of speed.
 """
 
 from __future__ import annotations
@@ -15,14 +15,9 @@ _RIDGE = 0.05
 
 @njit(cache=True)
 def update_fit(sums, force_change, displacement, speed_change, keep):
-    """Add one piece of displacement to the fit; return stiffness [N/m] and damping [N s/m].
+    """Add one displacement [m] to the fit; return stiffness [N/m] and damping [N s/m].
 
-    Args:
-        sums: (NUM_SUMS,) products of displacement, speed change and force change; updated.
-        force_change: change of the contact force [N].
-        displacement: displacement into the contact [m], not 0.
-        speed_change: change of the speed into the contact [m/s].
-        keep: weight of the previous sums, 0 to 1.
+    `sums` (NUM_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
     """
     for i in range(NUM_SUMS):
         sums[i] *= keep
@@ -41,17 +36,10 @@ def update_fit(sums, force_change, displacement, speed_change, keep):
 
 @njit(cache=True)
 def smooth_slip(displayed, component, explained, share, max_slip):
-    """Return the force to render along the contact's mean direction [N], without steps by slips.
+    """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
-    A slip changes this component of the contact wrench w by up to f^2 / |w|, with the friction f.
-    Up to this size, changes that depth and speed do not explain are rendered gradually.
-
-    Args:
-        displayed: result of the last step [N].
-        component: component of w along the mean direction, at least 0 [N].
-        explained: change that depth and speed explain [N].
-        share: share of the remaining change that is rendered in this step.
-        max_slip: f^2 / |w| for the largest recent f [N].
+    `component` [N] is the measured force. Its changes that depth and speed explain (`explained`)
+    are rendered at once; of the others only a `share`, up to the size `max_slip`.
     """
     displayed += explained
     displayed += min(share, 1.0) * (component - displayed)
@@ -60,12 +48,9 @@ def smooth_slip(displayed, component, explained, share, max_slip):
 
 @njit(cache=True)
 def slip_change(force_change, largest_change, max_slip):
-    """Return the part of a force change that no stiffness explains, but a slip may [N].
+    """Return the part of a force change [N] that a slip may cause, at most `max_slip`.
 
-    Args:
-        force_change: change of the contact force during a displacement [N].
-        largest_change: change that the largest stiffness would cause by this displacement [N].
-        max_slip: largest size of the result [N].
+    `largest_change` [N] is the change that the largest stiffness would cause.
     """
     rest = force_change - min(max(force_change, min(largest_change, 0.0)), max(largest_change, 0.0))
     return min(max(rest, -max_slip), max_slip)

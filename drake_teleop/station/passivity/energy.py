@@ -1,8 +1,4 @@
-"""Energy through a port of the station, computed from recorded wrenches f and poses x.
-
-The work of a step from x_(k-1) to x_k uses the wrench `held` f_(k-1) (exact for hand and motors),
-`backward` f_k (the balance of TDPA and wave variables) or the `mean` of both (contact).
-"""
+"""Energy through a port of the station, computed from recorded wrenches f and poses x."""
 
 from __future__ import annotations
 
@@ -23,27 +19,24 @@ PAIRS = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 
 def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
-    """Return the cumulative work of a wrench on a moving body, for translation and rotation.
+    """Return the cumulative work (N, 2) of a wrench on a moving body, translation and rotation [J].
 
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
         pair: wrench of step k: `held` f_(k-1), `backward` f_k or `mean` of both.
 
-    Returns:
-        (N, 2) sums of f . dx and tau . log(R_k R_(k-1)^T) [J], 0 at the first sample.
-
     Raises:
         DrakeTeleopError: for an unknown pair or arrays of wrong shape.
     """
     if pair not in PAIRS:
         raise DrakeTeleopError(
-            f"there is no pair '{pair}'", where="pair", remedy=f"choose one of {', '.join(PAIRS)}"
+            f"'{pair}' is unknown", where="pair", remedy=f"choose one of {', '.join(PAIRS)}"
         )
     wrench, pose = np.ascontiguousarray(wrench, float), np.ascontiguousarray(pose, float)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or pose.shape != (len(wrench), 7):
         raise DrakeTeleopError(
-            f"wrench {wrench.shape} and pose {pose.shape} do not fit",
+            f"wrench has the shape {wrench.shape} and pose {pose.shape}",
             where="wrench, pose",
             remedy="give (N, 6) and (N, 7)",
         )
@@ -66,21 +59,18 @@ def _work_into(wrench, pose, share, work):
 def created(energy: Array) -> Array:
     """Return the energy created up to each sample: the running maximum of max(0, -energy) [J].
 
-    Args:
-        energy: (N, ...) net energy that flowed into an element, which starts without energy [J].
+    `energy` (N, ...) is the net energy that flowed into an element without initial energy [J].
     """
     return np.maximum.accumulate(np.maximum(-np.asarray(energy), 0.0), axis=0)
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """Energy balance of a passivity method at one end of the channel.
+    """Energy balance of a passivity method at one end of the channel, each (..., 2) [J].
 
     Attributes:
-        stored: energy that this end may still release. All fields are (..., 2), for translation and
-            rotation [J].
-        received: energy received from the other end so far.
-        sent: energy sent so far.
+        stored: energy that this end may still release, for translation and rotation.
+        received, sent: total energy received from, and sent to, the other end.
         lost: energy removed from the loop (damper, overflow, withheld work).
     """
 
@@ -91,16 +81,13 @@ class Ledger:
 
 
 def ledger(memory: Array) -> Ledger:
-    """Return the energy balance that one end's memory (..., MEMORY) contains.
+    """Return the energy balance of one end's memory (..., MEMORY), 0 for methods without one.
 
-    It is 0 for methods without one.
-
-    Raises:
-        DrakeTeleopError: if the last dimension of `memory` is not MEMORY.
+    A wrong shape raises a DrakeTeleopError.
     """
     if memory.shape[-1] != MEMORY:
         raise DrakeTeleopError(
-            f"memory {memory.shape} is not one", where="memory", remedy=f"give (..., {MEMORY})"
+            f"has the shape {memory.shape}", where="memory", remedy=f"give (..., {MEMORY})"
         )
     stored, received, sent, lost = (
         memory[..., places].copy() for places in (LEDGER, RECEIVED, SENT, LOST)

@@ -1,6 +1,6 @@
 """Passivity method "local_force_limit": bounds force and torque rendered at the hand.
 
-There is no energy balance. An unstable loop stays unstable, but its limit cycle is bounded.
+Without an energy balance, an unstable loop stays unstable, but its limit cycle is bounded.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -28,13 +28,11 @@ class ForceLimitConfig:
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[_LOCAL_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
         limit(wrench, g, p[_LOCAL_LIMIT][g])
@@ -43,5 +41,4 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)

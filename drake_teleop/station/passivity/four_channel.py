@@ -50,28 +50,34 @@ class FourChannelConfig:
         "N/m, N m/rad",
         0.0,
         1e6,
-        "of C_m, between the hand and the received pose of the slave",
+        "stiffness of C_m, the spring between the hand and the received pose of the slave",
     )
-    damping: list[float] = quantity([10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "of C_m")
+    damping: list[float] = quantity(
+        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damping of C_m, likewise"
+    )
     slave_feedback: float = quantity(
-        0.0, "1", -1.0, 10.0, "C5: the slave's own contact force; 1 + C5 is C3, the hand's force"
+        0.0,
+        "1",
+        -1.0,
+        10.0,
+        "C5, gain of the contact force at the slave; that of the hand's force is C3 = 1 + C5",
     )
     hand_feedback: float = quantity(
-        0.0, "1", -1.0, 10.0, "C6: the hand's own force; 1 + C6 is C2, the contact force"
+        0.0,
+        "1",
+        -1.0,
+        10.0,
+        "C6, gain of the hand's force at the master; that of the contact force is C2 = 1 + C6",
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
         p[_SLAVE_FEEDBACK], p[_HAND_FEEDBACK] = self.slave_feedback, self.hand_feedback
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet, which contains the hand's measured wrench.
-
-    Arguments: `methods.master_step`.
-    """
+    """Compute the rendered wrench and the packet, which contains the hand's measured wrench."""
     difference = memory[_DIFFERENCE]
     difference[:] = 0.0
     connected = arrived(received)
@@ -91,7 +97,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     if arrived(received):
         shift = memory[_DIFFERENCE]
         for i in range(6):

@@ -1,7 +1,6 @@
-"""Passivity method "ledger" with an energy balance at the slave's actual motion: master's end.
+"""Master's end of the passivity method "ledger", whose energy balance is at the slave's motion.
 
-docs/theory.md, "The energy ledger", has equations, guarantees, constants, and the steps M1 to M7
-(master) and S1 to S6 (slave, in `ledger_slave`).
+docs/theory.md, "The energy ledger", has its equations and the steps M1 to M7 and S1 to S6.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -125,7 +124,7 @@ class LedgerConfig:
         "J",
         0.0,
         1e3,
-        "E_0, energy in both ledgers at the start; drag earns the rest of the reserves",
+        "E_0, energy of both ends together at the start; the drag adds the rest of the reserves",
     )
     reserve: list[float] = quantity(
         [0.1, 0.01],
@@ -145,7 +144,6 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
@@ -163,7 +161,7 @@ def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
 
 
 def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the slave's largest speed (2,) that its reserve of energy permits [m/s, rad/s].
+    """Return the largest speed (2,) of the slave that its energy reserve permits [m/s, rad/s].
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
@@ -173,7 +171,6 @@ def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     velocity, offset_to_slave = memory[OWN_VELOCITY], wrench  # overwritten below
     smooth_velocity(twist, min(T / _VELOCITY_FILTER_S, 1.0), memory)
     memory[_WALL_DEPTH] += work_along(memory[_INWARD], dx)
@@ -223,7 +220,7 @@ def _update_hand_ledger(g, dx, in_contact, p, memory):
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     """Write the predicted contact wrench (M2, M3) into `wrench`.
 
-    `offset_to_slave` (6,) is the pose of the hand minus the slave's pose without a wall.
+    `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
     contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_STIFFNESS)
@@ -296,7 +293,6 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 @njit(cache=True)
 def _find_slave_step(received, memory):
-    """Write the displacement of the received pose since the last step into the memory."""
     last = memory[_LAST_SLAVE_POSE]
     difference_into(received[POSE], last, memory[_SLAVE_STEP])
     put(last, 0, received, POSE.start, 7)
@@ -304,7 +300,7 @@ def _find_slave_step(received, memory):
 
 @njit(cache=True)
 def _add_friction(T, size, force, received, dx, p, memory, wrench):
-    """Write the friction (6,) into `wrench`: model of the hand plus the model's error (T68)."""
+    """Write the friction (6,) into `wrench`: model at the hand plus the model's error (T68)."""
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
     slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
     normal = memory[NORMAL]
@@ -347,7 +343,6 @@ def _friction_stiffness(g, p):
 
 @njit(cache=True)
 def _remove_normal(wrench, p, memory):
-    """Remove the component of `wrench` (6,) along the direction of the contact."""
     normal = memory[NORMAL]
     component = component_along(wrench, normal, p)
     for i in range(6):
@@ -391,7 +386,7 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _opposing_share(g, dx, T, p, memory):
-    """Return the share of a wrench against the motion that the master's energy permits, 0 to 1."""
+    """Return the share, 0 to 1, of a wrench against the motion that the master's energy permits."""
     if memory[LEDGER][g] >= _LEAST_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]

@@ -112,7 +112,7 @@ _DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(
 
 @njit(cache=True)
 def smooth_velocity(twist, share, memory):
-    """Low-pass the velocity of this end in `memory`; `share` is the weight of the new twist."""
+    """Low-pass the velocity in `memory`; `share` is the weight of the new `twist`."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -120,7 +120,6 @@ def smooth_velocity(twist, share, memory):
 
 @njit(cache=True)
 def is_contact(wrench, p):
-    """Return whether force or torque of the wrench exceeds the contact threshold."""
     threshold = p[CONTACT_THRESHOLD]
     return length(wrench, 0) > threshold[0] or length(wrench, 1) > threshold[1]
 
@@ -139,7 +138,7 @@ def work_along(wrench, displacement):
 
 @njit(cache=True)
 def find_direction(wrench, round_trip, T, p, memory):
-    """Update the mean direction of the contact; return the component of `wrench` (6,) along it [N].
+    """Update the contact's mean direction; return the component of `wrench` (6,) along it [N].
 
     The direction is a unit wrench. A much larger or opposite wrench replaces the mean at once.
     """
@@ -162,7 +161,7 @@ def find_direction(wrench, round_trip, T, p, memory):
 
 @njit(cache=True)
 def receive(g, received, memory):
-    """Add newly received energy to this end's balance for group `g`; return this energy [J]."""
+    """Add newly received energy to this end's balance for group `g`; return it [J]."""
     new = new_energy(g, received, memory)
     memory[LEDGER][g] += new
     return new
@@ -170,7 +169,6 @@ def receive(g, received, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = arrived(received)
     memory[_PERIOD] = T
@@ -255,7 +253,7 @@ def _servo_lag(p):
 
 @njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
-    """Return k_d, the largest stiffness that is rendered to the hand (S3) [N/m]."""
+    """Return k_d (S3), the largest contact stiffness that is rendered to the hand [N/m]."""
     normal, fill_level = memory[NORMAL], 0.0
     depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
@@ -455,7 +453,6 @@ def _step_servo_model(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Limit the motors' energy for a changed command; see `methods.command_sent`."""
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_motor_energy(command, pose, twist, p, memory):

@@ -7,33 +7,22 @@ PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` f
 
 
 class Slots:
-    """Allocator of consecutive places in a vector: hands out indices and slices.
-
-    Args:
-        size: length of the vector.
-        first: index of the first place.
-    """
+    """Allocator of consecutive places in a vector of `size` numbers, from index `first`."""
 
     def __init__(self, size: int, first: int = 0) -> None:
         self._size, self._next = size, first
 
     def number(self) -> int:
-        """Reserve one place and return its index."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
-        """Reserve `length` places and return their slice.
-
-        Raises:
-            IndexError: if fewer places remain.
-        """
+        """Reserve `length` places and return their slice."""
         first, self._next = self._next, self._next + length
         if self._next > self._size:
-            raise IndexError(f"{self._next} numbers do not fit into {self._size}")
+            raise IndexError(f"the vector has {self._size} places, {self._next} are required")
         return slice(first, self._next)
 
     def rest(self) -> slice:
-        """Reserve all remaining places and return their slice."""
         return self.vector(self._size - self._next)
 
 
@@ -72,10 +61,9 @@ _METHOD = _parameters.rest()
 
 
 def own_memory() -> Slots:
-    """Return an allocator for a method's own part of the memory; this part starts with zeros."""
+    """Return an allocator for a method's own part of the memory, which starts with zeros."""
     return Slots(MEMORY, _OWN.start)
 
 
 def own_parameters() -> Slots:
-    """Return an allocator for a method's own part of the parameter vector."""
     return Slots(PARAMETERS, _METHOD.start)

@@ -1,9 +1,7 @@
 """Passivity methods by name, their parameters, and one step of each end of the channel.
 
-Ports: at the master the wrench to render and the motion of its command (after kinematic scaling,
-before the channel); at the slave the wrench of contact (with sigma > 0 also of the load) and the
-actual motion, all in world axes W. Wrenches are in the *master's power units*: wrench times motion
-of the slave's command is the work at the hand, docs/theory.md (T29).
+All poses, twists and wrenches are in world axes W. Wrenches are in the *master's power units*:
+wrench times motion of the slave's command is the work at the hand, docs/theory.md (T29).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -82,8 +80,7 @@ class PassivityMethod(NamedTuple):
         balance_at_motors: the energy balance is at the slave's motors, not at its command.
         needs_arm_mass: `slave_mass` and servo are by default those of the arm at the start.
         needs_load_apart: the ends need the load's part of the wrench, `load_wrench_B`.
-        speed_limit: `speed_limit(config, slave_mass)` [m/s, rad/s] (2,) of the slave by the
-            `reserve` and `hand_reserve` of the method's settings; a run warns above it.
+        speed_limit: function of config and slave mass: largest speed of the slave [m/s, rad/s].
     """
 
     master_step: Any
@@ -204,7 +201,6 @@ class PassivityConfig(Methods, _CommonConfig):
     """
 
     def check(self, where: str) -> None:
-        """Raise a DrakeTeleopError for invalid parameters of a registered method."""
         METHODS.check(self.method, f"{where}.method")
         self.of_method(where)
 
@@ -213,8 +209,11 @@ class PassivityConfig(Methods, _CommonConfig):
         schema = METHODS[self.method].config
         if schema is None:
             if self.registered:
-                what = f"'{self.method}' has its own fields, or no parameters"
-                raise DrakeTeleopError(what, where=f"{where}.registered")
+                raise DrakeTeleopError(
+                    f"'{self.method}' is no registered method",
+                    where=f"{where}.registered",
+                    remedy="leave it out; a shipped method has its own block of parameters",
+                )
             return getattr(self, _FIELDS[self.method]) if self.method in _FIELDS else None
         for name in self.registered:
             check_name(schema, name, f"{where}.registered.{name}")
@@ -229,15 +228,12 @@ def parameters(
     power_scale: Sequence[float] = (1.0, 1.0),
     motion_scale: Sequence[float] = (1.0, 1.0),
 ) -> NDArray[np.float64]:
-    """Return the parameters of the selected method as one vector for the compiled steps.
+    """Return the parameters (PARAMETERS,) of the selected method for the compiled steps.
 
     Args:
         power_scale: (2,) factors from the slave's wrench to the master's power units, for force and
             torque: force scale over kinematic scale.
         motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
-
-    Returns:
-        (PARAMETERS,) vector in the layout of `memory`.
     """
     p = np.zeros(PARAMETERS)
     p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
@@ -257,12 +253,7 @@ def initial_memory(
 ) -> NDArray[np.float64]:
     """Return the memory (MEMORY,) of one end of the channel before its first step.
 
-    Args:
-        parameters: result of `parameters`.
-        pose: (7,) slave's pose X_WS at the start, its command until a packet arrives.
-
-    Raises:
-        DrakeTeleopError: for an unknown method.
+    `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives.
     """
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(MEMORY)
@@ -283,7 +274,6 @@ _master_step, _slave_step, _command_sent = map(
 
 
 def steps_of(method: str) -> tuple[int, int, int]:
-    """Return the addresses of a method's `master_step`, `slave_step` and `command_sent`."""
     return _addresses(*METHODS[method][:3])
 
 
@@ -315,18 +305,15 @@ def master_step(
     """Compute the wrench to render at the hand and the packet of one step at the master's end.
 
     Args:
-        steps: result of `steps_of(method)`.
         received: (PACKET_SIZE,) newest packet of the slave; zeros before the first.
         fresh: True if the packet is new.
         pose: (7,) commanded pose X_WS, after kinematic scaling, before the channel.
         twist: (6,) twist of this command [v; omega], in W.
         dx: (6,) increment of this command since the last step [dp; log(R_k R_(k-1)^T)], in W.
-        hand: (6,) wrench of the hand on the device, in W and master's power units; only
-            `four_channel` uses it.
-        limits: (2,) largest force and torque, in the master's power units [N, N m].
+        hand: (6,) wrench of the hand on the device, in W; only `four_channel` uses it.
+        limits: (2,) largest force and torque [N, N m].
         T: time between steps [s].
-        p: (PARAMETERS,) result of `parameters`.
-        memory: (MEMORY,) memory of this end, updated.
+        p, memory: parameters and memory of this end; memory is updated.
         wrench: (6,) written: wrench to render; 0 if an input is not finite.
         packet: (PACKET_SIZE,) written: packet to send.
     """
@@ -347,13 +334,10 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
     """Compute the slave's command and the packet of one step at the slave's end.
 
     Args:
-        steps, received, fresh, T, p, memory, packet: as for `master_step`, with the master's
-            packet.
-        pose: (7,) actual pose X_WS of the slave.
-        twist: (6,) actual twist of the slave [v; omega], in W.
+        received, fresh, T, p, memory, packet: as for `master_step`, with the master's packet.
+        pose, twist: (7,) and (6,) actual pose X_WS and twist [v; omega] of the slave, in W.
         dx: (6,) increment of this pose since the last step, in W.
-        wrench: (6,) wrench on the slave from contact, with sigma > 0 also from the load, in W and
-            master's power units.
+        wrench: (6,) wrench on the slave from contact, with sigma > 0 also from the load, in W.
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
             finite, it is the last pose with zero twist.
     """
@@ -371,13 +355,9 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 
 @njit(cache=True)
 def command_sent(steps, requested, command, pose, twist, p, memory):
-    """Report to the method the command that is sent; a stop by the safe state may have changed it.
+    """Update the method's memory if the safe state changed the method's command.
 
-    Args:
-        steps: result of `steps_of(method)`.
-        requested: (7,) command X_WS of the method.
-        command: (7,) command after the safe state; the method may change it.
-        pose, twist: (7,) and (6,) actual pose and twist of the slave, in W.
-        p, memory: as for `master_step`.
+    `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
+    the method may change.
     """
     _command_sent(steps[2], requested, command, pose, twist, p, memory)

@@ -1,7 +1,4 @@
-"""Passivity method "none": wrench and pose are passed on unchanged.
-
-Delay or loss creates energy in this channel. It is the baseline for comparisons.
-"""
+"""Passivity method "none": wrench and pose are passed on unchanged, a baseline for comparisons."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ from drake_teleop.station.passivity.packet import POSE, VELOCITY, WRENCH, arrive
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     requested = received[WRENCH]
     for i in range(6):
         wrench[i] = requested[i]
@@ -25,7 +21,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     if arrived(received):
         put(memory, COMMAND_POSE.start, received, POSE.start, 7)
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)

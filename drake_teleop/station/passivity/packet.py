@@ -1,4 +1,4 @@
-"""Layout of a packet, (38,) float64, and small vector operations of all passivity methods.
+"""Layout of a packet, (38,) float64, and vector operations of all passivity methods.
 
 Vectors (6,) have two *groups* g of three: 0 is translation, 1 rotation.
 """
@@ -56,7 +56,6 @@ def new_energy(g, received, memory):
 
 @njit(cache=True)
 def fill(pose, twist, wrench, packet):
-    """Write the sender's pose (7,), twist (6,) and wrench (6,) into the packet."""
     now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
     for i in range(7):
         now[i] = pose[i]
@@ -66,28 +65,25 @@ def fill(pose, twist, wrench, packet):
 
 @njit(cache=True)
 def dot(a, b, g):
-    """Return the scalar product of group `g` (0: translation, 1: rotation) of two vectors (6,)."""
     i = 3 * g
     return a[i] * b[i] + a[i + 1] * b[i + 1] + a[i + 2] * b[i + 2]
 
 
 @njit(cache=True)
 def length(a, g):
-    """Return the norm of group `g` (0: translation, 1: rotation) of the vector `a` (6,)."""
     i = 3 * g
     return math.hypot(math.hypot(a[i], a[i + 1]), a[i + 2])
 
 
 @njit(cache=True)
 def scale(a, g, s):
-    """Multiply group `g` (0: translation, 1: rotation) of the vector `a` (6,) by `s`."""
     for i in range(3 * g, 3 * g + 3):
         a[i] *= s
 
 
 @njit(cache=True)
 def limit(a, g, most):
-    """Shorten group `g` of the vector `a` (6,) to at most the length `most`, in its direction."""
+    """Shorten group `g` of the vector `a` (6,) to at most the length `most`."""
     size = length(a, g)
     if size > most:
         scale(a, g, most / size)
@@ -95,7 +91,6 @@ def limit(a, g, most):
 
 @njit(cache=True)
 def finite(a):
-    """Return whether every number of the vector is finite."""
     rest = 0.0
     for x in a:
         rest += x - x  # NaN if any x is not finite

@@ -1,7 +1,6 @@
 """Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
-A spring pulls each end to a set position, which moves as near to the requested one as the stored
-energy permits. The energy balance holds if K and D of the servo are configured correctly.
+A spring pulls each end to a set position, as near to the requested one as the energy permits.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -55,9 +54,13 @@ _OFFSET, _REQUESTED = _places.vector(6), _places.vector(6)
 class PspmConfig:
     """Parameters of the passive set-position modulation."""
 
-    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "E at the start")
+    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
-        [0.015, 3e-4], "J", 0.0, 1e6, "largest E; the rest is sent to the slave, which discards it"
+        [0.015, 3e-4],
+        "J",
+        0.0,
+        1e6,
+        "largest E; the master sends the rest to the slave, the slave discards it",
     )
     stiffness: list[float] = quantity(
         [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"
@@ -67,14 +70,12 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Write the initial energy of one channel end into its memory."""
     memory[LEDGER] = p[_INITIAL]
 
 
@@ -103,7 +104,6 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     offset, requested, received_wrench = memory[_OFFSET], memory[_REQUESTED], received[WRENCH]
     K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
@@ -124,7 +124,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
@@ -144,7 +143,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Adopt the command that is sent as the spring's set position; see `methods.command_sent`."""
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
     K, D = p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, offset)

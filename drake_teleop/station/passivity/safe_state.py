@@ -1,8 +1,7 @@
 """Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
 An end is *silent* without new packets of a healthy sender for `timeout` seconds, or if data of
-either end are not finite or beyond 1e6 in SI units. Both ends begin silent. A silent master fades
-the wrench to zero; a silent slave stops.
+either end are not finite or beyond 1e6 in SI units.
 """
 
 from __future__ import annotations
@@ -39,9 +38,9 @@ _LAST_COMMAND, _PREVIOUS_COMMAND = (
 
 
 def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """Return the state (MASTER_WATCH,) of the master's silence monitor before the first packet.
+    """Return the silence monitor (MASTER_WATCH,) of the master before the first packet.
 
-    With `full` (2,), the device's limits [N, N m], it is the state of normal operation.
+    With `full` (2,), the device's limits [N, N m], it is that of normal operation.
     """
     watch = np.zeros(MASTER_WATCH)
     if full is None:
@@ -52,7 +51,7 @@ def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.
 
 
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the initial state (SLAVE_WATCH,) of the slave's silence monitor, with its command."""
+    """Return the silence monitor (SLAVE_WATCH,) of the slave; `pose` (7,) is its first command."""
     watch = np.zeros(SLAVE_WATCH)
     watch[SILENT] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
@@ -70,17 +69,12 @@ def _update_silence(alive, fault, T, watch):
 
 @njit(cache=True)
 def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
-    """Write the limits of the rendered wrench for this step: they fall to zero during silence.
+    """Write the limits (2,) of the rendered wrench [N, N m]; they fall to zero during silence.
 
-    Args:
-        alive: whether a new packet of a healthy slave came at this step.
-        fault: whether the hand's data are not finite, or a new packet reports this of the slave.
-        T: time between steps [s].
-        timeout: time without packets until the end is silent [s].
-        full: (2,) the device's limits [N, N m].
-        held: (6,) wrench displayed since the last step [N, N m].
-        watch: (MASTER_WATCH,) monitor state, updated.
-        limits: (2,) written: largest force and torque [N, N m].
+    `alive` means that a new packet of a healthy slave came; `fault` that data of the hand or the
+    slave are not finite. `timeout` [s] is the time without packets until the end is silent, `full`
+    (2,) the device's limits, `held` (6,) the displayed wrench. `watch` is the silence monitor,
+    updated.
     """
     _update_silence(alive, fault, T, watch)
     connected = watch[SILENT] <= timeout
@@ -102,15 +96,10 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
 
 @njit(cache=True)
 def slave_command_into(alive, fault, T, timeout, requested, watch, command):
-    """Write the command that is sent to the slave at this step; during silence it stops.
+    """Write the command X_WS (7,) that is sent to the slave; during silence the slave stops.
 
-    Args:
-        alive: whether a new packet of a healthy master came at this step.
-        fault: whether the slave's data are not finite, or a new packet reports this of the hand.
-        T, timeout: as for `master_limits_into`.
-        requested: (7,) pose X_WS from the passivity method.
-        watch: (SLAVE_WATCH,) monitor state, updated.
-        command: (7,) written: commanded pose X_WS.
+    `requested` (7,) is the pose from the passivity method; other arguments as for
+    `master_limits_into`.
     """
     _update_silence(alive, fault, T, watch)
     last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]
@@ -146,16 +135,9 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def retreat(twist, T, p, memory, wrench):
-    """Reduce a rendered wrench that pushes the hand, so that a released hand stays slow.
+    """Reduce a wrench (6,) that pushes the hand, so that a released hand stays slow.
 
-    For hand speeds along the wrench between `RETREAT` and twice this, it falls to 0. While the hand
-    decelerates, the slave's inertial force remains.
-
-    Args:
-        twist: (6,) twist of the command before the channel [v; omega], in W.
-        T: time between steps [s].
-        p, memory: parameters and memory of the master's end; memory is updated.
-        wrench: (6,) in W and the master's power units, updated.
+    It falls to 0 for hand speeds along the wrench between `RETREAT` and twice this.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)
     for i in range(6):

@@ -1,8 +1,7 @@
 """Time-domain passivity approach (TDPA) of a delayed two-port, docs/theory.md, (T31), (T32), (T44).
 
-Passivity is guaranteed at the hand and the slave's *command*, for the `backward` work of module
-`energy`. `charged_tdpa` adds a drag on the hand that stores energy in free motion (Franken et al.
-2011), and a filter of the slave's wrench.
+`charged_tdpa` adds a drag on the hand that stores energy (Franken et al. 2011) and a filter of the
+slave's wrench.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -92,7 +91,11 @@ class TdpaConfig:
     """Parameters of the time-domain passivity approach."""
 
     release: float = quantity(
-        0.02, "s", 0.0, 10.0, "time in which a shortened wrench may come back (force-jump filter)"
+        0.02,
+        "s",
+        0.0,
+        10.0,
+        "time in which a reduced wrench returns to its full value (force-jump filter)",
     )
     drain_rate: float = quantity(
         200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may use in a second"
@@ -126,7 +129,6 @@ class TdpaConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
@@ -134,13 +136,12 @@ class TdpaConfig:
 
 
 def charged() -> TdpaConfig:
-    """Return the parameters of `charged_tdpa`, TDPA with drag on the hand, for a medium grip."""
+    """Return the parameters of `charged_tdpa`, for a medium grip."""
     return TdpaConfig(reserve=[0.06, 1e-3], drag=[0.28, 3e-3], hand_stiffness=[300.0, 1.5])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     for g in range(2):
         memory[LEDGER][g] += new_energy(g, received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
@@ -211,7 +212,6 @@ def _account_for_work(g, drained, p, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     for g in range(2):
         memory[LEDGER][g] += new_energy(g, received, memory)
     put(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
@@ -311,7 +311,6 @@ def _account_command(command, sign, memory):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Correct the energy balance for a changed command; see `methods.command_sent`."""
     for i in range(7):
         if command[i] != requested[i]:
             _account_command(requested, -1.0, memory)

@@ -1,8 +1,6 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-The tank of each end must cover the energy that the wrench can use until the next step. It is never
-overdrawn if hand and walls accelerate less than `acceleration` and if servo and mass are configured
-correctly.
+The tank of each end covers the energy that the wrench can use until the next step.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -83,7 +81,6 @@ class TwoLayerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[_SEND], p[_DRAIN] = self.send_rate, self.drain_rate
         p[_INITIAL], p[_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
         p[_DAMPER], p[ACCELERATION] = self.damper, self.acceleration
@@ -91,7 +88,6 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Write the tank's initial energy into the memory of one channel end."""
     memory[LEDGER] = p[_INITIAL]
 
 
@@ -126,7 +122,6 @@ def _limit_to_tank(f, dx, g, acceleration, T, memory):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     _exchange(received, dx, T, p, memory, packet)
     ledger, requested = memory[LEDGER], received[WRENCH]
     for g in range(2):
@@ -145,7 +140,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     spring, brake = memory[_SPRING_WRENCH], memory[_BRAKE_WRENCH]
     _exchange(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
@@ -181,7 +175,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Store the servo's wrench for the command that is sent; see `methods.command_sent`."""
     spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, spring)
     for i in range(6):

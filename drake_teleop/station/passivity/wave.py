@@ -1,8 +1,7 @@
 """Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991), theory.md (T33) to (T36).
 
-The receiver outputs the integral of the wave through a filter, within the received energy
-(Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold create no
-energy at the hand and the slave's *command*, for the `backward` work of module `energy`.
+The receiver filters the integral of the wave within the received energy, so jitter and loss create
+no energy.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -63,11 +62,17 @@ class WaveConfig:
     """Parameters of the wave variables."""
 
     impedance: list[float] = quantity(
-        [10.0, 0.05], "N s/m, N m s/rad", 1e-6, 1e6, "b of the line, translation and rotation"
+        [10.0, 0.05],
+        "N s/m, N m s/rad",
+        1e-6,
+        1e6,
+        "wave impedance b, for translation and rotation",
     )
-    filter: float = quantity(0.003, "s", 0.0, 10.0, "time constant of the filter of either wave")
+    filter: float = quantity(
+        0.003, "s", 0.0, 10.0, "time constant of the filter of the received wave, at both ends"
+    )
     matching: float = quantity(
-        1.0, "1", 0.0, 100.0, "damper at the slave's end over b; 1: no reflection"
+        1.0, "1", 0.0, 100.0, "damping at the slave's end divided by b; at 1 it reflects no wave"
     )
     patience: float = quantity(
         0.03,
@@ -81,14 +86,13 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the parameter vector `p`."""
         p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
         p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 
 
 @njit(cache=True)
 def _play(received, T, p, memory, wave):
-    """Write the wave (6,) of this step, taken from the integral of the received wave (T34)."""
+    """Write the wave (6,) of this step, the filtered rate of the received wave integral (T34)."""
     ledger, played = memory[LEDGER], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
@@ -107,7 +111,6 @@ def _play(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
     catching_up, newest = memory[_CATCHING_UP], received[SEQUENCE]
@@ -154,7 +157,6 @@ def _limit_change(g, energy, dx, most, held, wrench):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
     if memory[FILL_TIME] > 0.0:

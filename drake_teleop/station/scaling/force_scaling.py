@@ -1,4 +1,4 @@
-"""Scaling of the slave's wrench for the master, and removal of the load's wrench (Figs. 2, 4)."""
+"""Scaling of contact wrench and load's wrench from slave to master (Figs. 2 and 4 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
 
 
 class Scales(NamedTuple):
-    """Scales of a wrench: shares of inertia and weight, of gripper and object; and of contact."""
+    """Factors of the wrench's parts: sigma for inertia, weight for weight, gamma for contact."""
 
     sigma_gripper: float
     sigma_object: float
@@ -56,7 +56,6 @@ class Scales(NamedTuple):
 
     @property
     def shares(self) -> tuple[float, float, float, float]:
-        """Shares of the inertias and weights."""
         return self.sigma_gripper, self.sigma_object, self.weight_gripper, self.weight_object
 
 
@@ -84,12 +83,7 @@ class ForceScalingConfig:
     )
 
     def scales(self, where: str = "force_scaling") -> Scales:
-        """Return the scales of gripper, object and contact.
-
-        Raises:
-            DrakeTeleopError: if eta is given without gripper_phi, sigma = 0 and gamma = 1 (section
-                V), or with another sigma; `where` is the block's path.
-        """
+        """Return the scales of gripper, object and contact; raise for an eta that does not fit."""
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
             weights, inertias = weight_and_inertia_scales(self.sigma, self.sigma, *separate)
@@ -97,18 +91,17 @@ class ForceScalingConfig:
         alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
         if not alone or self.gripper_phi is None:
             raise DrakeTeleopError(
-                "eta works on the object alone",
+                "eta cannot be combined with these fields, because it scales the object alone",
                 where=f"{where}.eta",
                 remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper), and leave "
                 "sigma_weight and sigma_inertia out",
             )
-        gripper, thing, gamma = scales_from_eta(self.eta)
-        return Scales(gripper, thing, gamma, gripper, thing)
+        gripper, grasped, gamma = scales_from_eta(self.eta)
+        return Scales(gripper, grasped, gamma, gripper, grasped)
 
 
 @njit(cache=True)
 def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
-    """Write the result of `wrench_to_master` for one wrench (6,) into `out` (6,); compiled."""
     for part in range(2):
         scale = torque_scale if part == 1 else force_scale
         base = 3 * part
@@ -124,19 +117,15 @@ def wrench_to_master(
     force_scale: float,
     torque_scale: float,
 ) -> NDArray[np.float64]:
-    """Return the wrench to render at the master for a wrench at the slave's sensor.
+    """Return the wrench to render (..., 6): the scaled reaction to the sensor's wrench.
 
-    It is the reaction, rotated and scaled: for a load that is held up, the hand is pulled down.
+    It is F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
 
     Args:
         wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
         R_WS: (..., 3, 3) orientation of the sensor.
         R_WB: (3, 3) alignment of the master's base B with the world.
-        force_scale: force at the master over force at the slave.
-        torque_scale: torque at the master over torque at the slave.
-
-    Returns:
-        (..., 6) F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
+        force_scale, torque_scale: value at the master over value at the slave.
     """
     R_BS = np.swapaxes(R_WB, -1, -2) @ R_WS
     force = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., :3])
@@ -146,13 +135,9 @@ def wrench_to_master(
 
 @njit(cache=True)
 def scales_at(change, time, scales):
-    """Write the six scales at `time`: a minimum-jerk blend from old to new scales.
+    """Write the six scales at `time` [s]: a minimum-jerk blend from old to new scales.
 
-    Args:
-        change: (14,) old scales (6), new scales (6), start of the change [s], duration [s].
-        time: present time [s].
-        scales: (6,) written: sigma_gripper, sigma_object (of the inertia), gamma, force scale,
-            shares of the weight of gripper and object.
+    `change` (14,) contains old scales (6), new scales (6), start of the change [s], duration [s].
     """
     u = min(max((time - change[12]) / change[13], 0.0), 1.0) if change[13] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
@@ -180,13 +165,9 @@ def _scaled_into(sample, estimate, gripper, arm, scales, out):
 
 @njit(cache=True)
 def fault_of(sample, estimate, time, valid_range):
-    """Return the code (`Fault`) of the first fault in a sample and a load estimate.
+    """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
-    Args:
-        sample: sample of the wrist sensor, see `drake_teleop.load.regressor`.
-        estimate: (16,) [offsets; phi].
-        time: present time [s].
-        valid_range: (7,) largest wrench [N, N m], largest age [s].
+    `valid_range` (7,) contains the largest wrench [N, N m] and age [s].
     """
     if not abs(time - sample[TIME]) <= valid_range[6]:
         return _STALE
@@ -231,8 +212,7 @@ class ForceScaling(LeafSystem):
     """Scaling of contact wrench and load's wrench, and transformation to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj) has contact wrench F_c, regressor V,
-    and inertial parameters phi of gripper and object. `SetScales` changes the scales during a
-    simulation.
+    and inertial parameters phi of gripper and object.
 
     .. pydrake_system::
 
@@ -244,10 +224,10 @@ class ForceScaling(LeafSystem):
         - scaled_wrench_S: scaled wrench F' of Fig. 2
         - contact_wrench_S: contact wrench F_c of Eq. (13)
         - fault: `Fault` of sample or estimate
-        - scaled_contact_and_fault: the three above in one vector, for a log
+        - scaled_contact_and_fault: the three above in one vector
         - non_contact_wrench_S: wrench of the load (weight and inertia), Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
-        - load_wrench_B: part of wrench_B from weight and inertia of the load, zero for sigma = 0
+        - load_wrench_B: part of wrench_B from weight and inertia of the load
 
     Args:
         config: initial scales.
@@ -307,11 +287,8 @@ class ForceScaling(LeafSystem):
     ) -> None:
         """Change the scales, beginning now, on a minimum-jerk ramp of `duration` [s].
 
-        The ramp starts at the present scales, also during an earlier change. `sigma_weight` is the
-        share of the weight of both parts; without it the other sigmas scale weight and inertia.
-
-        Raises:
-            DrakeTeleopError: for a scale or duration that is negative or not finite.
+        `sigma_weight` is the share of the weight of both parts; without it the other sigmas scale
+        weight and inertia.
         """
         both = sigma_gripper, sigma_object
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)

@@ -17,7 +17,7 @@ class JointCoupling(LeafSystem):
     """Coupling of the slave's joint positions to those of the leader arm, with a clutch.
 
     While the clutch is open the commanded joints are constant. When it closes they follow the
-    leader again with a jump; `JointFollower` limits the speed.
+    leader again with a jump.
 
     .. pydrake_system::
 
@@ -29,13 +29,7 @@ class JointCoupling(LeafSystem):
         - leader_joints: (n,) commanded joint positions of the slave [rad]
         - pose_command: (7,) X_WS for these joints
 
-    Args:
-        start: (n,) joints of the slave when the leader is at `home` [rad].
-        home: (n,) joints of the leader [rad].
-        period: sampling period of the clutch [s].
-
-    Raises:
-        DrakeTeleopError: if the numbers of joints differ.
+    The slave has the joints `start` when the leader is at `home`, (n,) [rad].
     """
 
     __slots__ = ONE_DICT

@@ -36,27 +36,20 @@ class KinematicScalingConfig:
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
-    """Return the quaternion of the rotation about the same axis by `scale` times the angle.
-
-    For a scale that is not an integer the result jumps where the angle passes 180 degrees.
-    """
+    """Return the quaternion of the rotation about the same axis by `scale` times the angle."""
     v = logarithm(rotation)
     return exponential((scale * v[0], scale * v[1], scale * v[2]))
 
 
 @njit(cache=True)
 def scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out):
-    """Write the commanded pose X_WS (7,) of the slave into `out`.
+    """Write the commanded pose X_WS (7,) of the slave into `out`, which may be `command`.
 
         p_WS = p_command + translation_scale R_WB (p_BE - p_master)
         R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
 
-    Args:
-        pose: (7,) present pose X_BE of the master.
-        master: (7,) pose X_BE when the clutch was closed.
-        command: (7,) commanded X_WS when the clutch was closed.
-        alignment: (4,) quaternion of R_WB.
-        out: (7,) written; the quaternion has norm 1. It may be `command` itself.
+    `pose` is the present X_BE of the master, `master` and `command` are X_BE and X_WS when the
+    clutch was closed, `alignment` is the quaternion of R_WB.
     """
     R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
     offset = rotate(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
@@ -84,8 +77,8 @@ class KinematicScaling(DoubleOnly, LeafSystem):
     """Scaling of the master's motion into the slave's commanded pose, with a clutch.
 
     While the clutch is open the command is constant. When it closes, the master's present pose is
-    the new reference, so the command does not jump. The clutch keeps its state while the master's
-    pose is not finite.
+    the new reference, so the command does not jump. The clutch keeps its state while the
+    master's pose is not finite.
 
     .. pydrake_system::
 

@@ -1,12 +1,10 @@
 """Estimated motion of the sensor frame S (long: each source with its delay and noise).
 
-It is specific force s of the origin So, angular velocity omega and acceleration alpha. Sources:
+Sources of specific force s of So, angular velocity omega and acceleration alpha:
 
 - `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
 - `accelerometer` (default, as in the paper): measured s and alpha, omega from encoders.
 - `fused`: a steady-state Kalman filter per axis integrates s and alpha, corrected by the encoders.
-
-Faster paths wait for the slowest one, so that a sample belongs to one instant.
 """
 
 from dataclasses import dataclass
@@ -99,9 +97,7 @@ class MotionEstimationConfig:
 class Delays:
     """Delays of the signal paths at low frequencies [s].
 
-    Args:
-        wrench, acceleration, encoders: delay of each path before it waits for slower ones.
-        sample: delay of a sample, equal to that of the slowest path in use.
+    `sample` is the delay of the slowest path in use, for which the others wait.
     """
 
     wrench: float
@@ -116,8 +112,7 @@ class SteadyState:
 
     Attributes:
         gains: (3,) gains of the innovation for position [1], rate [1/s], acceleration [1/s^2].
-        innovation_std, position_std: standard deviations of innovation and estimated position, in
-            the position's unit.
+        innovation_std, position_std: standard deviations, in the position's unit.
         crossover_hz: the accelerometer dominates above this frequency, the positions below it.
     """
 
@@ -130,16 +125,13 @@ class SteadyState:
 def steady_state(
     position_std: float, acceleration_std: float, drift: float, period: float
 ) -> SteadyState:
-    """Return the Kalman filter for a measured position x and acceleration a with the error e.
-
-    The model is x_k = x_{k-1} + T v_k, v_k = v_{k-1} + T (a_{k-1} - e_{k-1} - noise). The gains
-    follow by spectral factorisation (Anderson and Moore, Optimal Filtering, ch. 9).
+    """Return the Kalman filter for a measured position x and acceleration a with a drifting error.
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
         acceleration_std: standard deviation of a measured acceleration [that unit / s^2].
-        drift: random walk of e [that unit / s^2 / sqrt(s)], positive.
-        period: sampling period T [s].
+        drift: random walk of the error [that unit / s^2 / sqrt(s)], positive.
+        period: sampling period [s].
     """
     white = (acceleration_std * period**2 / position_std) ** 2
     walk = (drift * period**2.5 / position_std) ** 2
@@ -164,7 +156,6 @@ def steady_state(
 
 
 def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, period: float) -> Delays:
-    """Return the delays of all signal paths and of the sample, for a sampling period [s]."""
     wrench, acceleration, encoders = sensor.delays(period)
     encoders += _group_delay(_filters(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
@@ -188,11 +179,7 @@ def motion_gains(
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> NDArray[np.float64]:
-    """Return standard deviations (9,) of specific force, angular velocity and its derivative.
-
-    Units are m/s^2, rad/s (counted as exact) and rad/s^2. A low-pass after the converter is
-    excluded.
-    """
+    """Return standard deviations (9,) of s [m/s^2], omega (exact) [rad/s] and alpha [rad/s^2]."""
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
         return np.concatenate([s_std, np.zeros(3), alpha_std])
@@ -218,7 +205,7 @@ def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
 def _accelerometer_std(
     sensor: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return standard deviations (3,) of s, moved to So (adds alpha x r), and (3,) of alpha."""
+    """Return standard deviations (3,) of the specific force at So, and (3,) of alpha."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
@@ -230,11 +217,6 @@ def _accelerometer_std(
 def motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return constants and initial memory of `estimate_into` for an arm with n joints.
-
-    Raises:
-        DrakeTeleopError: if the encoders' bandwidth is 0.45 of the sensor's rate or more.
-    """
     delays = path_delays(config, sensor, period)
     paths = np.array([delays.wrench, delays.acceleration, delays.encoders])
     used = np.array([True, config.source != "encoders", True])
@@ -285,13 +267,10 @@ def _group_delay(sections: NDArray[np.float64]) -> float:
 
 @njit(cache=True)
 def estimate_into(constants, memory, arm, reading, sample):
-    """Convert one reading of the sensor to one sample whose values belong to a single instant.
-
-    Call it once per period. At the first reading all filters settle on it, at rest.
+    """Convert one reading of the sensor, one per period, to a sample of a single instant.
 
     Args:
         constants, memory: results of `motion_estimator`; memory is updated.
-        arm: `ArmModel.table` of an arm with n joints.
         reading: (13 + n,) output of `sensor_chain.read_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
@@ -313,10 +292,9 @@ def estimate_into(constants, memory, arm, reading, sample):
 
 @njit(cache=True)
 def estimate_with_gyroscope_into(constants, memory, reading, sample):
-    """Convert one reading to one sample without an arm's kinematics.
+    """Convert one reading to one sample without an arm's kinematics (source `accelerometer`).
 
-    Arguments as for `estimate_into` with source `accelerometer`, but the first three of the n
-    "joint angles" are the measured angular velocity of S, in S [rad/s].
+    The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
     n = sample.shape[0] - JOINT_POSITION.start
     motion = memory[_MOTION:_JOINTS]

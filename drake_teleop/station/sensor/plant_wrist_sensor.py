@@ -1,9 +1,7 @@
 """Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
 
-The wrench is the reaction of the weld, the motion that of the sensor frame S. Both come from the
-plant's output ports, so joints, contact and controllers are arbitrary. With sampled output ports
-(Drake's default for discrete plants) reaction and acceleration belong to the state before a step,
-pose and velocity to the state after it; the block holds pose and velocity to pair the four.
+With sampled output ports, reaction and acceleration belong to the state before a step; the block
+holds pose and velocity of this state to pair them.
 """
 
 from __future__ import annotations
@@ -139,9 +137,7 @@ def AddWristSensor(
 class PlantWristSensor(DoubleOnly, LeafSystem):
     """Sensor of force, torque and motion of S at a weld of a plant, see `AddWristSensor`.
 
-    The outputs hold the last sample, which belongs to the instant `sample_time`. The angular
-    velocity is that of an ideal gyroscope on the path of the joint encoders: their low-pass, delay
-    and rounding, no noise. Faster paths wait for the slowest one.
+    The outputs hold the last sample, which belongs to the instant `sample_time`.
 
     .. pydrake_system::
 
@@ -156,7 +152,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         output_ports:
         - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So, Eq. (1) [N, N m]
         - specific_force_S: (3,) a - g of So [m/s^2]
-        - angular_velocity_S: (3,) [rad/s]
+        - angular_velocity_S: (3,) [rad/s], of an ideal gyroscope with the encoders' delay
         - angular_acceleration_S: (3,) [rad/s^2]
         - status: 0 valid; 1 a channel is saturated; 2 and above no sample yet, or an impossible one
         - joint_position: (n,) positions q
@@ -345,11 +341,10 @@ def _steps(step: float | None, period: float | None) -> tuple[float, int]:
 
 
 def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple[Frame, WeldJoint]:
-    """Return the sensor frame S and the weld beyond it."""
     expect((Joint, Frame), joint_or_frame, f"{_WHERE}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         raise DrakeTeleopError(
-            f"'{joint_or_frame.name()}' is of another plant",
+            f"'{joint_or_frame.name()}' belongs to another plant",
             where=f"{_WHERE}: joint_or_frame",
             remedy="pass a joint or frame of this plant",
         )
@@ -384,10 +379,7 @@ def _joints(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
-    """Return the arm's body at the weld, and all bodies of the load.
-
-    The load is on the side of the weld that is not connected to the world.
-    """
+    """Return the arm's body at the weld, and all bodies on the other side, the load."""
     neighbours: dict[BodyIndex, list[BodyIndex]] = {}
     for joint in _joints(plant):
         if joint.index() != weld.index():

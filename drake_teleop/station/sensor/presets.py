@@ -103,9 +103,6 @@ accordingly.
 
 
 def preset_of(block: Mapping[str, Any] | None) -> WristSensorConfig:
-    """Return the default settings for a scenario's block `wrist_sensor`, from its `preset`.
-
-    An unknown name gives the general defaults; the check of the loaded block rejects it.
-    """
+    """Return the default settings for a scenario's block `wrist_sensor`, from its `preset`."""
     name = (block or {}).get("preset")
     return copy.deepcopy(PRESETS.get(str(name), WristSensorConfig()))

@@ -163,27 +163,17 @@ class WristSensorConfig:
         )
 
     def largest_wrench(self) -> NDArray[np.float64]:
-        """Return the largest plausible readings (6,) of force and torque [N, N m].
-
-        They are 1.5 ranges for a sensor that saturates, else 10.
-        """
+        """Return the largest plausible readings (6,) of force and torque [N, N m]."""
         share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
-        """Return standard deviations (6,) of force and torque in raw samples [N, N m].
-
-        They contain noise and quantisation, and are at least 1e-6.
-        """
+        """Return standard deviations (6,) of force and torque by noise and quantum [N, N m]."""
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> NDArray[np.float64]:
-        """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2].
-
-        They contain noise and quantisation of raw samples; the angular velocity omega counts as
-        exact.
-        """
+        """Return standard deviations of s [m/s^2], omega (exact) and alpha [rad/s^2], (9,)."""
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
@@ -200,11 +190,7 @@ class WristSensorConfig:
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
     def delays(self, period: float) -> NDArray[np.float64]:
-        """Return the delays (3,) of wrench, acceleration and encoder readings [s].
-
-        They are latencies plus, for wrench and acceleration, the low-pass's group delay at zero
-        frequency.
-        """
+        """Return the delays (3,) of wrench, acceleration and encoder readings [s]."""
         delays = self.latencies(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
             for b0, b1, b2, a1, a2 in butterworth_sections(self.bandwidth_hz, 1 / period):
@@ -213,10 +199,6 @@ class WristSensorConfig:
         return delays
 
     def check(self, where: str, rate_hz: float) -> None:
-        """Raise a DrakeTeleopError for an invalid R_SA or a bandwidth too high for the rate [Hz].
-
-        `where` is the block's path for the message.
-        """
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
@@ -261,18 +243,14 @@ PARTS: dict[str, dict[str, Any]] = {
 def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
     """Return a copy of the configuration without some parts of the sensor (keys of `PARTS`).
 
-    >>> without(WristSensorConfig(), "noise", "offset").force_noise
-    0.0
+    >>> without(WristSensorConfig(), "noise", "offset").force_noise 0.0
     """
     changes = {name: value for part in parts for name, value in PARTS[part].items()}
     return dataclasses.replace(config, **copy.deepcopy(changes))
 
 
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
-    """Return the sections (2, 5) [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass.
-
-    Bilinear, prewarped, each section with unit gain at zero frequency, as `settle` requires.
-    """
+    """Return the sections (2, 5) [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass."""
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_SECTIONS, 5))
     for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
@@ -291,14 +269,10 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 def calibration_matrices(
     config: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return matrices that multiply true values by the calibration errors.
+    """Return matrices that multiply true values by the calibration errors, drawn with seed `unit`.
 
-    Each is (1 + gains + cross-talk) times the rotation of the misalignment, drawn with the seed
-    `unit`.
-
-    Returns:
-        (6, 6) for [f; tau] in S, (3, 3) for specific force in A, (3, 3) for angular acceleration in
-            A.
+    They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
+    in A.
     """
     random = np.random.default_rng(config.unit)
     gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
@@ -350,8 +324,7 @@ def sensor_chain(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `read_into` for an arm with n joints.
 
-    `constants[OFFSET]` is the wrench's offset [N, N m], which may change during a run. `memory[0]`
-    counts samples.
+    `constants[OFFSET]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer()
@@ -390,10 +363,7 @@ def sensor_chain(
 
 @njit(cache=True)
 def is_plausible(constants, truth):
-    """Return whether the true values are finite and do not overload the sensor.
-
-    Arguments as for `read_into`. A NaN offset marks a dead channel.
-    """
+    """Return whether the true values are finite and do not overload the sensor."""
     good = True
     for i in range(6):
         good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOADS + i]
@@ -404,9 +374,7 @@ def is_plausible(constants, truth):
 
 @njit(cache=True)
 def read_into(constants, memory, noise, truth, reading):
-    """Convert true values to the sensor's reading at one instant.
-
-    Call it once per period. At the first sample filters and delay lines settle on it.
+    """Convert true values to the sensor's reading at one instant, once per period.
 
     Args:
         constants, memory: results of `sensor_chain`; memory is updated.
@@ -512,13 +480,7 @@ def _convert(constants, first, end, channels):
 
 @njit(cache=True)
 def low_pass(sections, memory, values):
-    """Apply second-order sections in series to `values` in place (transposed direct form II).
-
-    Args:
-        sections: (5 k,) [b0, b1, b2, a1, a2] of each section; sections with b0 = 1 are skipped.
-        memory: (2 k n,) state of the filter, updated.
-        values: (n,) one value of each channel.
-    """
+    """Apply the second-order `sections` (5 k,) in series to `values` (n,) in place."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):
         b0, b1, b2 = sections[5 * k], sections[5 * k + 1], sections[5 * k + 2]

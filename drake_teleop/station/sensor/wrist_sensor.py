@@ -97,13 +97,8 @@ _USE_CONTACT_LAW = np.zeros(0)
 def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     """Write the true wrench and motion [f, tau, s, omega, alpha] of S into `out` (15,).
 
-    Args:
-        arm: `ArmModel.table` of an arm with n joints.
-        phi: (10,) inertial parameters of the tool.
-        q, v, vdot: (n,) joint positions, speeds and accelerations.
-        contact_W: (6,) wrench of the environment on the tool about the world's origin, in W, which
-            is subtracted from that of Eqs. (1)-(2).
-        motion: (21,) scratch.
+    `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
+    `phi` (10,) are the tool's inertial parameters.
     """
     sensor_motion(arm, q, v, vdot, motion)
     put(out, MOTION.start, motion, 0, 9)
@@ -183,7 +178,7 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 
 @njit(cache=True)
 def _torque_at(held, after, torque):
-    """Write the motor torque (n,) at the time now + `after` [s]; `held` as in `sample_step`."""
+    """Write the motor torque (n,) at the time now + `after` [s]."""
     put(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -201,19 +196,16 @@ def sample_step(
             acceleration by gravity; `JointTable` of other moving bodies, wrenches from Drake).
         sensor: (chain's constants, estimator's constants, start of its memory, start of the tail,
             ideal).
-        period: sampling period [s].
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         around: present [deflection and rate of the sheet, plant's state if other bodies move].
         held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
-        applied_W: (6,) additional wrench on the tool, see `environment_wrench`.
+        applied_W: (6,) additional wrench on the tool.
         memory: [last two samples (16 + n each) | chain's | estimator's | tail: samples taken,
             length of the queue, time and x of each step's end in it].
-        touching_W: (6,) contact wrench on the tool now, from the plant, about the world's origin,
-            in W; or (0,) to calculate it with `physics`.
-        scratch: (9, 2 n + 6 + size of the plant's state).
-        result: written: [last sample before now (16 + n) | its time [s] | memory with now's end as
-            the only queue entry].
+        touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
+            calculate it with `physics`.
+        result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
     size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
@@ -293,19 +285,10 @@ class WristSensor(LeafSystem):
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
-        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | its time [s] |
-          memory]
+        - step: [the last sample before now (16 + n) | its time [s] | memory]
 
-    Args:
-        slave: the plant; source of the tool's true inertial parameters and contact shapes.
-        period: sampling period [s].
-        held: duration for which the motors hold a torque, or its rate [s].
-        q_start: (n,) joint angles at rest before the first sample [rad].
-        ramps: True if the motors hold a rate.
-
-    Raises:
-        DrakeTeleopError: during simulation, if a force that the sensor does not receive moves the
-            arm, because its samples would be wrong.
+    The motors hold a torque, or with `ramps` its rate, for the duration `held` [s]. A force that
+    the sensor does not receive raises a DrakeTeleopError during simulation.
     """
 
     __slots__ = ONE_DICT
@@ -399,12 +382,11 @@ class WristSensor(LeafSystem):
 
     @property
     def contact_pairs(self) -> Array:
-        """Table (k, 28) of pairs of shapes that can touch, see `Pairs`; a view."""
         return self._physics[2]
 
     @property
     def beyond(self) -> str:
-        """Reason why contact is outside the compiled contact law, or "", see `Contact`."""
+        """Reason why contact is outside the compiled contact law, or ""."""
         return self._beyond_contact_law
 
     @property
@@ -415,10 +397,7 @@ class WristSensor(LeafSystem):
 
     @property
     def remembered(self) -> NDArray[np.intp]:
-        """Indices of the numbers in the discrete state that depend on the motion.
-
-        Counters, flags, random walks and the sample before the last one are excluded.
-        """
+        """Indices of the numbers in the discrete state that depend on the motion."""
         _, _, chain_end, end, _ = self._sensor
         size = sample_size(self._n)
         before_and_walks = range(size, 2 * size + FILTERED)
@@ -426,7 +405,6 @@ class WristSensor(LeafSystem):
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
-        """Take the samples due before the present time and store the resulting discrete state."""
         seen = self._states(context)
         self._sample(
             context, seen, self._contact_level(*seen), False, _USE_CONTACT_LAW, self._result
@@ -561,7 +539,7 @@ class WristSensor(LeafSystem):
             1.0 + np.abs(vdot).max()
         ):
             raise DrakeTeleopError(
-                f"at {context.get_time():g} s an unknown force moves the slave",
+                f"at {context.get_time():g} s the slave is moved by a force that is not connected",
                 where="wrist_sensor.applied_wrench_W",
                 remedy="connect every wrench on the tool to this port",
             )
@@ -588,13 +566,9 @@ def AddCompiledWristSensor(
     *,
     ramps: bool = False,
 ) -> dict[str, OutputPort]:
-    """Add the block "wrist_sensor", its noise source, and demultiplexers of its output.
+    """Add the block "wrist_sensor" with its noise source; return the ports by name.
 
-    Arguments as for `WristSensor`. The caller must connect state, acceleration and torque of the
-    arm.
-
-    Returns:
-        The output ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
+    The caller must connect state, acceleration and torque of the arm.
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
