@@ -31,9 +31,9 @@ _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
 def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
-    """Return motion and load of a log with poses, and the source of its delay.
+    """Return motion and load of a log with poses, and the source of the delay.
 
-    `delay` is that of the motion behind the wrench [s], or "auto".
+    `delay` of the motion behind the wrench is in [s], or "auto".
     """
     return _with_delay(log, delay, lambda late: _estimate(log, late), 0.0, "undetermined")
 
@@ -41,14 +41,11 @@ def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
 def motion_of_known_load(
     log: Log, delay: str | float, load: Array, usual_s: float
 ) -> tuple[PoseMotion, str] | None:
-    """Return the motion with which an identified load fits best, and the source of its delay.
+    """Return the motion from poses that fits an identified load best, and the source of the delay.
 
-    None without positions, for a short record, and if an IMU disagrees with the poses.
-
-    Args:
-        delay: of the motion behind the wrench [s], or "auto".
-        load: (6, 16) from `drake_teleop.logs.pose_motion.rigid.load_coefficients`.
-        usual_s: delay for a record that does not determine it [s].
+    The coefficients `load` (6, 16) are from `load_coefficients`. The delay is
+    `usual_s` [s] for a record that does not determine it. Return None without poses, for a short
+    record, and if the IMU disagrees with the poses.
     """
     posed = log.posed
     if posed is None or log.static:
@@ -93,9 +90,9 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log with spline motion and without delay, and flags (N,).
+    """Return the log with the motion of splines and without delay, and (N,) booleans.
 
-    Flags are True near ends and gaps of the poses, where the acceleration is noisy.
+    They are True near ends and gaps of the poses, where the acceleration is noisy.
     """
     assert log.posed is not None
     moved, splines = undelayed(log, found.delay_s), found.splines
@@ -162,9 +159,9 @@ def aligned_log(
     The motion is from splines of the poses, or from an IMU if the load then fits better.
 
     Args:
-        path, cutoff_hz, delay: as in `eliminate_log`.
         phi: (10,) identified load.
         usual_s: delay for a record that does not determine it [s].
+        delay: of the motion behind the wrench [s], or "auto".
         weight_removed: True if the wrench does not contain the weight of the load.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
@@ -209,7 +206,7 @@ def without_orientation(where: str) -> DrakeTeleopError:
 
 
 def accelerated(log: Log) -> Log:
-    """Return the log with the acceleration in place of the specific force."""
+    """Return the log with acceleration in place of specific force."""
     if log.gravity is None:
         raise without_orientation(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)

@@ -52,7 +52,7 @@ class Detection:
     Attributes:
         floor: noise floor of the free motion.
         statistic, threshold: name of the used statistic, and its threshold.
-        statistics: (N, 3) all statistics; 0 at the unjudged ends.
+        statistics: (N, 3) all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
         free_s: duration of the free motion [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
@@ -70,7 +70,7 @@ class Detection:
 
     @property
     def above(self) -> NDArray[np.bool_]:
-        """Booleans (N,): True where the statistic reaches the threshold."""
+        """Booleans (N,): True where the statistic reaches the threshold, without hysteresis."""
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
@@ -99,7 +99,6 @@ def detect_contact(
 
     Args:
         rows: samples of the whole log.
-        dt: sample time [s].
         cutoff_hz: cut-off of the low-pass; one of its periods at both ends is not judged.
         covariance: (16, 16) of [offsets; phi], from `finite_covariance`.
         usual: (6,) RMS residual of the identification [N, N m].
@@ -238,7 +237,7 @@ def _detection_notes(
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
     """Return a note if most of a record seems to be contact, else ().
 
-    `shift` (6,) is the difference of its offsets from those of the free motion [N, N m].
+    `shift` (6,) is the change of its offsets since the free motion [N, N m].
     """
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _CONTACT_SHARE_OF_SHIFT:

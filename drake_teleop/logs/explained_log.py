@@ -49,7 +49,7 @@ _OTHER_REMEDIES = {
 
 
 def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
-    """Return the causes; their messages now end in the description lines that correct them.
+    """Return the causes, with the corrected description lines at the end of their messages.
 
     `by_pose` is True if the acceleration is from poses, not from an IMU.
     """
@@ -61,7 +61,7 @@ def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cau
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Return a message with the units to correct if a mass [kg] is above 1000 kg, or None."""
+    """Return which units to correct for a mass above 1000 kg, or None for a smaller one."""
     if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
@@ -316,10 +316,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
 
 
 def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
-    """Return the causes, with `finding` instead of "pose frame" and "sensor rotation".
-
-    Only if these are the only extensions of the model.
-    """
+    """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
     if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (Cause(finding.name, finding.message), *kept)

@@ -43,7 +43,7 @@ def common_figures(
 
 
 def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
-    """Return the numbers of the load in one part of a record for a summary [SI]."""
+    """Return the load in one part of a record for a summary [SI]."""
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -59,7 +59,7 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 
 def load_figures(load: Identification) -> dict[str, Any]:
-    """Return the numbers of a load for a summary: values and uncertainties [SI]."""
+    """Return values and uncertainties of a load for a summary [SI]."""
     deviations = load.standard_deviations
     ends = intervals(load)
     return {
@@ -79,7 +79,7 @@ def load_figures(load: Identification) -> dict[str, Any]:
 
 
 def object_figures(alone: Identification) -> dict[str, Any]:
-    """Return the numbers of an object without its gripper for a summary [SI]."""
+    """Return the load of an object without its gripper for a summary [SI]."""
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -162,7 +162,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
 
 
 def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return the share of samples with |F| > `threshold` [N], for raw and corrected wrenches."""
+    """Return the shares of samples with |F| > `threshold` [N], of raw and corrected wrenches."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,

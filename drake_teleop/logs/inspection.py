@@ -44,16 +44,11 @@ _QUANTITIES = (
 def inspect_command(
     log: Path, out: Path, *, others: Sequence[Path] = (), quiet: bool = False
 ) -> dict[str, Any]:
-    """Inspect a canonical log, a log description, any table or a bag.
+    """Inspect a canonical log, a log description, any table or a bag; return the summary.
 
-    Write summary.json into the folder `out`, and draft.yaml for unknown tables and bags: a
-    description of all of them, in which signs, axes and units are those that fit the data.
-
-    Args:
-        others: further tables or bags of the same recording.
-
-    Returns:
-        the summary.
+    Write summary.json into the folder `out`. Write draft.yaml for unknown tables and bags: a
+    description of `log` and of `others` (further files of the same recording), in which signs,
+    axes and units are those that fit the data.
     """
     summary: dict[str, Any] = {"log": str(log), "kind": "description", "topics": {}, "streams": {}}
     summary |= {"findings": [], "fit": None, "mounting": None, "delay_s": None, "draft": None}
@@ -132,9 +127,9 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
 
 
 def _fitted_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
-    """Return the draft description corrected by its data, and inspect it.
+    """Inspect a draft description, and return it corrected by its data.
 
-    Each round applies the first finding that names the right values of fields.
+    Each round applies the first finding with corrected fields.
     """
     tables: dict[Path, Table] = {}
     for _ in range(_MAX_CORRECTIONS):
@@ -346,7 +341,6 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
 
 
 def _without(table: Table, rows: NDArray[np.intp]) -> Table:
-    """Return the table without some rows."""
     if not len(rows):
         return table
     kept = np.setdiff1d(np.arange(table.rows), rows)

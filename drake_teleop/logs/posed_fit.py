@@ -53,11 +53,10 @@ def fit_posed(
 ) -> tuple[PosedFit | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and findings about the pose frame.
 
-    The load is None for a method without splines, a log without usable poses, or an IMU that
-    contradicts the poses.
+    The load is None for a method without splines ("robust" and "consistent" use them), a log
+    without usable poses, or an IMU that contradicts the poses.
 
     Args:
-        method: "robust" or "consistent" use splines.
         cutoff_hz: cut-off of the low-pass on samples and residual.
         delay: delay of the motion behind the wrench [s], or "auto".
     """

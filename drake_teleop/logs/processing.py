@@ -107,7 +107,7 @@ class EliminatedLog:
     Attributes:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
-        point_mass: undetermined inertias, set to those of a point mass.
+        point_mass: names of undetermined inertias, replaced by those of a point mass.
         offsets: (6,) sensor offsets of this record [N, N m].
         tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
@@ -268,9 +268,7 @@ def _can_be_explained(log: Log, by_splines: bool) -> bool:
 def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     """Check a log and its description, including causes that identification finds.
 
-    Args:
-        path: canonical table or log description.
-        checks: result of `check_file` for this log, if known.
+    `checks` is the result of `check_file` for this log, if known.
     """
     checks = check_file(path) if checks is None else checks
     try:
@@ -527,9 +525,9 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with undetermined inertias set to a point mass's, and their names.
+    """Return phi (10,) with undetermined inertias set to those of a point mass, and their names.
 
-    Weakly identified inertias are kept: they are nearer to the truth.
+    Weakly identified inertias are kept, because they are closer to the true values.
     """
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
@@ -551,7 +549,7 @@ def _suspected_errors(
 
 
 def removed_weight(where: str) -> DrakeTeleopError:
-    """Return the error for different scales of weight and inertia of a removed weight."""
+    """Return the error for a scale of the weight if the robot has already removed the weight."""
     return DrakeTeleopError(
         "the robot has removed the weight, so that sigma_weight has no effect",
         where=where,

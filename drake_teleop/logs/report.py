@@ -70,12 +70,10 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, with embedded pictures.
+    """Write the HTML report of an identification, with fit.png and knowledge.png of its folder.
 
-    Args:
-        path: HTML file; fit.png and knowledge.png are beside it.
-        summary: summary of `identify_command`.
-        alone: identification of the object alone, if the gripper is known.
+    `alone` is the load of the object alone,
+    if the gripper is known.
     """
     log, result = found.log, found.identification
     tables = [

@@ -192,8 +192,7 @@ def _motion(number: int) -> _Motion:
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link S.
 
-    Args:
-        q, qd, qdd: (N, 6) joint angles and their derivatives [rad, s].
+    The joint angles and their derivatives are (N, 6) [rad, s].
     """
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
@@ -287,9 +286,7 @@ def sample_episode(
 ) -> SampleEpisode:
     """Return an episode whose motion, contacts and noise follow from its number and the seed.
 
-    Args:
-        phi: (10,) load.
-        lag_frames: delay of the poses behind the wrench [frames].
+    `lag_frames` is the delay of the poses behind the wrench, in frames.
     """
     from scipy.spatial.transform import Rotation
 

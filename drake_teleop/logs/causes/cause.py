@@ -55,12 +55,11 @@ class Stretch:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        """Booleans (16,): True for identified parameters of [offsets; phi]."""
         return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
-    """Return the causes in a fitted model, without its extensions `given`."""
+    """Return the causes of a misfit in a fitted model, except for the extensions `given`."""
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_axes(model.axes))
@@ -87,7 +86,7 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 def stretches(state: State, covariance: Array) -> list[Stretch]:
     """Return the parts of a record between changes of the load; none without a change.
 
-    `covariance` (16, 16) is that of [offsets; phi] of the first part.
+    `covariance` (16, 16) is that of [offsets; phi] in the first part.
     """
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:

@@ -76,8 +76,8 @@ def search(
 ) -> Found:
     """Return the model that explains a record, additional delay [s], and rejected candidates.
 
-    `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
-    model.
+    `with_delay` returns the record with an additional delay [s]. `given` are extensions that the
+    model has from the start.
     """
     plain = Model(parts=given)
     found = _search(_initial_state(data, plain), 0.0, with_delay)
@@ -100,7 +100,7 @@ def search(
 
 
 def may_be_coloured_noise(state: State) -> bool:
-    """Return whether the residual may be coloured noise: smooth signals do not explain it."""
+    """Return whether the residual may be coloured noise, which smooth signals do not explain."""
     return (
         state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
     )
@@ -148,7 +148,7 @@ def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found
 
 
 def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Remove "cable" if an attenuated inertia explains a third of its score."""
+    """Remove "cable" from the candidates if a reduced inertia explains a third of its score."""
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
@@ -235,12 +235,11 @@ _NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Causes why a rigid load does not explain a wrench, and the load when they are in the model.
+    """Causes why a rigid load does not explain a wrench, and the load of the model with causes.
 
     Attributes:
         explained: whether the residual is sensor noise.
-        theta: (16,) [offsets; phi] of the first part of the record [SI].
-        covariance: (16, 16) of theta.
+        theta, covariance: [offsets; phi] (16,) in the first part of the record [SI]; (16, 16).
         deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of a record whose load changes.
@@ -261,12 +260,11 @@ class Explanation:
 
     @property
     def misfit(self) -> bool:
-        """Whether the residual is clearly not noise, not even coloured noise."""
         return not self.explained and is_clear_misfit(self.state)
 
     @property
     def several_gains(self) -> bool:
-        """Whether gain errors of single channels stand for errors of the whole gain matrix."""
+        """Whether gain errors of single channels approximate those of a whole gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)
@@ -277,8 +275,8 @@ def explain(
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
-    model, such as "weight".
+    `with_delay` returns the record with an additional delay [s]. `given` are extensions that the
+    model has from the start, such as "weight".
     """
     with one_blas_thread():
         state, delay_s, rejected = search(data, with_delay, given)

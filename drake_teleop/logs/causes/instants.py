@@ -71,7 +71,7 @@ class Instants:
 
     @cached_property
     def accelerates_enough(self) -> bool:
-        """Whether accelerations are large enough to separate inertia from weight."""
+        """Whether the accelerations are large enough to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_NOISE_SHARE
         a = (self.y[:, S] + self.y[:, G])[self.used]
@@ -81,21 +81,19 @@ class Instants:
 
     @property
     def dt(self) -> float:
-        """Time between instants [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
     def block(self) -> int:
-        """Number of rows in one block, in which contacts and changes of the load are searched."""
+        """Number of rows in a block, the time resolution of the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
     def only(self, used: NDArray[np.bool_]) -> Instants:
-        """Return the record with `used` (M,) as its used rows."""
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def with_steps(self, times: tuple[float, ...]) -> Array:
-        """Return y with copies of its motion after each time, (M, WIDTH + 25 len(times))."""
+        """Return y and copies of its motion from each time on, (M, WIDTH + 25 len(times))."""
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
@@ -103,7 +101,7 @@ class Instants:
         return np.hstack(parts)
 
     def sums(self, y: Array, *, rows: int, lags: int = ORDER + 1) -> Array:
-        """Return sums (blocks, lags, W, W) of products of y (M, W), for blocks of `rows` rows."""
+        """Return sums of lagged products of y (M, W) over blocks, (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -130,7 +128,7 @@ def instants(
 
     Args:
         t: (N,) times, evenly spaced [s].
-        wrench: (N, 6) measured [f; tau] on the load, in S about So, Eq. (1) [N, N m].
+        wrench: (N, 6) [f; tau] on the load, in S about So, Eq. (1) [N, N m].
         motion: a function of time, or its values at `t` (see `Motion`).
         gravity_W: (3,) gravity in the world [m/s^2]; None without orientation.
         lost: (N,) True for ignored samples.
@@ -231,10 +229,10 @@ def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
 
 
 def free_delay(data: Instants) -> float:
-    """Return the delay of the motion [s] with the smallest residual.
+    """Return the delay of the motion [s] with the smallest residual, for free coefficients.
 
-    It is within 0.25 s and a tenth of the record. No load is assumed: the wrench channels are
-    fitted by the 16 motion signals.
+    It is within 0.25 s and a tenth of the record. The coefficients map 16 motion signals to the
+    wrench, without the assumption of a rigid load.
     """
     reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

@@ -36,7 +36,7 @@ def covariance_of(
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes.
 
-    `blocks` (16,) is from `block_deviations`, `gains` (16, 16) the covariance due to gain errors.
+    `blocks` (16,) is from `block_deviations`, `gains` (16, 16) from `gain_covariance`.
     """
     out = state.fit.covariance[LOAD, LOAD].copy()
     deviations = np.sqrt(np.diag(out))
@@ -50,7 +50,7 @@ def covariance_of(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return standard deviations (16,) of [offsets; phi] for a misfit without a named cause."""
+    """Return standard deviations (16,) of [offsets; phi] for a misfit without a found cause."""
     if state.smooth_misfit > (
         _CLEAR_SMOOTH_MISFIT
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
@@ -79,7 +79,7 @@ def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
 def gain_covariance(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] that errors of all 36 sensor gains cause.
 
-    The residual determines their size; 0 if gains explain little.
+    The residual determines the size of these errors.
     """
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
@@ -115,7 +115,7 @@ def gain_covariance(state: State) -> Array:
 
 
 def factor_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] caused by an uncertain torque unit."""
+    """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in similar_factors(state):
         distance = other.x[LOAD] - state.x[LOAD]

@@ -63,12 +63,12 @@ class LoadFit:
 
     @property
     def good(self) -> bool:
-        """Whether some load of positive mass explains the wrench."""
+        """Whether the fitted load has a positive mass and explains the wrench."""
         return self.mass > 0 and self.unexplained < GOOD_SHARE + self.noise
 
 
 def load_fit(log: Log) -> LoadFit:
-    """Fit a load and constant offsets to a log, low-passed at 15 Hz."""
+    """Fit a load and constant offsets to a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_passed(log, cutoff).only(measured(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
@@ -108,7 +108,7 @@ def _scale(wrench: Array) -> Array:
 
 
 def decisive_factor(fit: LoadFit) -> float:
-    """Return the factor by which a corrected description must reduce the unexplained share."""
+    """Return the factor by which a correction must reduce the unexplained share of a fit."""
     n = max(1.0, fit.independent)
     return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARMS / _TESTED_EDITS)))
 

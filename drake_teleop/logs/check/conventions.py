@@ -88,7 +88,7 @@ def question_fit(
         check: function that checks the log's description against its data.
 
     Raises:
-        DrakeTeleopError: if the result is worthless and a finding has a remedy.
+        DrakeTeleopError: if the load is useless and a finding has a remedy.
     """
     if _never_changes(log):
         raise DrakeTeleopError(
@@ -129,7 +129,7 @@ def question_fit(
 
 
 def errors_of_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
-    """Return the findings of `check` that are errors of the described motion."""
+    """Return the findings of `check` that concern the described motion, not the wrench."""
     return tuple(x for x in _findings(check) if x.name in MOTION_ERRORS)
 
 
@@ -165,7 +165,7 @@ def _is_suspicious(log: Log) -> bool:
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Check a description against its data; `tables` are already read tables by path."""
+    """Check a description against its data; `tables` are the tables already read, by path."""
     with one_blas_thread():
         found = _check(LogData(description, source, dict(tables or {})), description)
     if Path(source).suffix.lower() not in FORMATS:

@@ -28,7 +28,7 @@ _TIME_COLUMN = "thinned time stamps of"
 
 
 class LogData:
-    """Tables of a log, whole and thinned, which edited descriptions read without file access."""
+    """Tables of a log in memory, whole and thinned, for reading with edited descriptions."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source = source
@@ -48,11 +48,10 @@ class LogData:
             self._thin(name, stream, thin, min(steps[stream.source]))
 
     def read(self, description: Description) -> Log:
-        """Return the whole log, as a description defines it."""
         return read_description(description, self._source, tables=self.tables)
 
     def thin(self, description: Description) -> Log:
-        """Return the log at about 100 Hz, read with a description."""
+        """Return the log at about 100 Hz, as a description defines it."""
         stamped = {}
         for name, stream in _streams(description).items():
             if (time := getattr(stream, "time", None)) is not None:

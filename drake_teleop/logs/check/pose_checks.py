@@ -123,7 +123,7 @@ def _fit_with_offset(
 
 
 def usable(log: Log) -> bool:
-    """Return whether a log has poses of at least 4 s for splines."""
+    """Return whether a log has poses over at least 4 s, as splines require."""
     return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST_S
 
 

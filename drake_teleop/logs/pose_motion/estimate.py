@@ -83,12 +83,10 @@ class Frame:
 
     @property
     def position_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where a coordinate of the origin is determined."""
         return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
 
     @property
     def rotation_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where the rotation about an axis of S is determined."""
         return np.asarray(self.turn_deviations_deg < MAX_ROTATION_DEVIATION_DEG)
 
 
@@ -144,7 +142,6 @@ class PoseEstimate(PoseMotion):
 
     @property
     def covariance(self) -> Array:
-        """Covariance (16, 16) of [offsets; phi] [SI]."""
         return self.fit.covariance[LOAD, LOAD]
 
 
@@ -168,12 +165,11 @@ def estimate_from_poses(
         wrench: (N, 6) [f; tau] on the load, in S about So, Eq. (1) [N, N m].
         poses: of P, on the same clock except for a delay.
         gravity_W: (3,) gravity in the world [m/s^2].
-        p_SoPo_S: (3,) origin of P [m], or None to estimate it.
-        R_SP: (3, 3) rotation of P, or None to estimate it.
+        p_SoPo_S, R_SP: origin (3,) [m] and rotation (3, 3) of P, each None to estimate it.
         delay: delay of the poses behind the wrench [s], or None to estimate it.
         gain: standard deviation of the sensor gains, such as 0.01.
         lost: (N,) True for excluded samples.
-        imu: IMU data of S, used if they lower the cost.
+        imu: IMU data of S, used if they fit the wrench better.
     """
     with one_blas_thread():
         found, _, window = _find_motion(

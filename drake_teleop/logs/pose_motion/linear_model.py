@@ -86,7 +86,7 @@ def _wrench_powers(Z: Array) -> Array:
 def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
 ) -> LinearFit:
-    """Fit the model to moments of signals and wrench; with a known load only the constants."""
+    """Fit the linear model to moments; fit only the constants if `load` is given."""
     floor = _rounding_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T
@@ -180,7 +180,7 @@ class Spectra:
 
     @cached_property
     def taper_fixed(self) -> bool:
-        """Whether the taper (weights of samples) stays in place if the delay changes."""
+        """Whether the weights of samples stay in place when the delay changes."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.load is not None)
@@ -204,7 +204,7 @@ class Spectra:
         return moments(self.signals, self.wrench, self.of, rates)
 
     def fit(self) -> LinearFit:
-        """Fit the coefficients of all signals; only the constants if the load is known."""
+        """Fit the coefficients of all signals, or only the constants if the load is known."""
         Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
         parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z)
         fit = _fit_moments(*parts, Levels.flat(self.of), load)
@@ -224,7 +224,7 @@ class Spectra:
         return fits.costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
-        """Return moments of signals and wrench at delays (D,); the taper moves with the signals."""
+        """Return moments of signals and wrench at delays (D,) [s], with a moving taper."""
         of, Z = self.of, moments(self.signals, self.wrench, self.of)
         fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
         products = np.conj(self.signals)[:, :, None] * fixed[:, None]
@@ -259,7 +259,6 @@ class Window:
     top: float
 
     def part(self, rows: slice) -> Window:
-        """Return the window of some rows of the grid."""
         grid = self.grid
         wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
         grid = replace(grid, t=grid.t[rows], wrench=wrench)
@@ -279,7 +278,7 @@ class Window:
 def best_delay(
     spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
 ) -> tuple[float, float]:
-    """Return the delay [s] of lowest cost within `reach` [s], to `finest` [s], and this cost."""
+    """Return the delay of lowest cost within `reach`, to the step `finest` [s], and this cost."""
     step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs(at)
@@ -310,7 +309,7 @@ def guess_spacing(
 ) -> tuple[float, float]:
     """Return knot distance [s] and delay [s] of lowest cost on a coarse grid.
 
-    The delay is fixed if `known`.
+    The delay is not changed if `known`.
     """
     spacings, found = _allowed_spacings(cache)[::2], []
     start = window.spectra(cache.at(spacings[0]), delay)
@@ -327,9 +326,9 @@ def guess_spacing(
 def choose_spacing(
     window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return the splines (of `choices`), knot distance [s] and delay [s] with least cost.
+    """Return the splines (of `choices`), knot distance [s] and delay [s] of about lowest cost.
 
-    Knots are 8 or 16 % closer than at least cost. `known`: keep `delay`.
+    Knots are 8 or 16 % closer than at lowest cost. The delay is not changed if `known`.
     """
     start = window.spectra(choices[0].at(SPACINGS[0]), delay)
     found = []
@@ -354,7 +353,7 @@ def choose_spacing(
 
 
 def averaged_splines(poses: Poses) -> SplineCache:
-    """Return splines of averaged poses, at the rate that a search needs."""
+    """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
     return SplineCache(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 
@@ -394,7 +393,7 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
 
 
 def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
-    """Return the poses on the wrench's clock, for a relative rate error of their own clock.
+    """Return the poses on the wrench's clock, for a relative rate error of the poses' clock.
 
     The delay at mid-record, `delay` [s], is unchanged.
     """

@@ -23,10 +23,7 @@ _MIN_MARGIN_S = 0.1
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
-    """Return (M,) booleans: True for disturbed instants (contact, impact, saturation), and a note.
-
-    For an identified load only the offsets are fitted.
-    """
+    """Return (M,) True for contact, impact or saturation, and a note for the user."""
     # A Gaussian gain, one half at `_PASSED_SHARE` / h, does not ring.
     gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED_SHARE) ** 2)
     grid = spectra.grid

@@ -45,9 +45,9 @@ class RigidFit:
         state: estimated parameters; tau is relative to the delay of the moments.
         covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
             if undetermined, 0 if not free.
-        misfit, degrees: log likelihood ratio to the linear model (times 2), and its degrees of
+        misfit, degrees: twice the log likelihood ratio to the linear model, and its degrees of
             freedom.
-        misfit_of_gains: expected increase of the misfit by stated gain errors.
+        misfit_of_gains: expected increase of the misfit by the stated gain errors.
         one_weight: whether all bands had one weight.
     """
 
@@ -138,7 +138,6 @@ def fit_rigid(
     Args:
         Z: (bands, 38, 38) second moments, `Spectra.moments`.
         Q: (bands, 38, 38) noise of the poses in Z, `spectra.noise_moments`.
-        levels: noise of the bands.
         free: (23,) True for estimated parameters.
         linear: fit of the linear model, whose residual gives the first weights.
         gain: standard deviation of the sensor gains.
@@ -345,7 +344,7 @@ _ITERATIONS = 5
 
 @dataclass(frozen=True, eq=False)
 class ReadOff:
-    """Units, axes and masses that the free coefficients of a linear model of the wrench imply.
+    """Units, axes and masses that the fit of a linear model of the wrench implies.
 
     Attributes:
         kappa: unit error of position; 1e-3 for mm described as m.
@@ -373,7 +372,6 @@ class ReadOff:
 
 
 def read_off(fit: LinearFit) -> ReadOff:
-    """Return units, axes and masses that a fitted linear model implies."""
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
     kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])

@@ -210,7 +210,6 @@ class SplineCache:
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def at(self, spacing: float) -> PoseSplines:
-        """Return the splines with a knot distance [s]."""
         if spacing not in self._fit:
             self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
         return self._fit[spacing]
@@ -219,7 +218,7 @@ class SplineCache:
 def passed(frequency: Array, spacing: float) -> Array:
     """Return the share (K,) of white noise's power that splines pass, Eq. (T72).
 
-    `frequency` (K,) in [Hz], knot distance `spacing` in [s].
+    `frequency` (K,) is in [Hz], the knot distance `spacing` in [s].
     """
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))

@@ -26,7 +26,6 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
     """Return the numeric arrays of an HDF5 file; links to other files are not followed.
 
     Args:
-        path: the file.
         transpose: reverse the axes, as for files of MATLAB.
         group: only arrays in this group, with names relative to it.
 
@@ -50,7 +49,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 
 
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
-    """Return some rows of the numeric arrays of a Zarr folder; raises errors as `read_hdf5`."""
+    """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
     zarr = library("zarr", path)
     group = zarr.open_group(path, mode="r")
     members = group.members(max_depth=None)
@@ -72,7 +71,7 @@ def _is_table(item: Any, transpose: bool) -> bool:
 
 
 def library(name: str, path: Path) -> Any:
-    """Return an optional package that reads a file; raise DrakeTeleopError if it is missing."""
+    """Import an optional package that reads a file; raise DrakeTeleopError if it is missing."""
     try:
         return import_module(name)
     except ImportError:
@@ -97,8 +96,7 @@ _BROKEN = "it is damaged or incomplete"
 def read_mat(path: Path) -> dict[str, NDArray]:
     """Return the numeric arrays of a MATLAB file by name; fields are named `structure.field`.
 
-    Raises:
-        ValueError: if the file is invalid or has no arrays.
+    Raise ValueError if the file is invalid or has no arrays.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version

@@ -199,7 +199,6 @@ def _result_note(name: str, value: Any, deviation: str) -> str:
 
 
 def log_instants(log: Log) -> Instants:
-    """Return block means of a log's wrench and motion."""
     gravity = None
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:
@@ -213,7 +212,7 @@ def weight_wrench(weight: Array, gravity: Array) -> Array:
 
 
 def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
-    """Return the log with the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] added.
+    """Add the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] to a log.
 
     `motion_log` is the same log with motion, from which the delay is estimated and removed.
     """

@@ -59,7 +59,7 @@ class Clock:
     episodes: int = 1
 
     def select(self, x: Array) -> Array:
-        """Return those rows of x (total, ...) that have a time."""
+        """Return the rows of x (total, ...) that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
 

@@ -129,7 +129,7 @@ class _Stream(Strict):
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Columns of all quantities of the stream, without those of the time."""
+        """Columns of all quantities of the stream, except the time."""
         quantities = (getattr(self, field) for field in type(self).model_fields)
         return tuple(c for quantity in quantities for c in getattr(quantity, "columns", ()))
 
@@ -331,14 +331,14 @@ class Description(Strict):
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
-        """Return the poses of S together with gravity, described pose frame and IMU data."""
+        """Return the poses of S with gravity, described pose frame and IMU data."""
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
         return Posed(poses, self.gravity_W, np.array(origin), rotation, imu)
 
     def scale(self, unit: str) -> float:
-        """Return the SI value of a unit; "g" is the described gravity."""
+        """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else UNITS[unit]
 
 

@@ -41,7 +41,7 @@ def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
 def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
     """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
 
-    Any affine map of the IMU's axes is permitted. Effects linear in `arm` (N, k) are removed.
+    The axes of the IMU may differ by any affine map. Effects linear in `arm` (N, k) are removed.
     """
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
@@ -72,7 +72,7 @@ def clock_drift(
 ) -> tuple[float, float]:
     """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
 
-    `lag` [s] is a constant start, `independent` the number of independent samples. A drift that is
+    `lag` [s] is a first estimate, `independent` the number of independent samples. A drift that is
     insignificant or below 10 ms in total is 0.
     """
     tau = t - t.mean()
@@ -121,7 +121,7 @@ _MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 def solve(
     residual: Callable[[Array], Array], x: Array, linear: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the solution x (n,) and its standard deviations (n,); inf if undetermined.
+    """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
 
     Args:
         residual: function of x that returns residuals (N, 3 k).
@@ -205,7 +205,7 @@ class LeverArm:
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     """Return the position of the accelerometer, fitted with offsets, load and delay, Eq. (T21).
 
-    None for a poor fit (contact), or few samples outside of gaps.
+    Return None for a poor fit (contact), or few samples outside of gaps.
     """
     cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
@@ -236,16 +236,15 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 
 def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
-    """Return evenly spaced times at which all logs have samples."""
     t = np.linspace(start, stop, COMPARED_SAMPLES)
     known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
 
 def lever_matrix(omega: Array, alpha: Array) -> Array:
-    """Return the matrix K (N, 3, 3): K p is the acceleration of a point p relative to the origin.
+    """Return the matrix K (N, 3, 3) with K p the acceleration of point p relative to the origin.
 
-    Eq. (T20), for omega and alpha (N, 3).
+    Eq. (T20), for omega [rad/s] and alpha [rad/s^2] (N, 3).
     """
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
@@ -312,7 +311,6 @@ class Mounting:
 
     @property
     def oblique_deg(self) -> float:
-        """Angle between R_SI and `right_angled` [deg]."""
         return _angle_deg(self.right_angled.T @ self.R_SI)
 
     @property

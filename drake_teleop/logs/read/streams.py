@@ -54,7 +54,6 @@ class Stream:
 
     @property
     def dt(self) -> float:
-        """Mean sample spacing [s]."""
         return spacing(self.t)
 
 
@@ -113,9 +112,9 @@ class Orientations:
             self._columns *= description.scale(orientation.unit)
 
     def output(self, count: int) -> Array:
-        """Return memory (count, 4) for the quaternions of increasing rows, written in their order.
+        """Return memory (count, 4) for quaternions, to be written in the order of increasing rows.
 
-        It is that of the columns, if these are quaternions: each row is read before.
+        It may be that of the columns, because each row is read before it is written.
         """
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 

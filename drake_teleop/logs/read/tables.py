@@ -32,7 +32,7 @@ class Table:
         first_row: number of the first data row in the file.
         absent: names of column groups that the file marks as not provided.
         whole: table of all rows, if these are a part of them.
-        kept: numbers of these rows in `whole`, counted from 0; None: all rows.
+        kept: row numbers in `whole`, counted from 0; None: all rows.
     """
 
     path: Path
@@ -64,7 +64,6 @@ class Table:
 
     @property
     def rows(self) -> int:
-        """Number of rows of the longest column."""
         if self.kept is not None:
             return len(self.kept)
         return max(len(column) for column in self.columns.values())
@@ -103,7 +102,6 @@ class Table:
                 )
 
     def all_raw(self, names: Sequence[str | int], where: str) -> Array:
-        """Return `raw` of several columns, which must have equal rows, side by side."""
         columns = [self.raw(name, where) for name in names]
         self._check_rows(names, columns, where, None)
         return np.hstack(columns)
