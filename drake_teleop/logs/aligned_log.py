@@ -156,13 +156,9 @@ def aligned_log(
 ) -> AlignedLog:
     """Read a log and remove the delay between motion and wrench.
 
-    The motion is from splines of the poses, or from an IMU if the load then fits better.
-
-    Args:
-        phi: (10,) identified load.
-        usual_s: delay for a record that does not determine it [s].
-        delay: of the motion behind the wrench [s], or "auto".
-        weight_removed: True if the wrench does not contain the weight of the load.
+    The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
+    `delay` and its default `usual_s` are in [s]. `weight_removed` is True if the wrench does not
+    contain the weight of the load.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.free

@@ -92,10 +92,8 @@ def causal_wrenches(
 ) -> CausalWrench:
     """Return the filtered wrenches that a control loop has at each instant.
 
-    Args:
-        contact, scaled: (N, 6) unfiltered wrenches, with the motion of the same instants.
-        delay_s: delay of the motion behind the wrench [s], rounded up to a full sample.
-        mode: "delayed" keeps the lag, "predicted" extrapolates over it.
+    The delay of the motion behind the wrench, `delay_s`, is rounded up to full samples. The mode
+    "delayed" keeps the lag of the wrenches (N, 6), "predicted" extrapolates over it.
     """
     if mode not in MODES:
         raise DrakeTeleopError(

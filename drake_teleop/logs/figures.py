@@ -43,7 +43,6 @@ def common_figures(
 
 
 def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
-    """Return the load in one part of a record for a summary [SI]."""
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -59,7 +58,6 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 
 def load_figures(load: Identification) -> dict[str, Any]:
-    """Return values and uncertainties of a load for a summary [SI]."""
     deviations = load.standard_deviations
     ends = intervals(load)
     return {
@@ -79,7 +77,6 @@ def load_figures(load: Identification) -> dict[str, Any]:
 
 
 def object_figures(alone: Identification) -> dict[str, Any]:
-    """Return the load of an object without its gripper for a summary [SI]."""
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -129,7 +126,6 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
 
 
 def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
-    """Return noise floor, contacts and causal wrenches for a summary."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,

@@ -33,11 +33,10 @@ _CHUNK, _NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for 
 
 @dataclass(frozen=True)
 class PosedFit:
-    """Load identified from a log with poses.
+    """Load identified from a log with poses, after removal of the delay `delay_s` [s].
 
     Attributes:
         log: used samples with the motion of splines, low-passed.
-        delay_s: removed delay of the motion behind the wrench [s].
         source: of the delay: "given", "estimated", or "undetermined" (0 was used).
     """
 
@@ -55,10 +54,6 @@ def fit_posed(
 
     The load is None for a method without splines ("robust" and "consistent" use them), a log
     without usable poses, or an IMU that contradicts the poses.
-
-    Args:
-        cutoff_hz: cut-off of the low-pass on samples and residual.
-        delay: delay of the motion behind the wrench [s], or "auto".
     """
     if log.posed is None or method not in ROBUST or not usable(log):
         return None, ()

@@ -626,10 +626,8 @@ def detect_log(
     Args:
         path: canonical table or log description.
         load: identification.json or its content; None: load identified from the log itself.
-        free: log of equally fast free motion with the same load; None: calm parts of the log
-            itself.
+        free: log of equally fast free motion with the same load; None: calm parts of the log.
         statistic: "level", "cusum" or "glr".
-        cutoff_hz: cut-off of the low-pass.
         delay: delay of the motion behind the wrench [s], or "auto".
     """
     if load is None:

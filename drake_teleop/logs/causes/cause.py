@@ -27,9 +27,7 @@ class Cause:
     """Reason why a rigid load with constant offsets does not explain a wrench.
 
     Attributes:
-        name: "axes", "gravity direction", "weight removed", "payload configured", "torque factor",
-            "zero change", "load change", "drift", "gain", "pose frame", "sensor rotation",
-            "contact", "cable" or "no load".
+        name: such as "axes", "gravity direction", "load change" or "cable".
         message: cause, value with its interval, and remedy.
         start_s, stop_s: time span since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.

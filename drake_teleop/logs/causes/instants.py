@@ -124,15 +124,10 @@ def instants(
     lost: NDArray[np.bool_] | None = None,
     acceleration_noise: float = 0.0,
 ) -> Instants:
-    """Return block means of a record.
+    """Return block means of a record with N samples at even times `t` [s].
 
-    Args:
-        t: (N,) times, evenly spaced [s].
-        wrench: (N, 6) [f; tau] on the load, in S about So, Eq. (1) [N, N m].
-        motion: a function of time, or its values at `t` (see `Motion`).
-        gravity_W: (3,) gravity in the world [m/s^2]; None without orientation.
-        lost: (N,) True for ignored samples.
-        acceleration_noise: noise of the acceleration [m/s^2].
+    The wrench (N, 6) is [f; tau] on the load, in S about So, Eq. (1). `gravity_W` is in the world
+    [m/s^2], None without orientation. Samples with `lost` True are ignored.
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     size = max(1, round(1.0 / (_RATE_HZ * dt)), -(-len(t) // _MAX_ROWS))
@@ -229,10 +224,9 @@ def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
 
 
 def free_delay(data: Instants) -> float:
-    """Return the delay of the motion [s] with the smallest residual, for free coefficients.
+    """Return the delay of the motion [s], within +-0.25 s, with the smallest residual.
 
-    It is within 0.25 s and a tenth of the record. The coefficients map 16 motion signals to the
-    wrench, without the assumption of a rigid load.
+    The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.
     """
     reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

@@ -138,7 +138,6 @@ class Fit:
 def fit(
     model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
 ) -> Fit:
-    """Fit a model to rows, from parameters `start` (size,), in at most `steps` iterations."""
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
@@ -164,7 +163,6 @@ def fit(
 
 
 def regularized_inverse(gram: Array) -> Array:
-    """Invert a Gram matrix, with a small ridge on its scaled diagonal."""
     diagonal = np.diag(gram)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))
     scaled = gram * np.outer(scale, scale)
@@ -194,7 +192,6 @@ class State:
         return cls(data, spans, fit(model, Rows(data, used, model.times, model.columns), start))
 
     def extended(self, model: Model, start: Array | None = None, **options: int) -> State:
-        """Fit another model to the same rows."""
         if start is None:
             start = model.start(self.x, self.model)
         return State(self.data, self.spans, fit(model, self._rows_of(model), start, **options))

@@ -260,7 +260,6 @@ def _clock_edits(description: Description, log: Log) -> Iterator[tuple[None, Des
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
-    """Return a finding with a remedy if the motion is `delay` [s] behind the wrench."""
     if delay is None or abs(delay) <= SMALLEST_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"

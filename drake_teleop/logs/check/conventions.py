@@ -1,7 +1,4 @@
-"""Errors of convention in a log description, found by the laws of motion.
-
-An error is reported if a corrected description agrees decisively better with the data.
-"""
+"""Errors of convention in a log description, found by the laws of motion."""
 
 from __future__ import annotations
 
@@ -53,7 +50,6 @@ class Conventions:
     """Result of the checks of a log description.
 
     Attributes:
-        findings: suspected errors.
         fit: fit of a load, after correction of IMU errors.
         mounting: mounting of the IMU relative to the pose, if determined.
         delay_s: delay of the motion behind the wrench, if determined [s].
@@ -66,7 +62,6 @@ class Conventions:
 
 
 def check_file(path: Path) -> Conventions:
-    """Check a canonical log or a log description against its data."""
     if path.suffix.lower() in FORMATS:
         table = read_table(path)
         return check_conventions(describe_canonical(path, table), str(path), {path: table})
@@ -82,13 +77,8 @@ def question_fit(
 ) -> tuple[Finding, ...]:
     """Return findings, except "lag", of a log whose identified load is suspicious.
 
-    Args:
-        predicted: (N, 6) wrench that the load predicts [N, N m].
-        delay: removed delay [s]; None if undetermined.
-        check: function that checks the log's description against its data.
-
-    Raises:
-        DrakeTeleopError: if the load is useless and a finding has a remedy.
+    The load predicts the wrench `predicted` (N, 6). `check` checks the log's description against
+    its data. Raise DrakeTeleopError if the load is useless and a finding has a remedy.
     """
     if _never_changes(log):
         raise DrakeTeleopError(
@@ -165,7 +155,6 @@ def _is_suspicious(log: Log) -> bool:
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Check a description against its data; `tables` are the tables already read, by path."""
     with one_blas_thread():
         found = _check(LogData(description, source, dict(tables or {})), description)
     if Path(source).suffix.lower() not in FORMATS:

@@ -45,7 +45,6 @@ Edit = tuple[Finding, Description]
 
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
-    """Return the description with a changed value of the field `path`, as "imu.time.offset"."""
     first, *rest = path.split(".", 1)
     if rest:
         model: Any = getattr(description, first)

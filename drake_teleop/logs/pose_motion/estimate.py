@@ -158,18 +158,12 @@ def estimate_from_poses(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseEstimate:
-    """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses.
+    """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses of P.
 
-    Args:
-        t: (N,) times, evenly spaced [s].
-        wrench: (N, 6) [f; tau] on the load, in S about So, Eq. (1) [N, N m].
-        poses: of P, on the same clock except for a delay.
-        gravity_W: (3,) gravity in the world [m/s^2].
-        p_SoPo_S, R_SP: origin (3,) [m] and rotation (3, 3) of P, each None to estimate it.
-        delay: delay of the poses behind the wrench [s], or None to estimate it.
-        gain: standard deviation of the sensor gains, such as 0.01.
-        lost: (N,) True for excluded samples.
-        imu: IMU data of S, used if they fit the wrench better.
+    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Origin
+    `p_SoPo_S` [m], rotation `R_SP`, and delay of the poses behind the wrench [s] are estimated
+    where None. `gain` is the standard deviation of the sensor gains. Samples with `lost` True are
+    excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
         found, _, window = _find_motion(
@@ -227,7 +221,7 @@ def motion_of_load(
 ) -> PoseMotion:
     """Return the motion from poses of S with which an identified load fits a wrench best.
 
-    `load` (6, 16) is from `load_coefficients`; other arguments as for `estimate_from_poses`.
+    `load` (6, 16) is from `load_coefficients`.
     """
     with one_blas_thread():
         motion, last, _ = _find_motion(

@@ -1,7 +1,4 @@
-"""Linear model of the wrench in 16 signals of the motion, Eqs. (T73) to (T76).
-
-Its likelihood determines knots, delay, and the rate of the poses' clock.
-"""
+"""Linear model of the wrench in 16 signals of the motion, Eqs. (T73) to (T76)."""
 
 from __future__ import annotations
 
@@ -159,9 +156,8 @@ class Spectra:
     """Spectra of wrench (K, 6) and motion signals (K, 16) of a record, for one taper and delay.
 
     Attributes:
-        of: frequency bands.
-        delay: delay of the signals [s].
         grid, taper: instants of the record, and their weights (M,).
+        delay: delay of the signals [s].
         zeta: (M, 16) signals in time.
     """
 

@@ -48,10 +48,9 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """IMU data at the sensor origin So, in the axes of S.
+    """IMU data at the sensor origin So, in the axes of S, at times t (K,) [s].
 
     Attributes:
-        t: (K,) times, evenly spaced except for gaps [s].
         specific_force: (K, 3) [m/s^2], or None.
         angular_velocity: (K, 3) [rad/s], or None.
     """

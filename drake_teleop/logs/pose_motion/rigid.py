@@ -78,10 +78,9 @@ class RigidFit:
 
 
 def motion_map(R: Array, r: Array) -> Array:
-    """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79).
+    """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79), for R = R_PS, r = p_PoSo [m].
 
-    zeta (16): motion signals of pose frame P, F: wrench, z (19): Eq. (T4) in sensor frame S;
-    R = R_PS, r = p_PoSo [m].
+    It maps motion signals zeta (16) of pose frame P, and the wrench F, to the sensor frame S.
     """
     M = np.zeros((19, SIGNALS + 6))
     M[0, 0] = 1.0
@@ -135,12 +134,8 @@ def fit_rigid(
 ) -> RigidFit:
     """Fit a rigid load; all bands get one weight if no rigid load explains the wrench.
 
-    Args:
-        Z: (bands, 38, 38) second moments, `Spectra.moments`.
-        Q: (bands, 38, 38) noise of the poses in Z, `spectra.noise_moments`.
-        free: (23,) True for estimated parameters.
-        linear: fit of the linear model, whose residual gives the first weights.
-        gain: standard deviation of the sensor gains.
+    Z (bands, 38, 38) are second moments, Q the part that noise of the poses adds. Parameters with
+    `free` (23,) True are estimated. The residual of the fit `linear` gives the first weights.
     """
     record = _Record(Z, Q, levels, free, linear.power)
     solution = _solve(record, start)

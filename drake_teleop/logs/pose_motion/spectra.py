@@ -64,7 +64,6 @@ class Grid:
 
     @cached_property
     def frequency(self) -> Array:
-        """Frequencies (L,) of the Fourier transforms [Hz]."""
         return np.asarray(np.fft.rfftfreq(self.length, self.dt), np.float64)
 
 

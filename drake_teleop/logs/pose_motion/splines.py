@@ -129,7 +129,7 @@ class PoseSplines:
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """Return the signals zeta (N, 16) of Eq. (T73) at times t (N,) [s], in the axes of P.
 
-        They are [1, acceleration, -gravity, alpha, products of omega]. Values at the ends are held.
+        They are [1, acceleration, -gravity, alpha, products of omega].
         """
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         zeta = np.empty((len(t), SIGNALS))

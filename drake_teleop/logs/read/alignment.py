@@ -235,8 +235,8 @@ _MIN_DELAY_SAMPLES = 32
 def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
     """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c of the wrench
-    w, within +-0.25 s or a tenth of the record. Offsets o, and phi (10,) if not given, are fitted.
+    It minimizes the log variance of the residual, summed over the wrench channels, within
+    +-0.25 s. Offsets, and phi (10,) if not given, are fitted.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_passed(log, cutoff)

@@ -1,7 +1,7 @@
 """Arrays of HDF5, Zarr and MATLAB files; `group/name` becomes `group.name`.
 
-MATLAB files of version 7.3 are HDF5. Versions 5 to 7 are parsed here (MathWorks, MAT-File Format),
-because invalid files can crash SciPy's reader. Other types are ignored.
+MATLAB files of versions 5 to 7 are parsed here (MathWorks, MAT-File Format), because invalid files
+can crash SciPy's reader.
 """
 
 from __future__ import annotations
@@ -25,14 +25,8 @@ _MAX_VALUES, _MAX_ROW = 2**28, 64  # numbers of an array, and of one row: wider 
 def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[str, NDArray]:
     """Return the numeric arrays of an HDF5 file; links to other files are not followed.
 
-    Args:
-        transpose: reverse the axes, as for files of MATLAB.
-        group: only arrays in this group, with names relative to it.
-
-    Raises:
-        DrakeTeleopError: if h5py is not installed.
-        OSError: if the file is damaged.
-        ValueError: for an array that is too large or in another file.
+    Names are relative to `group`. `transpose` reverses the axes, as for files of MATLAB. Raise
+    OSError for a damaged file, ValueError for a too large array or one in another file.
     """
     h5py, found = library("h5py", path), dict[str, NDArray]()
     with h5py.File(path, "r") as file:

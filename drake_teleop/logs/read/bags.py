@@ -1,8 +1,7 @@
 """ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
 Columns are numbers and arrays (up to 64) by path (`wrench.force.x`, `data.0`), unique short names
-(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp`, the latter of these two. Groups
-with covariance -1 are absent, as in ROS.
+(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp`, the latter of these two.
 """
 
 from __future__ import annotations

@@ -1,17 +1,4 @@
-"""Clock of one stream: checks and corrections of its time stamps.
-
-=========================== ======================================================================
-time stamps                 result
-=========================== ======================================================================
-missing (NaN)               rows are removed, with a note
-repeated, rows identical    repetitions are removed, with a note
-repeated, rows differ       rows are spaced evenly, see `spread`, with a note
-decreasing or too uneven    error that names the row
-implausible rate            error that proposes a unit
-starting again              episodes follow each other after gaps, see `join_episodes`
-gaps                        samples in them are not used, see `gaps`
-=========================== ======================================================================
-"""
+"""Clock of one stream: checks and corrections of its time stamps (docs/log-description.md)."""
 
 from __future__ import annotations
 
@@ -43,7 +30,7 @@ _WINDOW = 50
 
 @dataclass(frozen=True)
 class Clock:
-    """Times t (N,) of the rows of a stream, increasing, on the common clock [s].
+    """Increasing times t (N,) of the rows of a stream on the common clock [s].
 
     Attributes:
         rows: (N,) row of the table for each time.
@@ -64,7 +51,7 @@ class Clock:
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
-    """Return checked and corrected times of a stream's rows (see module `clocks`).
+    """Return checked and corrected times of a stream's rows.
 
     A row is repeated if it equals the previous row in all `columns`.
     """
@@ -146,8 +133,8 @@ def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
 def join_episodes(t: Array) -> tuple[Array, int]:
     """Return increasing times (N,) for a clock that starts again, and the number of its starts.
 
-    A new start is a step back to within two median steps of the first stamp, from which the clock
-    runs on. Other steps back are not changed. NaN stays NaN.
+    A new start is a step back to near the first stamp, from which the clock runs on. Other steps
+    back are not changed. NaN stays NaN.
     """
     finite = np.isfinite(t)
     known = t[finite]

@@ -331,7 +331,6 @@ class Description(Strict):
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
-        """Return the poses of S with gravity, described pose frame and IMU data."""
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation

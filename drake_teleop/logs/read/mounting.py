@@ -123,10 +123,8 @@ def solve(
 ) -> tuple[Array, Array]:
     """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
 
-    Args:
-        residual: function of x that returns residuals (N, 3 k).
-        x: start.
-        linear: (N, 3 k, m) constant derivatives by the last m parameters.
+    `residual` maps x to residuals (N, 3 k). `linear` (N, 3 k, m) are constant derivatives by the
+    last m parameters.
     """
     linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
     rows, channels, _ = linear.shape
@@ -280,8 +278,8 @@ class Mounting:
         lag_s: constant lag of the IMU's clock behind the pose's clock [s].
         lag_middle_s, middle_s: lag at mid-record, and this time on the pose's clock [s].
         drift: growth of the lag [s/s]; 0 if insignificant.
-        unexplained: unexplained share of the variance of the specific force.
-        unexplained_turning: that of the angular velocity; None without a gyroscope.
+        unexplained, unexplained_turning: unexplained shares of the variance of specific force and
+            angular velocity (None without a gyroscope).
         mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (RMS), or None.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
@@ -337,15 +335,10 @@ class Mounting:
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
-    """Estimate rotation, position and clock of an IMU relative to the pose.
+    """Estimate rotation, clock and (with `position`) accelerometer position of an IMU.
 
-    By least squares at 8 Hz, starting from the rotation of Kabsch (1976); lags are within +-1 s.
-    None if the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
-
-    Args:
-        imu: the log.
-        pose: the same log, read without the IMU.
-        position: True to estimate the position of the accelerometer.
+    `pose` is the same log as `imu`, read without the IMU. Lags are within +-1 s. Return None if
+    the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_MAX_LAG_S, 0.2 * float(stop - start))

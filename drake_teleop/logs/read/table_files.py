@@ -38,7 +38,7 @@ _MAX_CELLS_IN_MEMORY = 2**24
 def read_table(path: Path, *, header: bool = True) -> Table:
     """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
 
-    Without a header the columns of a text file are named from "0" on.
+    The columns of a text file without header are named from "0" on.
     """
     kind = FORMATS.check(path.suffix.lower(), str(path))
     if not (os.path.isdir if kind == ".zarr" else os.path.isfile)(path):

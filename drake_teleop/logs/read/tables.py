@@ -47,10 +47,7 @@ class Table:
         return self.first_row + int(row if self.kept is None else self.kept[row])
 
     def filled(self, names: Sequence[str | int]) -> Table:
-        """Return the rows in which at least one of the named columns has a number.
-
-        Recorders of several topics write one table, and leave the cells of other topics empty.
-        """
+        """Return the rows in which at least one of the named columns has a number."""
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.raw(names[0], "")).all():
             return self
