@@ -31,10 +31,7 @@ _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
 def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
-    """Return motion and load of a log with poses, and the source of the delay.
-
-    `delay` of the motion behind the wrench is in [s], or "auto".
-    """
+    """Return motion and load of a log with poses, and the source of the delay."""
     return _with_delay(log, delay, lambda late: _estimate(log, late), 0.0, "undetermined")
 
 
@@ -43,9 +40,8 @@ def motion_of_known_load(
 ) -> tuple[PoseMotion, str] | None:
     """Return the motion from poses that fits an identified load best, and the source of the delay.
 
-    The coefficients `load` (6, 16) are from `load_coefficients`. The delay is
-    `usual_s` [s] for a record that does not determine it. Return None without poses, for a short
-    record, and if the IMU disagrees with the poses.
+    The delay is `usual_s` [s] for a record that does not determine it. Return None without poses,
+    for a short record, and if the IMU disagrees with the poses.
     """
     posed = log.posed
     if posed is None or log.static:
@@ -90,10 +86,7 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log with the motion of splines and without delay, and (N,) booleans.
-
-    They are True near ends and gaps of the poses, where the acceleration is noisy.
-    """
+    """Return the log with spline motion and without delay, and (N,) True near ends and gaps."""
     assert log.posed is not None
     moved, splines = undelayed(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W

@@ -34,10 +34,9 @@ class CausalWrench:
 
 
 def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
-    """Filter samples x (N, ...) by a second-order Butterworth low-pass, Eq. (T11).
+    """Filter samples x (N, ...) by a causal second-order Butterworth low-pass, Eq. (T11).
 
-    The input is not filtered for a cut-off of None or above the Nyquist rate. The output is
-    extrapolated over `ahead_s` [s] by its slope.
+    Extrapolate the output over `ahead_s` [s] by its slope. Do not filter for a cut-off of None.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -63,10 +62,7 @@ def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> 
 
 @njit(cache=True)
 def design_low_pass(dt, tangent, ahead_s, low_pass):
-    """Write filter coefficients b, a_1, a_2 and the steady-state memory at input 1 to `low_pass`.
-
-    `tangent` is tan(pi cutoff dt), for the bilinear transform.
-    """
+    """Write the low-pass for `tangent` = tan(pi cutoff dt) to the coefficients `low_pass` (7,)."""
     k = 2.0 / dt
     w = k * tangent / _ROOT_4_OF_3
     square, damping = w * w, _ROOT_OF_2 * w * k

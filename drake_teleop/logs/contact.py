@@ -92,7 +92,7 @@ def detect_contact(
 
     Samples with `edge` True, or within a period of the low-pass from the ends, are not judged.
     `covariance` (16, 16) is that of [offsets; phi], `usual` (6,) the RMS residual of the
-    identification [N, N m]. `free` are samples of free motion, and their sample time [s].
+    identification [N, N m]. `free` is a log of free motion, and its sample time [s].
     """
     period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
     inner = _judged_samples(rows, dt, period, edge)
@@ -223,10 +223,7 @@ def _detection_notes(
 
 
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if most of a record seems to be contact, else ().
-
-    `shift` (6,) is the change of its offsets since the free motion [N, N m].
-    """
+    """Return a note if most of a record seems to be contact, which shifts its offsets, else ()."""
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _CONTACT_SHARE_OF_SHIFT:
         return ()

@@ -49,10 +49,7 @@ _OTHER_REMEDIES = {
 
 
 def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
-    """Return the causes, with the corrected description lines at the end of their messages.
-
-    `by_pose` is True if the acceleration is from poses, not from an IMU.
-    """
+    """Add the corrected lines of the log description to the messages of causes."""
     _, texts, corrected = _correct_fields(causes, log, by_pose)
     return tuple(
         replace(cause, message=f"{cause.message}; {text}", fields=fields) if text else cause
@@ -219,10 +216,7 @@ _BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
-    """Search for causes why a rigid load does not explain the wrench; None for a short log.
-
-    `delay_s` is the delay of the motion behind the wrench [s], `found` the motion by splines.
-    """
+    """Search for causes why a rigid load does not explain the wrench; None for a short log."""
 
     def with_delay(more: float) -> Instants:
         late = delay_s + more

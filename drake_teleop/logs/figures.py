@@ -26,7 +26,6 @@ from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 def common_figures(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
-    """Return the fields with which the summaries of `identify` and `eliminate` begin."""
     log = found.log
     findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {

@@ -46,9 +46,8 @@ def inspect_command(
 ) -> dict[str, Any]:
     """Inspect a canonical log, a log description, any table or a bag; return the summary.
 
-    Write summary.json into the folder `out`. Write draft.yaml for unknown tables and bags: a
-    description of `log` and of `others` (further files of the same recording), in which signs,
-    axes and units are those that fit the data.
+    Write summary.json into the folder `out`. For unknown tables and bags also write draft.yaml: a
+    description of `log` and `others` (files of the same recording) that fits the data.
     """
     summary: dict[str, Any] = {"log": str(log), "kind": "description", "topics": {}, "streams": {}}
     summary |= {"findings": [], "fit": None, "mounting": None, "delay_s": None, "draft": None}

@@ -52,8 +52,8 @@ def fit_posed(
 ) -> tuple[PosedFit | None, tuple[Finding, ...]]:
     """Return the load identified from wrench and poses, and findings about the pose frame.
 
-    The load is None for a method without splines ("robust" and "consistent" use them), a log
-    without usable poses, or an IMU that contradicts the poses.
+    The load is None for a method without splines, a log without usable poses, or an IMU that
+    contradicts the poses.
     """
     if log.posed is None or method not in ROBUST or not usable(log):
         return None, ()

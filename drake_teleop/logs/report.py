@@ -72,8 +72,7 @@ def write_report(
 ) -> None:
     """Write the HTML report of an identification, with fit.png and knowledge.png of its folder.
 
-    `alone` is the load of the object alone,
-    if the gripper is known.
+    `alone` is the load of the object alone, if the gripper is known.
     """
     log, result = found.log, found.identification
     tables = [

@@ -82,10 +82,7 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 
 
 def stretches(state: State, covariance: Array) -> list[Stretch]:
-    """Return the parts of a record between changes of the load; none without a change.
-
-    `covariance` (16, 16) is that of [offsets; phi] in the first part.
-    """
+    """Return the parts of a record between changes of the load; none without a change."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []

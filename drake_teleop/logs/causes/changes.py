@@ -103,10 +103,7 @@ def with_ramps(
     spans: Spans,
     widths: Sequence[float] | None = None,
 ) -> State:
-    """Fit gradual changes of `kinds` near `times` [s], without the rows within `widths` [s].
-
-    `spans` are other omitted time spans; `state` has the initial parameters.
-    """
+    """Fit gradual changes of `kinds` near `times` [s], without the rows within `widths` [s]."""
     widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [Step(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]

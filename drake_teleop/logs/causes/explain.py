@@ -52,7 +52,6 @@ _FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"),
 
 
 def is_noise(state: State) -> bool:
-    """Return whether the residual of a fitted model is sensor noise."""
     if (
         has_negative_inertia(state)
         or state.residual_ratio > MAX_RESIDUAL_RATIO
@@ -76,8 +75,7 @@ def search(
 ) -> Found:
     """Return the model that explains a record, additional delay [s], and rejected candidates.
 
-    `with_delay` returns the record with an additional delay [s]. `given` are extensions that the
-    model has from the start.
+    The model contains the extensions `given` from the start.
     """
     plain = Model(parts=given)
     found = _search(_initial_state(data, plain), 0.0, with_delay)
@@ -275,8 +273,8 @@ def explain(
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    `with_delay` returns the record with an additional delay [s]. `given` are extensions that the
-    model has from the start, such as "weight".
+    The model contains the extensions `given`, such as "weight", from the start. `with_delay`
+    returns the record with an additional delay [s].
     """
     with one_blas_thread():
         state, delay_s, rejected = search(data, with_delay, given)

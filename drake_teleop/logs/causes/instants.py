@@ -47,15 +47,14 @@ Motion = Callable[[Array], tuple[Array, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Instants:
-    """Block means of a record (see module `instants`).
+    """Means of a record over blocks of about 20 ms.
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, WIDTH) signals; 0 in unused rows.
+        y: (M, WIDTH) signals of the module docstring; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
         white: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
-        positions: whether positions are known.
         acceleration_noise: in a block mean [m/s^2].
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """

@@ -34,10 +34,7 @@ _LARGEST_GAIN_ERROR = 0.025
 def covariance_of(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes.
-
-    `blocks` (16,) is from `block_deviations`, `gains` (16, 16) from `gain_covariance`.
-    """
+    """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
     out = state.fit.covariance[LOAD, LOAD].copy()
     deviations = np.sqrt(np.diag(out))
     factor = misfit_factor(state, blocks)
@@ -77,10 +74,7 @@ def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
 
 
 def gain_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] that errors of all 36 sensor gains cause.
-
-    The residual determines the size of these errors.
-    """
+    """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
     unit = np.repeat([1.0, TORQUE_ARM_M], 3)

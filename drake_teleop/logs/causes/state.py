@@ -28,7 +28,6 @@ class Rows:
     columns: NDArray[np.intp]
 
     def fits(self, model: Model) -> bool:
-        """Return whether `model` needs the same signals."""
         return self.times == model.times and np.array_equal(self.columns, model.columns)
 
     @cached_property
@@ -242,10 +241,7 @@ class State:
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """Gain of twice the log likelihood by generic smooth signals, per degree of freedom.
-
-        It is about 1 or below for noise of any colour.
-        """
+        """Gain of `smooth_gain` per degree of freedom: about 1 or below for noise of any colour."""
         gain, freedom = self.smooth_gain
         return gain / max(1, freedom - self.model.size)
 

@@ -222,10 +222,7 @@ def _without_remedy(
 
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
-    """Return a finding if a record does not determine the mass of a load.
-
-    `unexplained` is the unexplained share of the wrench's variance.
-    """
+    """Return a finding if a record does not determine the mass of a load."""
     if load.verdicts[6] != "not" and unexplained < UNDETERMINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])

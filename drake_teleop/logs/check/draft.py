@@ -140,10 +140,7 @@ _NOTHING = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
-    """Guess a log description from the names and magnitudes of a table's columns.
-
-    `folder` is that of the draft, to which the path to the table is relative.
-    """
+    """Guess a log description from the names and magnitudes of a table's columns."""
     plain = {name: _normalized(name) for name in table.columns}
     found = _pose_vectors(table, plain) | _vectors(plain) | _euler_angles(plain)
     found |= _numbered(plain) | _arrays(table, plain)

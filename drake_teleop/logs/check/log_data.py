@@ -83,7 +83,6 @@ class LogData:
         return self.tables[stream.source].filled(stream.columns)
 
     def _stamps(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
-        """Return the finite time stamps of a stream [s], and their rows."""
         if stream.time.column is None:
             rows = np.arange(self._table(stream).rows)
             return rows / stream.time.rate, rows

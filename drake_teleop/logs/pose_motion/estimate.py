@@ -122,9 +122,8 @@ class PoseEstimate(PoseMotion):
         fit: load, with the pose frame as described or as estimated on request.
         free: load, with the pose frame always estimated.
         frame: pose frame of `free`.
-        seen: units, axes and masses before a rigid load is assumed.
+        seen: units, axes and masses from a fit without a rigid load.
         t, rejected: (M,) instants [s], and True for disturbed ones.
-        note: note for the user, or "".
     """
 
     fit: RigidFit
@@ -219,10 +218,7 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseMotion:
-    """Return the motion from poses of S with which an identified load fits a wrench best.
-
-    `load` (6, 16) is from `load_coefficients`.
-    """
+    """Return the motion from poses of S with which an identified load fits a wrench best."""
     with one_blas_thread():
         motion, last, _ = _find_motion(
             *(t, wrench, poses, gravity_W, delay, lost, imu),

@@ -182,7 +182,6 @@ class Spectra:
         return bool(edged or self.grid.load is not None)
 
     def at(self, delay: float) -> Spectra:
-        """Return the spectra with the signals at another delay [s]."""
         shift, signals = delay - self.delay, self.signals
         if self.taper_fixed:
             before = shift_taper(self.grid, self.taper, shift)
@@ -322,7 +321,7 @@ def guess_spacing(
 def choose_spacing(
     window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return the splines (of `choices`), knot distance [s] and delay [s] of about lowest cost.
+    """Return splines, knot distance [s] and delay [s] of about lowest cost.
 
     Knots are 8 or 16 % closer than at lowest cost. The delay is not changed if `known`.
     """
@@ -389,10 +388,7 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
 
 
 def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
-    """Return the poses on the wrench's clock, for a relative rate error of the poses' clock.
-
-    The delay at mid-record, `delay` [s], is unchanged.
-    """
+    """Return the poses on the wrench's clock, for a relative rate error of the poses' clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 

@@ -80,10 +80,9 @@ class Inertial:
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """Poses of S in a log, and the described frame P that was recorded.
+    """Poses of S in a log, with gravity in the world [m/s^2], and the described pose frame P.
 
     Attributes:
-        gravity_W: (3,) gravity in the world [m/s^2].
         p_SoPo_S: (3,) described origin of P [m].
         R_SP: (3, 3) described rotation of P.
     """

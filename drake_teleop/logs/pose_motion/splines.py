@@ -216,10 +216,7 @@ class SplineCache:
 
 
 def passed(frequency: Array, spacing: float) -> Array:
-    """Return the share (K,) of white noise's power that splines pass, Eq. (T72).
-
-    `frequency` (K,) is in [Hz], the knot distance `spacing` in [s].
-    """
+    """Return the share (K,) of white noise's power that splines pass at a frequency, Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)

@@ -61,10 +61,7 @@ def _interpolate(t_new: Array, t: Array, x: Array) -> Array:
 
 
 def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
-    """Filter samples x (N, ...) of spacing `dt` [s] without phase shift, Eq. (T10).
-
-    The input is not filtered for a cut-off of None or above the Nyquist rate.
-    """
+    """Filter samples x (N, ...) without phase shift, Eq. (T10); no filter for a cut-off None."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return x
     n = len(x)
@@ -235,8 +232,8 @@ _MIN_DELAY_SAMPLES = 32
 def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
     """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    It minimizes the log variance of the residual, summed over the wrench channels, within
-    +-0.25 s. Offsets, and phi (10,) if not given, are fitted.
+    It minimizes the log variance of the residual, summed over the wrench channels. Offsets, and
+    phi (10,) if not given, are fitted.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_passed(log, cutoff)

@@ -214,7 +214,7 @@ def weight_wrench(weight: Array, gravity: Array) -> Array:
 def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     """Add the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] to a log.
 
-    `motion_log` is the same log with motion, from which the delay is estimated and removed.
+    The delay is estimated from `motion_log`, the same log with motion, and removed.
     """
     assert motion_log.gravity is not None
     at = np.clip(log.t + free_delay(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1])

@@ -110,7 +110,6 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """Return the table of a described stream, from its file or from its topic of a bag."""
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):

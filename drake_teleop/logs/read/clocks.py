@@ -53,7 +53,7 @@ class Clock:
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
     """Return checked and corrected times of a stream's rows.
 
-    A row is repeated if it equals the previous row in all `columns`.
+    A row with the same values in all `columns` as the previous row is a repetition.
     """
     if time.column is None:
         assert time.rate is not None
@@ -133,8 +133,7 @@ def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
 def join_episodes(t: Array) -> tuple[Array, int]:
     """Return increasing times (N,) for a clock that starts again, and the number of its starts.
 
-    A new start is a step back to near the first stamp, from which the clock runs on. Other steps
-    back are not changed. NaN stays NaN.
+    A step back to near the first stamp is a new start. Other steps back are not changed.
     """
     finite = np.isfinite(t)
     known = t[finite]

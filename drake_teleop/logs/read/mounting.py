@@ -72,8 +72,7 @@ def clock_drift(
 ) -> tuple[float, float]:
     """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
 
-    `lag` [s] is a first estimate, `independent` the number of independent samples. A drift that is
-    insignificant or below 10 ms in total is 0.
+    `lag` [s] is a first estimate. An insignificant drift is set to 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])
@@ -240,10 +239,7 @@ def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) 
 
 
 def lever_matrix(omega: Array, alpha: Array) -> Array:
-    """Return the matrix K (N, 3, 3) with K p the acceleration of point p relative to the origin.
-
-    Eq. (T20), for omega [rad/s] and alpha [rad/s^2] (N, 3).
-    """
+    """Return K (N, 3, 3), Eq. (T20): K p is the acceleration of point p relative to the origin."""
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
 
