@@ -21,7 +21,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     motion_of_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
-from drake_teleop.logs.read.alignment import delay_of, ends, low_pass, undelayed
+from drake_teleop.logs.read.alignment import delay_of, low_pass, near_ends, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
@@ -165,26 +165,26 @@ def aligned_log(
         moved = replace(moved, notes=(*moved.notes, *clock_note(motion)))
         plain = undelayed(log, motion.delay_s) if differentiate else None
         if weight_removed:
-            moved = accelerated(moved)
-            plain = None if plain is None else accelerated(plain)
-        edge = one_sided | ends(moved, 0.0, cutoff_hz)
+            moved = replace_force_by_acceleration(moved)
+            plain = None if plain is None else replace_force_by_acceleration(plain)
+        edge = one_sided | near_ends(moved, 0.0, cutoff_hz)
         smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
         if log.posed is None or log.posed.imu is None:
             return smooth
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
-    log = accelerated(log) if weight_removed else log
+    log = replace_force_by_acceleration(log) if weight_removed else log
     delay_s, source = delay_of(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = usual_s, "load"
     log = undelayed(log, delay_s)
-    other = AlignedLog(log, delay_s, source, log, ends(log, log.one_sided_s, cutoff_hz))
+    other = AlignedLog(log, delay_s, source, log, near_ends(log, log.one_sided_s, cutoff_hz))
     if smooth is None or _spread(other, phi, cutoff_hz) < _spread(smooth, phi, cutoff_hz):
         return other
     return smooth
 
 
-def without_orientation(where: str) -> DrakeTeleopError:
+def missing_orientation_error(where: str) -> DrakeTeleopError:
     """Return the error for a log with removed weight and without orientation."""
     return DrakeTeleopError(
         "the robot has removed the weight of the load from the wrench, and without an orientation"
@@ -194,10 +194,10 @@ def without_orientation(where: str) -> DrakeTeleopError:
     )
 
 
-def accelerated(log: Log) -> Log:
+def replace_force_by_acceleration(log: Log) -> Log:
     """Return the log with acceleration in place of specific force."""
     if log.gravity is None:
-        raise without_orientation(log.source)
+        raise missing_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 

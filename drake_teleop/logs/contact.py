@@ -68,7 +68,7 @@ class Detection:
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
-def samples_of(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
+def detector_samples(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
     s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)

@@ -17,10 +17,10 @@ from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
-from drake_teleop.logs.causes.intervals import attenuation
+from drake_teleop.logs.causes.intervals import attenuation_bias
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
+from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_share
 from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.auto_frames import log_instants
 from drake_teleop.logs.read.canonical import Log
@@ -48,7 +48,7 @@ _OTHER_REMEDIES = {
 }
 
 
-def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
+def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
     """Add the corrected lines of the log description to the messages of causes."""
     _, texts, corrected = _correct_fields(causes, log, by_pose)
     return tuple(
@@ -230,7 +230,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
     why = explain(data, with_delay, log.free)
     if log.described is None:
         return why
-    causes = with_lines(why.causes, log, by_pose=found is not None)
+    causes = add_description_lines(why.causes, log, by_pose=found is not None)
     return replace(why, causes=causes)
 
 
@@ -256,7 +256,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 def _acceleration_noise(splines: PoseSplines) -> float:
     f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
-    share = passed(f, splines.spacing)
+    share = passed_noise_share(f, splines.spacing)
     if splines.imu_rows is not None:
         share = share * splines.imu_rows.share(f)[0]
     power = 2.0 * splines.noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
@@ -268,7 +268,7 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
     load = _explained_load(load, why)
     if why.state.data.gravity_W is not None:
         return load
-    extra = attenuation(why.state)
+    extra = attenuation_bias(why.state)
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
     covariance = load.covariance + np.diag(extra**2)
@@ -309,7 +309,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
     )
 
 
-def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
+def replace_frame_causes(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
     """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
     if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
@@ -317,7 +317,7 @@ def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
     return why.causes
 
 
-def removed_note(why: Explanation) -> str:
+def removed_weight_note(why: Explanation) -> str:
     """Return a note about the weight that the robot removes (`wrench.weight: removed`), or ""."""
     if "weight" not in why.given or why.removed_weight is None:
         return ""

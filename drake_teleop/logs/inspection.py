@@ -21,7 +21,7 @@ from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import seconds, shortest_gap
+from drake_teleop.logs.read.clocks import shortest_gap, time_stamps_s
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -267,7 +267,7 @@ def _clock(
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return [], np.ones(rows, bool)
-    stamps, figures["episodes"] = seconds(time, table, at)
+    stamps, figures["episodes"] = time_stamps_s(time, table, at)
     highest = np.fmax.accumulate(stamps)
     usable = np.isfinite(stamps)
     usable[1:] &= stamps[1:] > highest[:-1]

@@ -41,20 +41,26 @@ from drake_teleop.logs.contact import (
     MIN_SAMPLES,
     Detection,
     detect_contact,
+    detector_samples,
     noise_floor,
     offset_shift_note,
     robust_offsets,
-    samples_of,
 )
 from drake_teleop.logs.explained_log import (
     explain_log,
     explained_load,
     implausible_mass_message,
-    named_frame,
-    removed_note,
+    removed_weight_note,
+    replace_frame_causes,
 )
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
-from drake_teleop.logs.read.alignment import delay_of, low_pass, low_passed, measured, undelayed
+from drake_teleop.logs.read.alignment import (
+    delay_of,
+    far_from_gaps,
+    low_pass,
+    low_passed,
+    undelayed,
+)
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
@@ -194,7 +200,7 @@ def _identified(
     else:
         delay_s, source = delay_of(log, cutoff_hz, delay)
         log = undelayed(log, delay_s)
-        log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
+        log = low_passed(log, cutoff_hz).only(far_from_gaps(log, cutoff_hz))
         fit = identify_batch(
             log.wrench,
             *log.motion,
@@ -219,10 +225,10 @@ def _identified(
         result = replace(result, identifiable=known)
     if why is not None:
         result = explained_load(result, why)
-        causes = named_frame(why, other[0]) if other else why.causes
+        causes = replace_frame_causes(why, other[0]) if other else why.causes
     note = fit.note if not causes or (why is not None and why.several_gains) else ""
     if raw.free and why is not None:
-        note = removed_note(why)
+        note = removed_weight_note(why)
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
@@ -380,10 +386,10 @@ def eliminate_log(
         )
     if found.log.static:
         return found
-    samples = samples_of(found.log, found.contact, cutoff_hz)
+    samples = detector_samples(found.log, found.contact, cutoff_hz)
     reference = None
     if free_motion is not None:
-        free_samples = samples_of(free_motion.log, free_motion.contact, cutoff_hz)
+        free_samples = detector_samples(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.at(~free_motion.edge), free_motion.log.dt
     covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
     options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
@@ -430,7 +436,7 @@ def _eliminated(
         raise DrakeTeleopError(
             "poses at rest have no order in time", where="causal", remedy="leave it out"
         )
-    known = measured(log, cutoff_hz)
+    known = far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
     def smooth(wrench: Array) -> Array:
@@ -548,7 +554,7 @@ def _suspected_errors(
     return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
-def removed_weight(where: str) -> DrakeTeleopError:
+def weight_scale_error(where: str) -> DrakeTeleopError:
     """Return the error for a scale of the weight if the robot has already removed the weight."""
     return DrakeTeleopError(
         "the robot has removed the weight, so that sigma_weight has no effect",
@@ -563,7 +569,7 @@ def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
     if weights == inertias:
         return
     if removed:
-        raise removed_weight(log.source)
+        raise weight_scale_error(log.source)
     if log.gravity is None:
         raise unknown_gravity(
             f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array, runs
 from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import DELAY, Step
-from drake_teleop.logs.causes.state import Spans, State, gain_of, in_spans, regularized_inverse
+from drake_teleop.logs.causes.state import (
+    Spans,
+    State,
+    in_spans,
+    likelihood_gain,
+    regularized_inverse,
+)
 
 _MIN_GAIN = 60.0
 _REFINEMENTS, _REFINEMENT_STEPS = (1.0, 0.25), 2  # instants
@@ -93,7 +99,7 @@ class _StepScan:
         mixed = gram[:, which]
         pull = right[which] - mixed.T @ (self._inverse @ self._right[0])
         schur = gram[which, which] - mixed.T @ self._inverse @ mixed
-        return gain_of(schur, pull, 1e-6 * np.diag(gram)[which])[0]
+        return likelihood_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
 def with_ramps(

@@ -51,7 +51,7 @@ _FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"),
 """Causes with many columns, which resemble others; required margins of their scores."""
 
 
-def is_noise(state: State) -> bool:
+def residual_is_noise(state: State) -> bool:
     if (
         has_negative_inertia(state)
         or state.residual_ratio > MAX_RESIDUAL_RATIO
@@ -86,13 +86,15 @@ def search(
         is_wrench = opposite[0].model.factor > 0.0
         if is_wrench and opposite[0].residual_ratio < _FIFTH * found[0].residual_ratio:
             found = opposite
-    if with_delay is None or may_be_coloured_noise(found[0]) or is_noise(found[0]):
+    if with_delay is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
         return found
     delay_s = free_delay(data)
     if abs(delay_s - found[1]) < _SAME_DELAY_S:
         return found
     repeated = _search(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
-    better = is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
+    better = (
+        residual_is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
+    )
     better = better or (repeated[0].residual_ratio < _FIFTH * found[0].residual_ratio)
     return repeated if better else found
 
@@ -119,7 +121,7 @@ def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found
     state, delay_s = _remove_delay(state, delay_s, with_delay)
     rejected: list[Candidate] = []
     for number in range(ROUNDS):
-        if is_noise(state):
+        if residual_is_noise(state):
             return state, delay_s, []
         found = _without_attenuation(list(candidates(state, first=number == 0)))
         rejected = [x for x in found if is_plausible(x.state)]
@@ -282,7 +284,7 @@ def explain(
         gains = gain_covariance(state) + factor_covariance(state)
         covariance = covariance_of(state, rejected, blocks, gains)
         causes = causes_of(state, given)
-        only_noise = is_noise(state)
+        only_noise = residual_is_noise(state)
         if (
             not causes
             and (only_noise or may_be_coloured_noise(state))

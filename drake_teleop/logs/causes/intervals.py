@@ -117,7 +117,7 @@ def factor_covariance(state: State) -> Array:
     return out
 
 
-def attenuation(state: State) -> Array:
+def attenuation_bias(state: State) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))

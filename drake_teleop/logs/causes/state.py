@@ -265,7 +265,7 @@ class State:
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
-            solved, rank = gain_of(x.T @ x, x.T @ white)
+            solved, rank = likelihood_gain(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
         return gain, freedom
 
@@ -274,10 +274,10 @@ class State:
         x = model.start(self.x, self.model)
         rows = self._rows_of(model)
         residual = self.fit.residual if rows is self.rows else model.residual(x)
-        return gain_of(*replace(self.fit, rows=rows, residual=residual).normal(model, x))[0]
+        return likelihood_gain(*replace(self.fit, rows=rows, residual=residual).normal(model, x))[0]
 
 
-def gain_of(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
+def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
     """Return right^T gram^-1 right and the rank; diagonals below `least` count as rounding."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())

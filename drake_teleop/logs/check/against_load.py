@@ -26,8 +26,8 @@ from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
     SEARCH_RANGE,
     estimate_delay,
+    far_from_gaps,
     low_passed,
-    measured,
     resample,
     undelayed,
     white_noise,
@@ -70,7 +70,7 @@ class LoadFit:
 def load_fit(log: Log) -> LoadFit:
     """Fit a load and constant offsets to a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_passed(log, cutoff).only(measured(log, cutoff))
+    smooth = low_passed(log, cutoff).only(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
     w = wrench - wrench.mean(axis=0)
@@ -123,7 +123,7 @@ _SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
 _HALVED = 0.5
 
 
-def against_load(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
+def check_wrench(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
     """Return findings about wrench, orientation and clocks, and the motion's delay [s]."""
     log = data.read(description)
     delay = None if log.static else estimate_delay(log, 30.0)

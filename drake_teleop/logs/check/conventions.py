@@ -15,7 +15,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_load import (
     GOOD_SHARE,
     LoadFit,
-    against_load,
+    check_wrench,
     drift_finding,
     load_fit,
     payload_finding,
@@ -27,7 +27,7 @@ from drake_teleop.logs.check.corrections import (
     Finding,
     correct_gravity_unit,
 )
-from drake_teleop.logs.check.imu_checks import against_itself, against_pose
+from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu_signals
 from drake_teleop.logs.check.log_data import LogData, channel_findings
 from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
@@ -148,7 +148,7 @@ def _is_suspicious(log: Log) -> bool:
     if (np.ptp(few.wrench, axis=0) < 1e-9 * np.abs(few.wrench).max()).any():
         return True
     with suppress(ValueError, ArithmeticError):
-        return bool(against_itself(log.described, few)[0])
+        return bool(check_imu_signals(log.described, few)[0])
     return False
 
 
@@ -179,11 +179,11 @@ def _check(data: LogData, description: Description) -> Conventions:
     if dead:  # A dead channel would cause wrong findings about motion and load.
         return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
     findings, description = correct_gravity_unit(description, log)
-    more, description = against_itself(description, data.thin(description))
+    more, description = check_imu_signals(description, data.thin(description))
     findings += more
     mounting = None
     if description.imu and description.pose:
-        more, mounting, description = against_pose(description, data)
+        more, mounting, description = check_imu_against_pose(description, data)
         findings += more
     fit = load_fit(data.thin(description))
     if broken or (mounting is not None and mounting.mirrored):
@@ -195,7 +195,7 @@ def _check(data: LogData, description: Description) -> Conventions:
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
         findings += position_finding(description, data, lag)
-    more, delay = against_load(description, data)
+    more, delay = check_wrench(description, data)
     findings = _one_clock(description, [*findings, *more], mounting, delay)
     rest = _rest_finding(log)
     if rest is not None:

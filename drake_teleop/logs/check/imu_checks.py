@@ -33,7 +33,7 @@ _WINDOW_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
 _ROTATION_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
 
 
-def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
+def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
     """Return contradictions among the signals of an IMU, and the corrected description."""
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
@@ -185,7 +185,7 @@ def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
     )
 
 
-def against_pose(
+def check_imu_against_pose(
     description: Description, data: LogData
 ) -> tuple[list[Finding], Mounting | None, Description]:
     """Return contradictions of IMU and pose, the IMU's mounting, and the corrected description."""

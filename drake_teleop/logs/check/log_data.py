@@ -17,7 +17,7 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.clocks import seconds, spread
+from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_s
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import read_description
 from drake_teleop.logs.read.streams import MINIMUM_SAMPLES
@@ -86,12 +86,12 @@ class LogData:
         if stream.time.column is None:
             rows = np.arange(self._table(stream).rows)
             return rows / stream.time.rate, rows
-        t, _ = seconds(stream.time, self._table(stream), "time")
+        t, _ = time_stamps_s(stream.time, self._table(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
-        return (spread(t) if shared else t), rows
+        return (spread_shared_stamps(t) if shared else t), rows
 
     def _thin(self, name: str, stream: Any, thin: Table, k: int) -> None:
         table, rows = self._table(stream), None

@@ -16,10 +16,10 @@ from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
     Spectra,
     Window,
-    at_rate,
     averaged_splines,
     choose_spacing,
     clock_rate,
+    correct_clock_rate,
     delay_deviation,
     fit_levels,
     fit_linear_model,
@@ -264,7 +264,9 @@ def _find_motion(
     part = replace(part, taper=exclude(part.taper, disturbed, grid.dt))
     rate = 0.0 if known else clock_rate(part, cache, late, spacing)
     if rate:
-        near_poses, poses = (at_rate(x, rate, part.grid, late) for x in (near_poses, poses))
+        near_poses, poses = (
+            correct_clock_rate(x, rate, part.grid, late) for x in (near_poses, poses)
+        )
         cache = averaged_splines(near_poses)
     choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:

@@ -20,8 +20,8 @@ from drake_teleop.logs.pose_motion.spectra import (
     end_taper,
     moments,
     random_walk_shape,
+    shift_spectrum,
     shift_taper,
-    shifted,
     signal_spectrum,
     taper_derivative,
     wrench_spectrum,
@@ -186,7 +186,7 @@ class Spectra:
         if self.taper_fixed:
             before = shift_taper(self.grid, self.taper, shift)
             signals = signal_spectrum(self.grid, before, self.zeta, len(signals))
-        late = shifted(signals, self.of.frequency, shift)
+        late = shift_spectrum(signals, self.of.frequency, shift)
         late[:, 0] = self.signals[:, 0]
         return replace(self, signals=late)
 
@@ -378,7 +378,7 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
             return 0.0
         if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CHANGE_S:
             break
-        splines = PoseSplines(at_rate(cache.poses, trial, grid, delay), spacing)
+        splines = PoseSplines(correct_clock_rate(cache.poses, trial, grid, delay), spacing)
         now = first.with_motion(splines, window.gravity_W, delay)
         cost = now.fit().cost
         if not cost < least:
@@ -387,7 +387,7 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
     return best if 2.0 * (start - least) > _MIN_LIKELIHOOD_GAIN else 0.0
 
 
-def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
+def correct_clock_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
     """Return the poses on the wrench's clock, for a relative rate error of the poses' clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)

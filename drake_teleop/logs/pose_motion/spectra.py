@@ -11,7 +11,7 @@ from scipy.fft import next_fast_len
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed
+from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed_noise_share
 
 Complex = NDArray[np.complex128]
 
@@ -128,11 +128,11 @@ def end_taper(t: Array, start: float, stop: float) -> Array:
 
 def exclude(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((distance(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
+    edge = np.clip((distance_to_flag(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
-def distance(flags: NDArray[np.bool_]) -> Array:
+def distance_to_flag(flags: NDArray[np.bool_]) -> Array:
     """Return the number (M,) of instants to the nearest set flag; inf without any."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))
@@ -160,7 +160,7 @@ def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Comple
     return out
 
 
-def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
+def shift_spectrum(spectrum: Complex, frequency: Array, shift: float) -> Complex:
     """Return spectra (K, 16) of zeta and taper `shift` [s] later; the constant is unchanged."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
@@ -268,7 +268,7 @@ def noise_moments(
     """
     w2 = (2.0 * np.pi * of.frequency) ** 2
     per_number = np.sum(taper**2) / (grid.dt * splines.rate)
-    share = per_number * passed(of.frequency, splines.spacing)
+    share = per_number * passed_noise_share(of.frequency, splines.spacing)
     position_power, rotation_power = (std**2 * share for std in noise)
     if splines.imu_rows is not None:
         left = splines.imu_rows.share(of.frequency)

@@ -215,7 +215,7 @@ class SplineCache:
         return self._fit[spacing]
 
 
-def passed(frequency: Array, spacing: float) -> Array:
+def passed_noise_share(frequency: Array, spacing: float) -> Array:
     """Return the share (K,) of white noise's power that splines pass at a frequency, Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))

@@ -198,14 +198,14 @@ def undelayed(log: Log, delay_s: float) -> Log:
     )
 
 
-def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
+def far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
     return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
 
 
-def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
+def near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True within `length_s` [s], or a period of the low-pass, of either end."""
     out = np.zeros(len(log), bool)
     if log.static:
@@ -240,7 +240,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     reach = min(SEARCH_RANGE, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    gap = ~measured(log, cutoff)
+    gap = ~far_from_gaps(log, cutoff)
     gap = widened(gap, math.ceil(reach / log.dt)) if gap.any() else gap
     inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_DELAY_SAMPLES:

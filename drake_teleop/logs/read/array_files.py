@@ -28,7 +28,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
     Names are relative to `group`. `transpose` reverses the axes, as for files of MATLAB. Raise
     OSError for a damaged file, ValueError for a too large array or one in another file.
     """
-    h5py, found = library("h5py", path), dict[str, NDArray]()
+    h5py, found = import_optional("h5py", path), dict[str, NDArray]()
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:
@@ -44,7 +44,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
     """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
-    zarr = library("zarr", path)
+    zarr = import_optional("zarr", path)
     group = zarr.open_group(path, mode="r")
     members = group.members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}
@@ -64,7 +64,7 @@ def _is_table(item: Any, transpose: bool) -> bool:
     return True
 
 
-def library(name: str, path: Path) -> Any:
+def import_optional(name: str, path: Path) -> Any:
     """Import an optional package that reads a file; raise DrakeTeleopError if it is missing."""
     try:
         return import_module(name)

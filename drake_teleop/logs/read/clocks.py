@@ -59,7 +59,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         assert time.rate is not None
         rows = np.arange(table.rows)
         return Clock(_to_common_clock(rows / time.rate, time), rows, table.rows)
-    t, episodes = seconds(time, table, where)
+    t, episodes = time_stamps_s(time, table, where)
     total, rows = len(t), np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
@@ -76,7 +76,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     t = t[rows]
     shared = int((np.diff(t) == 0).sum())
     if shared:
-        even = spread(t)
+        even = spread_shared_stamps(t)
         _check_increasing(even, rows, table, where)
         notes.append(
             f"{shared} rows share the time stamp of the previous row: all rows are spaced evenly"
@@ -88,7 +88,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     return Clock(_to_common_clock(t, time), rows, total, tuple(notes), episodes)
 
 
-def seconds(time: Time, table: Table, where: str) -> tuple[Array, int]:
+def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
     """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
     Episodes are joined in the whole table, so that all its streams keep one clock.
@@ -160,7 +160,7 @@ def _to_common_clock(t: Array, time: Time) -> Array:
     return t[0] + time.scale * (t - t[0]) + time.offset
 
 
-def spread(t: Array) -> Array:
+def spread_shared_stamps(t: Array) -> Array:
     """Return evenly spaced times for rows that share time stamps `t` (N,) [s]."""
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))
@@ -170,7 +170,7 @@ def spread(t: Array) -> Array:
     return np.concatenate([_smooth_stamps(part, half, step / per_stamp) for part in parts])
 
 
-def gaps(t: Array, bandwidth_hz: float | None) -> Array:
+def find_gaps(t: Array, bandwidth_hz: float | None) -> Array:
     """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s]."""
     steps = np.diff(t)
     at = np.flatnonzero(steps > shortest_gap(float(np.median(steps)), bandwidth_hz))

@@ -16,9 +16,9 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import (
     estimate_delay,
+    far_from_gaps,
     low_pass,
     low_passed,
-    measured,
     resample,
     undelayed,
 )
@@ -117,7 +117,7 @@ RANK = 1e-5
 _MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
-def solve(
+def solve_least_squares(
     residual: Callable[[Array], Array], x: Array, linear: Array | None = None
 ) -> tuple[Array, Array]:
     """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
@@ -224,7 +224,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     centred = ((V - V.mean(axis=0)) / size).reshape(-1, 10)
     phi = np.linalg.lstsq(centred, (wrench - wrench.mean(axis=0)).ravel(), rcond=RANK)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = solve(residual, np.concatenate([np.zeros(4), offsets, phi]))
+    x, deviations = solve_least_squares(residual, np.concatenate([np.zeros(4), offsets, phi]))
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual(x), wrench))
     if (left > MAX_UNEXPLAINED * whole).any():
         return None
@@ -234,7 +234,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     t = np.linspace(start, stop, COMPARED_SAMPLES)
-    known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
+    known = [np.interp(t, log.t, far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
 
@@ -414,7 +414,7 @@ def _refine(
     linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
     linear[:, :3, :3] = -K
     linear[:, :, 3:] = np.eye(3 * len(pairs))
-    x, deviations = solve(residual, first, linear)
+    x, deviations = solve_least_squares(residual, first, linear)
     return x, deviations, residual(x)
 
 
