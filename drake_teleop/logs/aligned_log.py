@@ -114,7 +114,7 @@ def clock_note(found: PoseMotion) -> list[str]:
     side = "faster" if found.clock_rate > 0.0 else "slower"
     return [
         f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
-        " that of the wrench, which is taken out; to say so, multiply pose.time.scale (1 by"
+        " that of the wrench, which is corrected; to state it, multiply pose.time.scale (1 by"
         f" default) by {1.0 / (1.0 + found.clock_rate):.6f}"
     ]
 

@@ -88,17 +88,17 @@ def object_notes(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
-            f"no object: the gripper's mass is exceeded by {alone.mass:.4g} ± {deviation:.2g} kg"
+            f"no object: the total mass exceeds the gripper's by {alone.mass:.4g} ± {deviation:.2g} kg"
         ]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
     if margin < -SIGNIFICANT * deviation:
         return [
-            "no body can have the object's parameters: were gripper and total identified about the"
-            " same sensor frame, with the same gripper?"
+            "the object's parameters are physically impossible; check that gripper and total were"
+            " identified in the same sensor frame, with the same gripper"
         ]
-    return ["the object's parameters are those of a possible body within their uncertainty only"]
+    return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
 def _named(result: Identification, identifiable: bool) -> list[str]:

@@ -605,7 +605,7 @@ def _scales(
         raise DrakeTeleopError(
             "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
             where="eta",
-            remedy="leave all scales but eta out",
+            remedy="remove all scales except eta",
         )
     sigma_gripper, kept, gamma = scales_from_eta(eta)
     return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}

@@ -78,9 +78,9 @@ def write_report(
     tables = [
         (
             "The load and the sensor's offsets",
-            "About the origin of the sensor frame S, in its axes. The intervals hold the truth in"
-            " 95 of 100 records, as far as the residual is noise. Nothing is printed where the"
-            " record says nothing.",
+            "About the origin of the sensor frame S, in its axes. The intervals contain the true"
+            " value in 95 of 100 records, if the residual is noise. Parameters that the record"
+            " does not determine have no value.",
             parameter_rows(result),
         )
     ]
@@ -88,7 +88,7 @@ def write_report(
         tables.append(
             (
                 "The object alone",
-                "The load less the gripper of the file that was given; uncertainties of both add.",
+                "The load minus the given gripper; the uncertainties of both are combined.",
                 parameter_rows(alone)[6:],
             )
         )
@@ -115,14 +115,14 @@ def write_report(
             (
                 "Fit",
                 embedded(path.parent / "fit.png"),
-                "Measured wrench and V φ without the offsets, and what is left between them.",
+                "Measured wrench and V φ, both without offsets, and their difference.",
             ),
             (
                 "Residual, intervals and identifiability",
                 embedded(path.parent / "knowledge.png"),
                 f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
-                "its standard deviation, as shares of what is natural for a load of this mass and "
-                "size: up to 5 % it is identified, up to 50 % weakly, beyond that not.",
+                "its standard deviation, relative to a typical value for a load of this mass and "
+                "size: identified up to 5 %, weakly identified up to 50 %, else not identified.",
             ),
         ],
         summary=dict(summary),

@@ -233,7 +233,7 @@ def payload_finding(load: Identification, unexplained: float) -> Finding | None:
     return Finding(
         "payload",
         f"payload not identifiable: {fitted}, which explains {share:.0f} % of the wrench's"
-        " variance; record slow turns about two horizontal axes that touch nothing",
+        " variance; record slow rotations about two horizontal axes, without contact",
     )
 
 

@@ -186,7 +186,7 @@ def _require_determined(known: Any, where: str, quantity: str) -> None:
         raise DrakeTeleopError(
             f"the data do not determine {quantity} {axes}",
             where=where,
-            remedy="turn the sensor faster, about more axes, touching nothing; or give it",
+            remedy="turn the sensor faster, about more axes, without contact; or give the values",
         )
 
 
@@ -247,7 +247,7 @@ def describe_gravity(
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
             where=f"{source}:gravity",
-            remedy="record the load in more orientations, touching nothing; or give the vector",
+            remedy="record the load in more orientations, without contact; or give the vector",
         )
     gravity = tuple((np.round(estimated, 4) + 0.0).tolist())
     note = (

@@ -135,7 +135,7 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dic
     head = [
         "DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
         "above all wrench.sign and the frames.",
-        f"Other topics that would do: {', '.join(others) or 'none'}.",
+        f"Other suitable topics: {', '.join(others) or 'none'}.",
     ]
     return draft, head
 

@@ -151,9 +151,9 @@ class Table:
         if name not in self.columns:
             if name.rpartition(".")[0] in self.absent:
                 raise DrakeTeleopError(
-                    f"{self.path.name} says that it does not provide {name!r} (covariance -1)",
+                    f"{self.path.name} marks {name!r} as not provided (covariance -1)",
                     where=where,
-                    remedy="name another column, or leave this out",
+                    remedy="name another column, or remove this field",
                 )
             similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
             hint = "did you mean" if similar else "its columns are"
@@ -178,7 +178,11 @@ class Table:
             f"{cell!r} in row {self.line(row)} is not a number",
             where=f"{self.path}:{name}",
             remedy="correct the cell or delete the row"
-            + (", if it holds units: the log description has them" if row == 0 else ""),
+            + (
+                ", for example a row of units, which belong into the log description"
+                if row == 0
+                else ""
+            ),
         )
 
 
