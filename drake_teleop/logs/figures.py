@@ -88,7 +88,8 @@ def object_notes(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
-            f"no object: the total mass exceeds the gripper's by {alone.mass:.4g} ± {deviation:.2g} kg"
+            f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
+            f" ± {deviation:.2g} kg"
         ]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []

@@ -127,8 +127,8 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     return Finding(
         "swapped axes",
         "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
-        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or take it"
-        " out",
+        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or remove"
+        " it",
     )
 
 
