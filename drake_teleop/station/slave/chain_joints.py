@@ -36,11 +36,7 @@ def moves(plant: MultibodyPlant, index: JointIndex) -> bool:
 
 
 def check_tree(plant: MultibodyPlant, where: str) -> None:
-    """Check that the joints form a tree; Drake aborts on loops, or never finishes.
-
-    Raises:
-        DrakeTeleopError: for a link with two parents, a world with a parent, or a loop.
-    """
+    """Check that the joints form a tree; Drake aborts on loops, or never finishes."""
     parents: dict[BodyIndex, Joint] = {}
     world = plant.world_body().index()
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -127,11 +123,7 @@ def check_chain(
 def weld_at(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld the named joints at angles or positions [rad, m]; return a note.
-
-    Raises:
-        DrakeTeleopError: for an unknown joint, or a position outside the joint's limits.
-    """
+    """Weld the named joints at angles or positions [rad, m]; return a note."""
     known = {plant.get_joint(k).name(): plant.get_joint(k) for k in joints if moves(plant, k)}
     for name, position in hold.items():
         joint = known.get(name)
@@ -213,6 +205,22 @@ def actuate(
         actuator.set_default_gear_ratio(gear)
 
 
+def set_torque_limits(
+    plant: MultibodyPlant, arm: ModelInstanceIndex, limits: dict[str, float]
+) -> None:
+    """Replace the effort limits of the named joints; raise DrakeTeleopError for an unknown one."""
+    motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    known = {each.joint().name(): each for each in motors if each.model_instance() == arm}
+    for name, limit in limits.items():
+        if name not in known:
+            raise DrakeTeleopError(
+                f"the arm has no joint {name!r}",
+                where="slave.torque_limits",
+                remedy=f"name one of {', '.join(known)}",
+            )
+        known[name].set_effort_limit(limit)
+
+
 def assume_rotor_inertias(
     plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
 ) -> list[str]:
@@ -247,7 +255,6 @@ def assume_rotor_inertias(
 
 
 def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str]) -> bool:
-    """Return whether the joint's child, or a body welded to it, has mass and inertia."""
     ahead, joints = [joint.child_body()], [plant.get_joint(k) for k in plant.GetJointIndices()]
     while ahead:
         body: RigidBody = ahead.pop()
@@ -261,7 +268,6 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str])
 
 
 def _length(chain: list[Joint], frame: Frame) -> float:
-    """Return the length [m] of the arm from its first moving joint to S."""
     while chain and chain[0].num_velocities() == 0:
         chain = chain[1:]
     ends = [*(joint.frame_on_parent() for joint in chain[1:]), frame][: len(chain)]
