@@ -185,7 +185,6 @@ def aligned_log(
 
 
 def missing_orientation_error(where: str) -> DrakeTeleopError:
-    """Return the error for a log with removed weight and without orientation."""
     return DrakeTeleopError(
         "the robot has removed the weight of the load from the wrench, and without an orientation"
         " gravity cannot be subtracted from the measured acceleration",

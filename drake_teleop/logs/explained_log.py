@@ -318,7 +318,6 @@ def replace_frame_causes(why: Explanation, finding: Finding) -> tuple[Cause, ...
 
 
 def removed_weight_note(why: Explanation) -> str:
-    """Return a note about the weight that the robot removes (`wrench.weight: removed`), or ""."""
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]

@@ -84,7 +84,6 @@ def object_figures(alone: Identification) -> dict[str, Any]:
 
 
 def object_notes(alone: Identification) -> list[str]:
-    """Return warnings for an object with a doubtful mass or impossible parameters."""
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [

@@ -272,10 +272,7 @@ def _can_be_explained(log: Log, by_splines: bool) -> bool:
 
 
 def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
-    """Check a log and its description, including causes that identification finds.
-
-    `checks` is the result of `check_file` for this log, if known.
-    """
+    """Check a log and its description, including causes that identification finds."""
     checks = check_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
@@ -531,10 +528,7 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with undetermined inertias set to those of a point mass, and their names.
-
-    Weakly identified inertias are kept, because they are closer to the true values.
-    """
+    """Return phi (10,) with undetermined inertias set to those of a point mass, and their names."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
@@ -555,7 +549,6 @@ def _suspected_errors(
 
 
 def weight_scale_error(where: str) -> DrakeTeleopError:
-    """Return the error for a scale of the weight if the robot has already removed the weight."""
     return DrakeTeleopError(
         "the robot has removed the weight, so that sigma_weight has no effect",
         where=where,

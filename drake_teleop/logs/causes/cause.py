@@ -57,7 +57,6 @@ class Stretch:
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
-    """Return the causes of a misfit in a fitted model, except for the extensions `given`."""
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_axes(model.axes))

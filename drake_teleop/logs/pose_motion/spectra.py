@@ -92,7 +92,6 @@ class Bands:
         return np.asarray(np.bincount(self.band, self.weight), np.float64)
 
     def sums(self, values: Array) -> Array:
-        """Return the weighted sums (count, ...) over each band of values (K, ...)."""
         flat = values.reshape(len(values), -1) * self.weight[:, None]
         starts = np.searchsorted(self.band, np.arange(self.count))
         return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])

@@ -65,7 +65,6 @@ def _is_table(item: Any, transpose: bool) -> bool:
 
 
 def import_optional(name: str, path: Path) -> Any:
-    """Import an optional package that reads a file; raise DrakeTeleopError if it is missing."""
     try:
         return import_module(name)
     except ImportError:

@@ -161,7 +161,6 @@ def _to_common_clock(t: Array, time: Time) -> Array:
 
 
 def spread_shared_stamps(t: Array) -> Array:
-    """Return evenly spaced times for rows that share time stamps `t` (N,) [s]."""
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))
     per_stamp = len(t) / len(distinct)

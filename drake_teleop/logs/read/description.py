@@ -206,7 +206,6 @@ class Imu(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether frame or position is `auto`."""
         return self.frame == "auto" or self.position == "auto"
 
 
@@ -242,7 +241,6 @@ class Pose(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether position or rotation is `auto`."""
         return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
 
     @property
