@@ -59,7 +59,6 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
 
 
 def _find_touches(t: Array, force: Array) -> Array:
-    """Return the start times of touches [s]."""
     if len(t) < 2:
         return np.empty(0)
     rows = 2 * round(_AROUND_S / (t[1] - t[0])) + 1

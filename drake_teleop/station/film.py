@@ -1,4 +1,4 @@
-"""3D replay: one HTML file with Meshcat and a player, which works offline in any browser."""
+"""3D replay: one HTML file with Meshcat and a player, for any browser without network."""
 
 from __future__ import annotations
 
@@ -61,7 +61,6 @@ class Reading:
     """Number displayed beside the replay.
 
     Args:
-        name, unit: label.
         values: (F,) one value per frame; NaN where the number does not exist.
         colour: colour of the curve, "#rrggbb"; "" for no curve. All curves share one scale.
         arrow: True if arrows of this colour represent the number.
@@ -74,7 +73,6 @@ class Reading:
     arrow: bool = False
 
     def for_page(self) -> dict[str, object]:
-        """Return label and values as the JSON data that the player reads."""
         largest = float(np.nanmax(np.abs(self.values), initial=0.0))
         return {
             "name": self.name,
@@ -164,14 +162,9 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times of the replay's frames (F,) [s], and the slow motion.
+    """Return the times of the replay's frames (F,) from `start` to `stop` [s], and the slow motion.
 
-    There are 50 frames per second of replay, at most 2001.
-
-    Args:
-        start, stop: displayed interval [s].
-        slow_motion: seconds of replay per second; default: the lowest for which the replay lasts 6
-            s.
+    The slow motion is in seconds of replay per second; by default the replay lasts at least 6 s.
     """
     span = stop - start
     if slow_motion is None:
@@ -184,7 +177,6 @@ def frame_times(start: float, stop: float, slow_motion: float | None = None) -> 
 
 
 def set_plain_background(meshcat: Meshcat) -> None:
-    """Set a light Meshcat background without grid and axes."""
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", [0.97, 0.98, 1.0])
@@ -208,7 +200,6 @@ def add_shapes(
 
 
 def rgba(colour: str) -> Rgba:
-    """Convert the colour "#rrggbb" to Drake's `Rgba`."""
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
 
 
@@ -243,7 +234,7 @@ class Arrow:
 
 @contextmanager
 def quiet_drake() -> Iterator[None]:
-    """Suppress log messages of Drake, such as the address of Meshcat."""
+    """Suppress Drake's log messages below warnings, such as the address of Meshcat."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

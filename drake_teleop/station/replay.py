@@ -1,7 +1,4 @@
-"""3D replay of a simulation: `replay.html` of a run and the command `drake-teleop replay`.
-
-Arrows are forces, 3 mm per newton: blue measured by the wrist sensor, orange calculated contact.
-"""
+"""3D replay of a simulation: `replay.html` of a run and the command `drake-teleop replay`."""
 
 from __future__ import annotations
 
@@ -78,8 +75,7 @@ def replay_command(
     Args:
         run: folder written by `run` or `reproduce`, or a log in it.
         out: output folder: replay.html, or one file per log for several logs.
-        scenario: shipped scenario or YAML file; by default `scenario.yaml` beside the log, or the
-            YAML file with the log's name.
+        scenario: shipped scenario or YAML file; by default the YAML file beside the log.
 
     Raises:
         DrakeTeleopError: if there is no log or no scenario.
@@ -104,14 +100,11 @@ def write_replay(
 ) -> None:
     """Write the replay of a run to an HTML file.
 
-    Args:
-        result: signals slave_state, measured_wrench_S, load_estimate; optionally master_state,
-            contact_wrench_S, force_to_master and sheet_state.
-        slow_motion: initial speed: seconds of replay per second of the run; by default the replay
-            lasts at least 6 s.
+    `slow_motion` is the initial speed in seconds of replay per second of the run; by default the
+    replay lasts at least 6 s.
 
     Raises:
-        DrakeTeleopError: if required signals are missing.
+        DrakeTeleopError: if slave_state, measured_wrench_S or load_estimate is missing.
     """
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
@@ -278,7 +271,7 @@ class ReplayScene:
             arrow.show(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
-        """Set the pose (7,) of a moving body; its parents must have theirs."""
+        """Set the pose (7,) of a moving body, after those of its parents."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])

@@ -1,7 +1,4 @@
-"""Scenarios: configuration of a station as dataclasses, read from YAML.
-
-Every field has a unit and a plausible range; an error names file and field.
-"""
+"""Scenarios: configuration of a station as dataclasses, read from YAML."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -178,7 +175,7 @@ class Scenario:
 
 
 def check_scenario(scenario: Any) -> None:
-    """Raise a DrakeTeleopError for an invalid value, or an object that is not a Scenario."""
+    """Raise DrakeTeleopError for an invalid value, or an object that is not a Scenario."""
     remedy = "load one: LoadScenario(name)"
     if isinstance(scenario, (str, Path)):
         remedy = f"write LoadScenario({str(scenario)!r})"
@@ -212,11 +209,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
 
 
 def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
-    """Read a scenario file; return the unchecked data, and the file's name for messages.
-
-    Raises:
-        DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
-    """
+    """Read a scenario file; return the unchecked data, and the file's name for messages."""
     path = shipped_file("scenario", name_or_path, scenarios_dir())
     return read_yaml(path, tagged=True), str(path)
 
@@ -224,8 +217,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
 def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
-    Raises:
-        DrakeTeleopError: if neither is a file; `kind` is its name in the message.
+    A DrakeTeleopError, which calls the file a `kind`, is raised if neither exists.
     """
     expect((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -237,10 +229,9 @@ def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
 
 
 def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | None = None) -> _T:
-    """Return settings from parsed YAML data; their ranges are not checked.
+    """Return settings from parsed YAML data, with unchecked ranges; `where` is for messages.
 
-    Raises:
-        DrakeTeleopError: for an unknown field, or a value of the wrong type.
+    A DrakeTeleopError is raised for an unknown field, or a value of the wrong type.
     """
     check_structure(schema, data, where)
     data = dict(data)
@@ -255,10 +246,9 @@ def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | N
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
-    """Convert parsed YAML data to a checked scenario; `where` is the file's name for messages.
+    """Convert parsed YAML data to a checked scenario, or raise DrakeTeleopError.
 
-    Raises:
-        DrakeTeleopError: with the invalid field.
+    `where` is the file's name for messages.
     """
     check_structure(Scenario, data, where)  # before the presets are read
     defaults = Scenario(

@@ -96,7 +96,7 @@ def _task_is_over(simulator: Simulator) -> bool:
 
 
 def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
-    """Raise a DrakeTeleopError for a fault in the log from row `rows` on; return its length."""
+    """Raise DrakeTeleopError for a fault in the log from row `rows` on; return its length."""
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG).FindLog(simulator.get_context())
     for name, column in columns(station).items():
@@ -140,7 +140,7 @@ class LogOnDisk:
         self.follow(simulator)
 
     def follow(self, simulator: Simulator) -> None:
-        """Continue with the log of another simulator; call `take` for the previous one before."""
+        """Continue with the log of another simulator, after `take` for the previous one."""
         self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
@@ -152,7 +152,7 @@ class LogOnDisk:
     def take(self) -> None:
         """Write the rows in memory as the next part, and remove them from memory.
 
-        After an interrupt it may be called again: it rewrites the same part or writes nothing new.
+        A call after an interrupt rewrites the same part or writes nothing new.
         """
         part = self._read()
         self._write(part)

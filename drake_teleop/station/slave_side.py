@@ -163,7 +163,7 @@ def MakeSlaveSide(
 
 
 def _gives_torques(controller: System | None, scenario: Scenario) -> bool:
-    """Return whether a custom controller replaces the joint control; check its ports."""
+    """Return whether a custom controller replaces the joint control, after a check of its ports."""
     if controller is None:
         return False
     expect(System, controller, "controller", "make a Drake system: docs/station.md")
@@ -200,7 +200,7 @@ def _add_inverse_kinematics(
 
 
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Build the slave side without master: its joints follow an excitation trajectory (section IV).
+    """Build the slave side without master: its joints follow an excitation trajectory.
 
     `trajectory` runs once after the settling time. Output ports are the signals of `MakeSlaveSide`
     that need neither command nor elimination.
@@ -323,7 +323,7 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Reject dry friction that stops a joint within one step [s] (numerical instability)."""
+    """Raise DrakeTeleopError for dry friction that stops a joint within one step [s]."""
     if not slave.friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)

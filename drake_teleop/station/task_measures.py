@@ -54,10 +54,7 @@ _PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures of a task by name for one run; the module explains them.
-
-    Args:
-        result: result with the signal task_state.
+    """Return the measures of a task by name for one run with the signal task_state.
 
     Raises:
         DrakeTeleopError: if the scenario has no task.
@@ -100,10 +97,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
 
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
-    """Return the reason why the task failed (timeout, given up, not achieved); "" after success.
-
-    Times in the text are those of the log. The scenario must have a task.
-    """
+    """Return the reason why the task failed (timeout, given up, not achieved); "" after success."""
     task, state, ended = scenario.operator.task, result["task_state"], _end_sample(result)
     assert task is not None
     at, outcome = float(result.t[ended]), state[ended, DONE]
@@ -152,7 +146,7 @@ def contact_force(result: SimulationResult) -> Array:
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
     """Return the time from the first contact to its detection [s]; nan if either is missing.
 
-    All arguments are (N,): times [s], true contact, detected contact.
+    The arguments are (N,): times [s], true contact, detected contact.
     """
     if not touching.any():
         return math.nan

@@ -31,10 +31,10 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 
 class _End(DoubleOnly, LeafSystem):
-    """Base class: one step of one channel end in a cache entry, read by the outputs.
+    """Base class of both ends of a passivity method.
 
     Args:
-        passivity: the method and its parameters, equal at both ends.
+        passivity: method and parameters, equal at both ends.
         period: time between packets [s].
         start: (7,) pose X_WS of the slave at the start.
         R_WB: (3, 3) alignment of the master's base with the world.

@@ -52,8 +52,6 @@ def ArmModelFromPlant(
 ) -> ArmModel:
     """Return the chain from the world to the sensor frame of a finalized plant.
 
-    Joints beyond the sensor frame are held at their default positions.
-
     Raises:
         DrakeTeleopError: if the frame is missing, or the path to it is not a chain of welds,
             revolute and prismatic joints without branches that move.
@@ -119,7 +117,7 @@ def _per_joint(values: list[float]) -> Array:
 
 
 def _range(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
-    """Return the joint limits, -inf or inf for none; a revolute joint then turns without end."""
+    """Return the joint limits, -inf and inf without limits."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
@@ -186,7 +184,7 @@ def _table_row(
 
 
 def _phi_of_body(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
-    """Return the inertial parameters phi (10,) of a body about the origin of L, in L."""
+    """Return the inertial parameters phi (10,) of a body B about the origin of L, in L."""
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
@@ -213,9 +211,6 @@ def with_all_limits(
 
     `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is appended to the
     assumption about accelerations.
-
-    Raises:
-        DrakeTeleopError: for a fixed joint or a wrong number of accelerations.
     """
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, SLIDES] != 0.0
@@ -286,7 +281,7 @@ def with_all_limits(
 
 
 def _is_specified(limits: Array) -> NDArray[np.bool_]:
-    """Return (n,) booleans: True for specified limits; exporters write 0 for unknown ones."""
+    """Return (n,) booleans: True for finite limits above 0; exporters write 0 for unknown ones."""
     return np.isfinite(limits) & (limits > 0)
 
 

@@ -1,4 +1,4 @@
-"""Joints of a parsed plant: base and other joints welded, motors of the chain to the sensor."""
+"""Joints of a parsed plant: welds of base and other joints, motors of the chain to the sensor."""
 
 from __future__ import annotations
 
@@ -31,16 +31,11 @@ _SLIDING_MOTOR_KG = 5.0  # mass that moves with a prismatic joint instead
 
 
 def moves(plant: MultibodyPlant, index: JointIndex) -> bool:
-    """Return whether a joint has a velocity."""
     return plant.get_joint(index).num_velocities() > 0
 
 
 def check_tree(plant: MultibodyPlant, where: str) -> None:
-    """Check that the joints form a tree; Drake aborts on loops, or never finishes.
-
-    Raises:
-        DrakeTeleopError: for a link with two parents, a world with a parent, or a loop.
-    """
+    """Raise DrakeTeleopError unless the joints form a tree; Drake aborts or never ends on loops."""
     parents: dict[BodyIndex, Joint] = {}
     world = plant.world_body().index()
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -72,8 +67,7 @@ def weld_base(
 ) -> list[JointIndex]:
     """Weld a free base to the world; return the joints up to S, from the base outwards.
 
-    Raises:
-        DrakeTeleopError: if the model fixes its base although `X_WBase` is not the identity.
+    A DrakeTeleopError is raised if the model fixes its base although `X_WBase` is not the identity.
     """
     inboard = {j.child_body().index(): j for j in map(plant.get_joint, plant.GetJointIndices())}
     body, chain = frame.body(), list[Joint]()
@@ -93,7 +87,7 @@ def weld_base(
 
 
 def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:
-    """Weld bodies that are not connected to the arm to the world; return a note."""
+    """Weld bodies without a joint to the world; return a note."""
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]
@@ -106,7 +100,7 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
 def check_chain(
     plant: MultibodyPlant, chain: list[JointIndex], dependent: dict[str, str], where: str
 ) -> None:
-    """Raise an error for joints of the chain that do not move alone, about or along one axis."""
+    """Raise DrakeTeleopError for joints of the chain that are coupled or have several axes."""
     for joint in (plant.get_joint(index) for index in chain):
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
             if name in dependent:
@@ -127,11 +121,7 @@ def check_chain(
 def weld_at(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld the named joints at angles or positions [rad, m]; return a note.
-
-    Raises:
-        DrakeTeleopError: for an unknown joint, or a position outside the joint's limits.
-    """
+    """Weld joints, by name, at the positions `hold` [rad, m]; return a note or raise an error."""
     known = {plant.get_joint(k).name(): plant.get_joint(k) for k in joints if moves(plant, k)}
     for name, position in hold.items():
         joint = known.get(name)
@@ -192,7 +182,7 @@ def actuate(
 ) -> None:
     """Give each moving joint of the chain one actuator, in the order of the chain.
 
-    `limits` are effort limits by joint, without an entry unlimited; None keeps Drake's.
+    `limits`: effort limits by joint, without an entry unlimited; None keeps Drake's.
     """
     moving = [index for index in chain if moves(plant, index)]
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
@@ -218,9 +208,7 @@ def assume_rotor_inertias(
 ) -> list[str]:
     """Give joints a rotor inertia if the links that they move have none; return a note.
 
-    Without it the joint's acceleration is undefined, or so large that a run takes hours. Gravity
-    and the wrench at the sensor stay those of the model. The links of a joint at an `auxiliary`
-    body include those of the next joint.
+    The links of a joint at an `auxiliary` body include those of the next joint.
     """
     joints = [plant.get_joint(index) for index in chain]
     inertia = _ROTOR_MASS_KG * _length(joints, frame) ** 2
@@ -247,7 +235,6 @@ def assume_rotor_inertias(
 
 
 def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str]) -> bool:
-    """Return whether the joint's child, or a body welded to it, has mass and inertia."""
     ahead, joints = [joint.child_body()], [plant.get_joint(k) for k in plant.GetJointIndices()]
     while ahead:
         body: RigidBody = ahead.pop()
@@ -261,7 +248,7 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str])
 
 
 def _length(chain: list[Joint], frame: Frame) -> float:
-    """Return the length [m] of the arm from its first moving joint to S."""
+    """Return the length [m] of the chain from its first moving joint to `frame`."""
     while chain and chain[0].num_velocities() == 0:
         chain = chain[1:]
     ends = [*(joint.frame_on_parent() for joint in chain[1:]), frame][: len(chain)]

@@ -1,4 +1,4 @@
-"""Model files in Drake's plant: one file, or those that model directives add, after repairs."""
+"""Parsing of model files and model directives into Drake's plant, after repairs."""
 
 from __future__ import annotations
 
@@ -54,11 +54,7 @@ class ReadModel(NamedTuple):
 def read_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: Purpose
 ) -> ReadModel:
-    """Repair a model's text and parse it into a plant.
-
-    Raises:
-        DrakeTeleopError: if the file, or a file that it names, cannot be read.
-    """
+    """Repair a model's text and parse it into a plant, or raise DrakeTeleopError."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
@@ -122,7 +118,7 @@ def _add_directives(
     purpose: Purpose,
     folder: TemporaryDirectory[str],
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    """Add the models of directives after the same repairs; welds and positions stay."""
+    """Add the models of a directives file after repairs; keep its welds and positions."""
     with raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
     repaired, purpose = dict[Path, RepairedModel](), purpose._replace(in_directives=True)

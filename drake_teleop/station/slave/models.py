@@ -31,7 +31,7 @@ _MAX_NAMES = 12  # names of frames in an error: the most similar ones
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """Arm from `ParseModel`; `folder` contains converted meshes, which Drake reads later."""
+    """Arm in a plant; `folder` contains converted meshes, which Drake reads later."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
@@ -41,7 +41,7 @@ class ParsedModel:
 
 @dataclass(frozen=True)
 class ParsedTool:
-    """Tool from `ParseTool`; `body` is the body welded to the sensor frame."""
+    """Tool in a plant; `body` is welded to the sensor frame."""
 
     body: RigidBody
     assumptions: list[str]
@@ -58,9 +58,8 @@ def ParseModel(
 ) -> ParsedModel:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    A free base is welded to the world at `X_WBase`. Other joints, such as a gripper's, are welded
-    at their default positions. `package_paths` are folders of `package://` addresses. The joints
-    `hold` are welded at the given positions [rad, m].
+    A free base is welded to the world at `X_WBase`, the joints `hold` at the given positions
+    [rad, m], and other joints, such as a gripper's, at their defaults.
 
     Raises:
         DrakeTeleopError: if the file cannot be read, has no frame `sensor_frame` or joint of
@@ -96,8 +95,7 @@ def ParseTool(
 ) -> ParsedTool:
     """Parse a tool with one root link, weld the root to S ("sensor_weld"), and weld other joints.
 
-    Raises:
-        DrakeTeleopError: if the file cannot be read or has another number of roots.
+    A DrakeTeleopError is raised if the file cannot be read or has another number of roots.
     """
     before = set(plant.GetJointIndices())
     read = read_model(plant, path, package_paths, Purpose(is_tool=True))
@@ -121,8 +119,7 @@ def ParseTool(
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     """Parse the surroundings of an arm; return the folder of their converted meshes.
 
-    Raises:
-        DrakeTeleopError: if the file cannot be read, or contains elements that Drake ignores.
+    A DrakeTeleopError is raised for an unreadable file, or elements that Drake ignores.
     """
     read = read_model(plant, path, (), Purpose(is_scene=True))
     for name, what in read.dependent.items():

@@ -1,8 +1,6 @@
-"""Compiled dynamics of the plant inside one step, with the wrench of the environment on the tool.
+"""Compiled dynamics of arm, leaf and contact inside one step, for tools of balls on boxes.
 
-Covers arm, tool, balls on boxes and one leaf (otherwise see `Contact.beyond`). The state is x = [q,
-leaf deflection, v, its rate], then the plant's [q; v] if other bodies move.
-"""
+The state is x = [q, leaf deflection, v, its rate], then the plant's [q; v] if other bodies move."""
 
 from __future__ import annotations
 
@@ -121,7 +119,7 @@ def add_force(wrench_W, p_WC, force_W):
 
 
 class ToolContact(LeafSystem):
-    """Block that outputs the true contact wrench for the log, see `environment_wrench`.
+    """Block with the environment's wrench (6,) on the tool about the world's origin, for the log.
 
     .. pydrake_system::
 
@@ -131,7 +129,7 @@ class ToolContact(LeafSystem):
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         output_ports:
-        - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
+        - true_contact_wrench_W: (6,) [N, N m]
     """
 
     __slots__ = ONE_DICT
@@ -173,10 +171,9 @@ def assemble_state(state, around, x):
 
 @njit(cache=True)
 def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot (2 n + 2,) of x, and the environment's wrench.
+    """Write the time derivative xdot (2 n + 2,) of the plant's state x, and the contact wrench.
 
-    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m]; `applied_W` and
-    `wrench_W` as for `environment_wrench`.
+    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m].
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
@@ -215,7 +212,7 @@ def _take_given_wrench(given, x, wrench_W):
 
 @njit(cache=True)
 def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot of x under a given environment wrench."""
+    """Write the time derivative xdot of the plant's state x under the contact wrench `wrench_W`."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]

@@ -1,8 +1,4 @@
-"""Environment from a file: SDF, URDF or Drake model directives.
-
-Bodies may be attached by joints with springs and damping. Free roots are welded to the world, or
-float.
-"""
+"""Environment from a file: SDF, URDF or Drake model directives."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -67,7 +63,6 @@ class Scene(Environment):
 
     @property
     def hydroelastic(self) -> bool:
-        """True if contacts may have a pressure over an area."""
         return self.contact == "hydroelastic"
 
     def found_from(self, folder: Path) -> "Scene":
@@ -76,7 +71,7 @@ class Scene(Environment):
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the file's bodies to a plant and place its free roots; raises DrakeTeleopError."""
+        """Add the file's bodies to a plant and place its free roots, or raise DrakeTeleopError."""
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
@@ -109,7 +104,7 @@ class Scene(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Make the tool's shapes hydroelastic, if configured; raises DrakeTeleopError."""
+        """Make the tool's shapes hydroelastic, if configured, or raise DrakeTeleopError."""
         if not self.hydroelastic:
             return
         inspector = scene_graph.model_inspector()
@@ -134,5 +129,4 @@ class Scene(Environment):
 
 
 def is_hydroelastic(properties: ProximityProperties) -> bool:
-    """Return whether a shape has hydroelastic properties."""
     return bool(properties.HasProperty("hydroelastic", "compliance_type"))

@@ -78,7 +78,6 @@ class Slave:
 
     @property
     def path(self) -> Path:
-        """Model file of the arm."""
         return Path(self.model) if self.model else models_dir() / "rx90.sdf"
 
     @property
@@ -88,7 +87,6 @@ class Slave:
 
     @property
     def X_WBase(self) -> RigidTransform:
-        """Pose of the arm's base in the world."""
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def files(self) -> list[Path]:
@@ -139,7 +137,7 @@ class Slave:
 
 
 def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
-    """Weld the payload to a frame that coincides with S, if it has mass."""
+    """Weld the payload, if it has mass, to a frame that coincides with S."""
     if payload.mass == 0.0:
         return
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))
