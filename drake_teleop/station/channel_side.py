@@ -119,7 +119,6 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 
 
 def power_scale(scenario: Scenario) -> Array:
-    """Return the master's power over the slave's (2,), for translation and rotation."""
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)

@@ -35,10 +35,9 @@ class Chatter(NamedTuple):
 
 
 def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
-    """Return each series of touches that the command does not explain.
+    """Return each series of touches that no reversal of the command explains.
 
     A series has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
-    A reversal of the command explains one touch within 0.1 s.
 
     Args:
         t: (N,) evenly spaced times [s].

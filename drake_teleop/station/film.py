@@ -93,8 +93,7 @@ class Film:
         slow_motion: initial speed: seconds of replay per second of `times`.
         readings: numbers beside the replay.
         shaded: intervals of `times` that the curves mark.
-        clock: label of the times.
-        curves: label of the curves; "{top}" is replaced by the largest value.
+        clock, curves: labels; in that of the curves "{top}" is replaced by the largest value.
     """
 
     title: str
@@ -162,9 +161,9 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times of the replay's frames (F,) from `start` to `stop` [s], and the slow motion.
+    """Return the times (F,) of a replay's frames [s], and its slow motion (replay per real second).
 
-    The slow motion is in seconds of replay per second; by default the replay lasts at least 6 s.
+    By default the replay lasts at least 6 s.
     """
     span = stop - start
     if slow_motion is None:
@@ -216,7 +215,7 @@ class Arrow:
         meshcat.SetObject(f"{self._path}/head/scaled", head, rgba(colour))
 
     def show(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
-        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W; `film_time` in s."""
+        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `film_time` [s]."""
         length = _ARROW_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _HEAD_LENGTH_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
@@ -234,7 +233,6 @@ class Arrow:
 
 @contextmanager
 def quiet_drake() -> Iterator[None]:
-    """Suppress Drake's log messages below warnings, such as the address of Meshcat."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

@@ -42,13 +42,12 @@ def oscillates(
 ) -> Flags:
     """Return (N,) booleans: True while the actual motion oscillates and the command does not.
 
-    An oscillation has at least four reversals, each within 0.5 s of the previous one. A reversal
-    of the command explains one reversal of the motion within the time `near` [s].
+    An oscillation has at least four reversals larger than `swing`, each within 0.5 s of the
+    previous one. A reversal of the command explains one of the motion within `near` [s].
 
     Args:
         t: (N,) times [s].
-        command, actual: (N, k) commanded and actual motion in one unit.
-        swing: smallest amplitude, in that unit.
+        command, actual: (N, k) commanded and actual motion in the unit of `swing`.
     """
     commanded = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
@@ -84,7 +83,7 @@ def rotation_near(pose: Array, reference: Array) -> Array:
 
 
 def remove_explained(times: Array, causes: Array, near: float) -> Array:
-    """Return the times [s] without one per cause: the nearest within `near` [s]."""
+    """Return event times [s] without the nearest one to each cause within `near` [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
         if len(times) and distances.min() < near:

@@ -197,9 +197,7 @@ def _find_scenario(log: Path) -> Path:
 class ReplayScene:
     """Meshcat scene of a replay, which shows one sample at a time.
 
-    Attributes:
-        plant: slave, surroundings and haptic device, for shapes and kinematics only.
-        canvas: receiver of poses and sizes; Meshcat by default.
+    `plant` contains slave, surroundings and haptic device, for shapes and kinematics only.
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
@@ -304,7 +302,7 @@ class ReplayScene:
 class _Device(NamedTuple):
     """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    `positions` converts joint positions to those of the plant. `folder` keeps meshes in use.
+    `positions` converts joint positions to those of the plant.
     """
 
     instance: ModelInstanceIndex

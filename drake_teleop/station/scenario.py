@@ -125,7 +125,7 @@ class Scenario:
 
     @property
     def surroundings(self) -> Environment | None:
-        """All objects that the tool can touch as one `Environment`; None if there are none."""
+        """All objects that the tool can touch as one `Environment`, or None."""
         things = self._objects
         if not things:
             return None
@@ -133,7 +133,7 @@ class Scenario:
 
     @property
     def leaf(self) -> SheetSpring | None:
-        """Sheet spring from `sheet_spring` or `environment`; None if there is none."""
+        """Sheet spring from `sheet_spring` or `environment`, or None."""
         return next((thing for thing in self._objects if isinstance(thing, SheetSpring)), None)
 
     @property
@@ -175,7 +175,6 @@ class Scenario:
 
 
 def check_scenario(scenario: Any) -> None:
-    """Raise DrakeTeleopError for an invalid value, or an object that is not a Scenario."""
     remedy = "load one: LoadScenario(name)"
     if isinstance(scenario, (str, Path)):
         remedy = f"write LoadScenario({str(scenario)!r})"
@@ -217,7 +216,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
 def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
-    A DrakeTeleopError, which calls the file a `kind`, is raised if neither exists.
+    `kind` is the file's name in the DrakeTeleopError if neither exists.
     """
     expect((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -229,10 +228,7 @@ def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
 
 
 def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | None = None) -> _T:
-    """Return settings from parsed YAML data, with unchecked ranges; `where` is for messages.
-
-    A DrakeTeleopError is raised for an unknown field, or a value of the wrong type.
-    """
+    """Return settings from parsed YAML data without checks of ranges; `where` is for messages."""
     check_structure(schema, data, where)
     data = dict(data)
     things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
@@ -267,8 +263,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5
 
-    Raises:
-        DrakeTeleopError: if there is no such block or field, or for an invalid value.
+    A DrakeTeleopError is raised for an invalid name or value.
     """
     expect(Scenario, scenario, "scenario")
     for name, value in changes.items():

@@ -89,7 +89,6 @@ def reference() -> str:
 
 
 def json_schema() -> str:
-    """Return the JSON schema of a scenario file as text."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scenario"}
     return json.dumps(schema | _object_schema(Scenario()), indent=1) + "\n"
 

@@ -112,10 +112,7 @@ SIGNALS = {
 
 
 def signal_of(name: str, size: int) -> Signal:
-    """Return the description of the signal `name` for a port with `size` components.
-
-    For prismatic joints, read m instead of rad and N instead of N m.
-    """
+    """Return the description of a signal for `size` components; SI units of revolute joints."""
     if name.startswith(POSE_OF):
         return _signal(name, *_POSE, f"where the body {name.removeprefix(POSE_OF)} is, in W, at t")
     signal = SIGNALS[name]

@@ -140,27 +140,22 @@ class LogOnDisk:
         self.follow(simulator)
 
     def follow(self, simulator: Simulator) -> None:
-        """Continue with the log of another simulator, after `take` for the previous one."""
         self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
 
     def waiting(self) -> int:
-        """Return the number of rows that are in memory only."""
         return int(self._sink.num_samples())
 
     def take(self) -> None:
-        """Write the rows in memory as the next part, and remove them from memory.
-
-        A call after an interrupt rewrites the same part or writes nothing new.
-        """
+        """Write the rows in memory as the next part and clear them, repeatable after an interrupt."""
         part = self._read()
         self._write(part)
         self._sink.Clear()
         self._rows += len(part.t)
 
     def keep(self) -> None:
-        """Write the rows in memory but keep them; the next `take` rewrites and extends the part."""
+        """Write the rows in memory but keep them; a later part replaces them."""
         self._write(self._read())
 
     def _write(self, part: SimulationResult) -> None:
@@ -182,7 +177,7 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 
 def advance(simulator: Simulator, time: float) -> None:
-    """Advance the simulator to `time` [s] with garbage collection disabled, which saves time."""
+    """Advance the simulator to `time` [s] without garbage collection, which saves time."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

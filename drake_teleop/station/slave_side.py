@@ -163,7 +163,7 @@ def MakeSlaveSide(
 
 
 def _gives_torques(controller: System | None, scenario: Scenario) -> bool:
-    """Return whether a custom controller replaces the joint control, after a check of its ports."""
+    """Check a custom controller's ports; return whether it replaces the joint control."""
     if controller is None:
         return False
     expect(System, controller, "controller", "make a Drake system: docs/station.md")

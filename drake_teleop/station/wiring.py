@@ -46,10 +46,7 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
 
 
 def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
-    """Export and record the sides' signals at `log_hz`; build and name the diagram.
-
-    Signals that share one port of a side (`COMBINED_PORTS`) are recorded from this port.
-    """
+    """Export and record the sides' signals at `log_hz`; build the diagram."""
     outputs = {
         port.get_name(): port
         for side in sides

@@ -103,7 +103,7 @@ class ArmModel:
 
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
-    """Replace the pose of the previous link P in x by that of link L, `row`; return p_PL_W."""
+    """Replace the pose of the previous link P in x by that of link `row`, L; return p_PL_W."""
     joint = table[row]
     p_PL_P = three(joint, TRANSLATION)
     if joint[SLIDES] != 0.0:
@@ -143,7 +143,6 @@ def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
 
 @njit(cache=True)
 def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
-    """Write the acceleration s + g of So to `out` (3,) for the specific force s (3,), both in S."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
     g = table[table.shape[0] - 1, GRAVITY : GRAVITY + 3]
@@ -153,7 +152,6 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
 
 @njit(cache=True, inline="always")
 def _set_world_at_rest(table: Array, x: Array) -> None:
-    """Set x to the state of the world frame at rest: s = -g, identity pose."""
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, GRAVITY + k]
@@ -287,7 +285,6 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
 
 
 def holding_torque(arm: ArmModel, q: Array) -> Array:
-    """Return the joint torques (n,) [N m] that hold the arm at rest at q (n,)."""
     zeros, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
     inverse_dynamics(arm.table, q, zeros, zeros, torque)
     return torque
@@ -410,16 +407,7 @@ def pose_into(arm, q, pose):
 
 
 class ForwardKinematics(LeafSystem):
-    """Block that converts joint positions to the pose of the slave's sensor frame.
-
-    .. pydrake_system::
-
-        name: ForwardKinematics
-        input_ports:
-        - slave_state: [q; v] of the arm [rad, rad/s]
-        output_ports:
-        - pose_slave: (7,) X_WS
-    """
+    """Block that outputs the pose X_WS (7,) of the sensor frame from the arm's state [q; v]."""
 
     __slots__ = ONE_DICT
 

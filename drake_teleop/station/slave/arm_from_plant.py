@@ -117,7 +117,6 @@ def _per_joint(values: list[float]) -> Array:
 
 
 def _range(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
-    """Return the joint limits, -inf and inf without limits."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:

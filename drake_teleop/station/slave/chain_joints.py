@@ -35,7 +35,7 @@ def moves(plant: MultibodyPlant, index: JointIndex) -> bool:
 
 
 def check_tree(plant: MultibodyPlant, where: str) -> None:
-    """Raise DrakeTeleopError unless the joints form a tree; Drake aborts or never ends on loops."""
+    """Raise DrakeTeleopError unless the joints form a tree; Drake aborts on loops."""
     parents: dict[BodyIndex, Joint] = {}
     world = plant.world_body().index()
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -87,7 +87,6 @@ def weld_base(
 
 
 def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:
-    """Weld bodies without a joint to the world; return a note."""
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]

@@ -43,7 +43,6 @@ def tool_down(
 
 
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    """Return joint positions (n,) [rad] with S at `position` [m, in W] and z_S down, or raise."""
     q, status = tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"

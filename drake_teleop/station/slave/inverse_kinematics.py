@@ -1,8 +1,7 @@
-"""Closed-form inverse kinematics of the Staubli RX90: eight branches, and the nearest one.
+"""Closed-form inverse kinematics of the Staubli RX90 (Pieper 1968).
 
-Joints 1-3 place the wrist centre, joints 4-6 orient the sensor frame (Pieper 1968). At q = 0 the
-arm points up and S is parallel to W. With the wrist centre at (x, y, z) above the shoulder and rho
-its signed distance from the first axis:
+At q = 0 the arm points up and S is parallel to W. With the wrist centre at (x, y, z) above the
+shoulder and rho its signed distance from the first axis:
 
     rho = -(l2 sin q2 + l3 sin(q2 + q3)),   z = l2 cos q2 + l3 cos(q2 + q3),
     R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6)."""

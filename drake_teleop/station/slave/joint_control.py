@@ -80,7 +80,7 @@ class JointControlConfig:
             interface.check(f"{where}.interface", rate)
 
     def check_computed_torque(self, what: str) -> None:
-        """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""
+        """Raise DrakeTeleopError, in the name of `what`, unless the servo is computed torque."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
                 f"{what} does not support the servo {self.servo}",
@@ -96,8 +96,8 @@ def joint_control_torque(
 ):  # fmt: skip
     """Write tau = ID(q, v, kv (clip(kp (q_command - q)) - v)) (n,) [N m], within the torque limits.
 
-    ID is the inverse dynamics; `state` is [q; v], `scratch` (3 n,); gains in 1/s. Invalid encoder
-    readings give gravity compensation at the commanded posture, an invalid command the last torque.
+    ID is the inverse dynamics, `state` [q; v]. Invalid encoder readings give gravity compensation
+    at the commanded posture, an invalid command the last torque.
     """
     if not sound(command):
         return
@@ -204,7 +204,7 @@ def MakeJointControl(
 
 
 def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """Return the default `interface` of the servo that a `joint_control` block names, or None."""
+    """Return a position interface by the name `servo` in a `joint_control` block, or None."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))
 
 
@@ -253,8 +253,7 @@ def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoA
     """Return stiffness, damping and mass of the slave for the passivity methods.
 
     Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
-    blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. The joint loops accelerate with
-    kv (kp (x_command - x) - v).
+    blocks of the inertia Lambda with diag(m, m, m, J, J, J) >= Lambda.
     """
     config.check_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)

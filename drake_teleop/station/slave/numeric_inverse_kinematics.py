@@ -358,8 +358,8 @@ def _follow_command(
 ):  # fmt: skip
     """Write joint positions q (n,) from the last command towards the pose; return the `IkStatus`.
 
-    `speed` (n,) contains speed limits for the elapsed time; `last` (n + 1,) is the last command and
-    its time [s], which is held if the encoder readings `position` (n,) are invalid.
+    `speed` (n,) contains speed limits; `last` (n + 1,) is the last command and its time [s], which
+    is held if the encoder readings `position` (n,) are invalid.
     """
     n = q.shape[0]
     put(q, 0, last, 0, n)

@@ -85,7 +85,6 @@ class SlavePlant:
 
     @property
     def friction(self) -> NDArray[np.float64]:
-        """Dry friction (n,) of the joints [N m]."""
         return friction_of_joints(self.config.friction, self.arm.joint_names)
 
     @property
@@ -118,7 +117,6 @@ def start_pose(slave: Slave) -> NDArray[np.float64]:
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
-    """Return the slave's plant without environment, from a cache."""
     written = tuple(path.stat().st_mtime_ns for path in slave.files())
     return _nominal_slave(HashableByValue(slave), written)
 
@@ -148,8 +146,6 @@ def AddSlavePlant(
     q_start: NDArray[np.float64] | None = None,
 ) -> SlavePlant:
     """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the configured start.
-
-    Only the tool makes contact.
 
     Raises:
         DrakeTeleopError: if a model cannot be read, or the arm cannot reach the start or hold its
@@ -268,7 +264,6 @@ def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
 
 
 def finalize(plant: MultibodyPlant) -> None:
-    """Finalize a continuous plant without Drake's warnings about ignored joint limits."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
     for joint, (lower, upper) in zip(joints, limits, strict=True):

@@ -29,17 +29,15 @@ _TOUCH_TOLERANCE_M = 1e-9  # m
 
 @njit(cache=True)
 def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench_W):
-    """Write the environment's wrench on the tool, about the world's origin, in W.
+    """Write the environment's wrench (6,) on the tool, about the world's origin, in W [N, N m].
 
     Args:
         arm: `ArmModel.table`.
         pairs: (k, 28) pairs of shapes, `Pairs.known`.
         joints: (m, 21) joints of moving bodies, `JointTable`.
         applied_W: (6,) additional [f; tau] about So, in W [N, N m].
-        q, v: (n,) joint positions and speeds.
         sheet: (2,) deflection of the leaf and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
-        wrench_W: (6,) output [N, N m].
     """
     has_wrench = pairs.shape[0] > 0
     for i in range(6):
@@ -121,15 +119,8 @@ def add_force(wrench_W, p_WC, force_W):
 class ToolContact(LeafSystem):
     """Block with the environment's wrench (6,) on the tool about the world's origin, for the log.
 
-    .. pydrake_system::
-
-        name: ToolContact
-        input_ports:
-        - slave_state: [q; v] of the arm
-        - sheet_state: [z; v_z] of the sheet spring (only if there is one)
-        - plant_state: [q; v] of the whole plant (only if other bodies move)
-        output_ports:
-        - true_contact_wrench_W: (6,) [N, N m]
+    Its ports sheet_state [z; v_z] and plant_state [q; v] exist only with a leaf or other moving
+    bodies.
     """
 
     __slots__ = ONE_DICT

@@ -1,12 +1,9 @@
-"""Commercial arm with a position interface.
+"""Commercial arm with a position interface (docs/station.md).
 
-    command --[dead time, held]--> target --[generator]--> r, dr/dt --[drives]--> torque
+command --[dead time, held]--> target --[generator]--> r, dr/dt --[drives]--> torque
 
-    d2r/dt2 = gain (target - (r + lookahead dr/dt))
-    d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz
-
-The generator respects speed and acceleration limits. Without integral action, a joint yields in
-contact by torque / (inertia w^2). Sources: docs/station.md."""
+d2r/dt2 = gain (target - (r + lookahead dr/dt))
+d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
 
 import math
 from dataclasses import dataclass

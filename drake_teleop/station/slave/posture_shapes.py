@@ -63,10 +63,7 @@ class Near(NamedTuple):
 
 
 class PostureShapes:
-    """Plant with the shapes of a slave and its surroundings.
-
-    Args:
-        sticks: True gives an arm without shapes sticks between its joints.
+    """Plant with the shapes of a slave and its surroundings; `sticks` replaces missing shapes.
 
     Attributes:
         assumptions: texts about data missing in the models.
@@ -135,7 +132,6 @@ class PostureShapes:
         ]
 
     def points(self, bodies: Collection[BodyIndex]) -> Array:
-        """Return points (k, 3) on the shapes of bodies, in W [m]."""
         return np.vstack(
             [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hulls(body))]
         )

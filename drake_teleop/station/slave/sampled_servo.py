@@ -1,11 +1,11 @@
 """Joint control that samples faster than the simulation's events.
 
-Each event predicts the motion with `plant_rates`, one midpoint step per sample of the controller:
+Each event predicts the motion, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
 The plant receives the line a + b (t - h/2) over h = m T with the area and first moment of these
-steps. The prediction includes contacts, but no other force on the tool."""
+steps."""
 
 from __future__ import annotations
 
@@ -56,7 +56,6 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
         servo: gains and limits from `servo_numbers`.
         physics: `SlavePlant.physics`.
         period: of the servo [s].
-        scratch: (3 n,).
         line: (3 n,) output: torque [N m], its rate [N m/s], last sample [N m].
     """
     n = command.shape[0]

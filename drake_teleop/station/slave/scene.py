@@ -57,7 +57,6 @@ class Scene(Environment):
 
     @property
     def path(self) -> Path:
-        """Path of `file`, or of the shipped model with this name."""
         given, shipped = Path(self.file), models_dir() / self.file
         return shipped if not given.is_file() and shipped.is_file() else given
 

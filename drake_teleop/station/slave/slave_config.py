@@ -82,7 +82,7 @@ class Slave:
 
     @property
     def packages(self) -> tuple[Path, ...]:
-        """Folders of package:// addresses."""
+        """Folders in which package:// addresses are searched."""
         return tuple(Path(folder) for folder in self.package_paths)
 
     @property
@@ -90,7 +90,6 @@ class Slave:
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def files(self) -> list[Path]:
-        """Return the existing model files."""
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
         return [path for path in paths if path.is_file()]
 

@@ -73,7 +73,6 @@ class Contact(NamedTuple):
 
     @property
     def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Arguments `pairs` and `joints` for `environment_wrench`."""
         return self.pairs, self.joints
 
 
@@ -85,7 +84,6 @@ def no_contact() -> Contact:
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
-    """Add the environment to a plant that contains the tool, before finalizing."""
     before, sheet = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
@@ -204,7 +202,6 @@ def supports_pose(joint: Joint) -> bool:
 
 
 def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
-    """Return the joint positions for the pose X_FM of the joint's child frame."""
     if isinstance(joint, RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
