@@ -195,7 +195,7 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft", tool=plain[1].tool))
     shapes.move_to(np.full(6, 0.3))
     assert not any(
-        {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.near()
+        {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.overlaps()
     )
 
 

@@ -299,7 +299,7 @@ class ReplayScene:
         return places
 
 
-class _Device(NamedTuple):
+class _ReplayDevice(NamedTuple):
     """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
     `positions` converts joint positions to those of the plant.
@@ -312,7 +312,7 @@ class _Device(NamedTuple):
     folder: object = None
 
 
-def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
+def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if scenario.master.leader is not None:
         return _add_leader(plant, scenario.master.leader)
     is_phantom = scenario.master.model == PHANTOM
@@ -321,10 +321,10 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
-    return _Device(master, plant.GetFrameByName("stylus", master), _P_EGRIP_E, positions)
+    return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _P_EGRIP_E, positions)
 
 
-def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
+def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
     parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
 
@@ -333,7 +333,9 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
         ordered[order] = q
         return ordered
 
-    return _Device(parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder)
+    return _ReplayDevice(
+        parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder
+    )
 
 
 def _add_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:

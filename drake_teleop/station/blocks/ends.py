@@ -30,7 +30,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 
-class _End(DoubleOnly, LeafSystem):
+class _PassivityEnd(DoubleOnly, LeafSystem):
     """Base class of both ends of a passivity method.
 
     Args:
@@ -106,7 +106,7 @@ class _End(DoubleOnly, LeafSystem):
             discrete_state.set_value(group, part)
 
 
-class PassivityAtMaster(_End):
+class PassivityAtMaster(_PassivityEnd):
     """Master's end of a passivity method: renders a wrench, sends pose and energy.
 
     .. pydrake_system::
@@ -140,7 +140,7 @@ class PassivityAtMaster(_End):
         output.SetFromVector(self._results(context)[3][:6])
 
 
-class PassivityAtSlave(_End):
+class PassivityAtSlave(_PassivityEnd):
     """Slave's end of a passivity method: commands a pose, sends wrench and energy.
 
     .. pydrake_system::

@@ -98,7 +98,7 @@ def ArmModelFromPlant(
             X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
             table[body_row, PHI:ROTOR] += _phi_of_body(M_B, X_LB)
-    lower, upper = np.array([_range(j) for j in joints]).T.copy()
+    lower, upper = np.array([_joint_limits(j) for j in joints]).T.copy()
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
@@ -116,7 +116,7 @@ def _per_joint(values: list[float]) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def _range(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
+def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:

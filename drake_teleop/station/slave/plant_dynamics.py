@@ -89,7 +89,7 @@ def _place_box(pair, bodies, placed):
 
 
 @njit(cache=True)
-def nearness(arm, pairs, watched, joints, q, sheet, state):
+def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     """Return the tool's proximity `FAR`, `TOUCHING` or `WATCHED`; `watched` is `Pairs.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)

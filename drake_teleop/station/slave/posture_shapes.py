@@ -54,7 +54,7 @@ _NUM_POSTURES, _DESIGN_SHARE = 25, 0.4
 _SIDES = 24  # points on a circumference of a round shape
 
 
-class Near(NamedTuple):
+class Overlap(NamedTuple):
     """Two bodies and the distance of their nearest shapes [m], negative if they overlap."""
 
     first: RigidBody
@@ -123,10 +123,10 @@ class PostureShapes:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
-    def near(self) -> list[Near]:
+    def overlaps(self) -> list[Overlap]:
         """Return the pairs of overlapping bodies, except those that overlap by design."""
         return [
-            Near(self.plant.get_body(first), self.plant.get_body(second), distance)
+            Overlap(self.plant.get_body(first), self.plant.get_body(second), distance)
             for (first, second), distance in self._distances().items()
             if (first, second) not in self._by_design
         ]
@@ -229,7 +229,7 @@ def _start_overlaps(key: HashableByValue, _: tuple[int, ...]) -> tuple[str, ...]
 def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
     """Return one sentence for each overlapping pair; `of_arm` leaves out the surroundings."""
     found = []
-    for first, second, distance in shapes.near():
+    for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
         if distance > -_MIN_DEPTH_M or (of_arm and with_surroundings):
             continue
