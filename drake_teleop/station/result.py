@@ -102,7 +102,7 @@ class SimulationResult:
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             raise DrakeTeleopError(
-                f"names and specs differ in {', '.join(odd)}",
+                f"signals and specs have different names: {', '.join(odd)}",
                 where="signals",
                 remedy="give each signal one spec",
             )
@@ -225,7 +225,7 @@ class SimulationResult:
         missing = [name for name in _CANONICAL_COLUMNS if name not in self]
         if missing:
             raise DrakeTeleopError(
-                f"this result holds no {', '.join(missing)}",
+                f"the result contains no {', '.join(missing)}",
                 where="sensor log",
                 remedy="record the wrist sensor's signals",
             )

@@ -167,7 +167,7 @@ class Scenario:
                 raise DrakeTeleopError(
                     f"there is more than one {name}",
                     where=f"{where}:environment",
-                    remedy="leave the others out",
+                    remedy="keep one",
                 )
         _check_task(self, where)
         _check_steps(self, where)
@@ -290,7 +290,7 @@ def _check_task(scenario: Scenario, where: str) -> None:
     check_task(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
-            "a task needs a hand that moves the tool",
+            "the operator's task requires a scale above 0",
             where=f"{where}:kinematic_scaling.translation_scale",
             remedy="set it above 0, or operator.task: null",
         )
@@ -317,7 +317,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         timeout = scenario.channel.timeout or LONGEST_TIMEOUT
         if line.rate_hz is not None and timeout < 2 / line.rate_hz:
             raise DrakeTeleopError(
-                f"{timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
+                f"{timeout:g} s are shorter than two packet intervals at {line.rate_hz:g} Hz",
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )

@@ -335,7 +335,7 @@ def _check_friction(slave: SlavePlant, step: float) -> None:
             f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
             f"{1e3 * step:g} ms",
             where="slave.friction",
-            remedy=f"choose less, or a simulation.max_step of {shorter:.2g} s",
+            remedy=f"reduce the friction, or set simulation.max_step: {shorter:.2g}",
         )
 
 
@@ -369,7 +369,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         raise DrakeTeleopError(
             f"expected 16 numbers, found {type(estimate).__name__}",
             where="load_estimate",
-            remedy="pass its .estimate",
+            remedy="pass the attribute .estimate of this object",
         )
     if estimate is not None:
         estimate = checked("load_estimate", estimate, 16)

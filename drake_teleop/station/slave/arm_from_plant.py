@@ -140,7 +140,7 @@ def _joint_chain(
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
             raise DrakeTeleopError(
-                f"the arm hangs on a {joint.type_name()} joint",
+                f"the chain to the sensor contains a {joint.type_name()} joint",
                 where=joint.name(),
                 remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
             )
@@ -292,7 +292,7 @@ def check_size(arm: ArmModel, where: str) -> None:
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
     if 0.0 < length < _MIN_LENGTH_M or length > _MAX_LENGTH_M:
-        what = f"from its first joint to the sensor it is {length:.3g} m long"
+        what = f"from its first joint to the sensor the arm is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI:], strict=True):
         # Root mean square distance of the mass from the joint's origin.

@@ -136,6 +136,6 @@ class SlaveMonitor(LeafSystem):
             f"{q[joint]:.3f} {unit} is outside {self._arm.lower[joint]:.3f} to "
             f"{self._arm.upper[joint]:.3f} {unit}",
             where="simulation",
-            remedy="ask for a smaller or slower motion, start elsewhere (slave.position or home)"
-            ", or speed joints up no faster than they can (joint_control.servo: position)",
+            remedy="command a smaller or slower motion, start elsewhere (slave.position or home)"
+            ", or limit joint accelerations (joint_control.servo: position)",
         )

@@ -111,7 +111,7 @@ class Slave:
         for joint, position in self.hold.items():
             if not np.isfinite(position):
                 raise DrakeTeleopError(
-                    f"{position:g} is no position",
+                    f"{position:g} is not a finite position",
                     where=f"{where}.hold.{joint}",
                     remedy="give an angle [rad] or a distance [m]",
                 )

@@ -105,7 +105,7 @@ class Tool:
             )
         if not _inertia(self).IsPhysicallyValid():
             raise DrakeTeleopError(
-                "no body has this inertia",
+                "the inertia is impossible for a rigid body",
                 where=f"{where}.inertia",
                 remedy="give entries of the tensor about the centre of mass, or leave it out",
             )
