@@ -37,7 +37,7 @@ class Chatter(NamedTuple):
 def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
     """Return each series of touches that no reversal of the command explains.
 
-    A series has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
+    It has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
 
     Args:
         t: (N,) evenly spaced times [s].

@@ -76,9 +76,6 @@ def replay_command(
         run: folder written by `run` or `reproduce`, or a log in it.
         out: output folder: replay.html, or one file per log for several logs.
         scenario: shipped scenario or YAML file; by default the YAML file beside the log.
-
-    Raises:
-        DrakeTeleopError: if there is no log or no scenario.
     """
     logs = _find_logs(run)
     films = []

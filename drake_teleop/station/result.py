@@ -102,7 +102,7 @@ class SimulationResult:
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             raise DrakeTeleopError(
-                f"signals and specs have different names: {', '.join(odd)}",
+                f"the names of signals and specs differ in {', '.join(odd)}",
                 where="signals",
                 remedy="give each signal one spec",
             )

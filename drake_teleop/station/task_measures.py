@@ -38,10 +38,9 @@ _PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures of a task by name, as in docs/operator.md, for one run.
+    """Return the measures of the operator's task, as in docs/operator.md, for one run.
 
-    Raises:
-        DrakeTeleopError: if the scenario has no task.
+    A DrakeTeleopError is raised if the scenario has no task.
     """
     task = scenario.operator.task
     if task is None:

@@ -103,7 +103,7 @@ class ArmModel:
 
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
-    """Replace the pose of the previous link P in x by that of link `row`, L; return p_PL_W."""
+    """Replace the previous link's pose in the state x by that of link `row`; return p_PL_W [m]."""
     joint = table[row]
     p_PL_P = three(joint, TRANSLATION)
     if joint[SLIDES] != 0.0:
@@ -217,7 +217,7 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 @njit(cache=True)
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write the state x (21,) of each link, and of S, to the rows of out (n+1, 21)."""
+    """Write [s, omega, alpha, p_WL, R_WL] in W of each link, and of S, to out (n+1, 21)."""
     n = table.shape[0] - 1
     _set_world_at_rest(table, out[0])
     for row in range(n):

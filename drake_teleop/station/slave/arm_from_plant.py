@@ -52,9 +52,8 @@ def ArmModelFromPlant(
 ) -> ArmModel:
     """Return the chain from the world to the sensor frame of a finalized plant.
 
-    Raises:
-        DrakeTeleopError: if the frame is missing, or the path to it is not a chain of welds,
-            revolute and prismatic joints without branches that move.
+    A DrakeTeleopError is raised unless it consists of welds, revolute and prismatic joints without
+    branches that move.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -208,8 +207,8 @@ def with_all_limits(
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing limits, and one text per assumption.
 
-    `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is appended to the
-    assumption about accelerations.
+    `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is added to the text
+    about accelerations.
     """
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, SLIDES] != 0.0

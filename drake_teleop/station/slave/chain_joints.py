@@ -67,7 +67,7 @@ def weld_base(
 ) -> list[JointIndex]:
     """Weld a free base to the world; return the joints up to S, from the base outwards.
 
-    A DrakeTeleopError is raised if the model fixes its base although `X_WBase` is not the identity.
+    A DrakeTeleopError is raised if the model fixes its base and `X_WBase` is not the identity.
     """
     inboard = {j.child_body().index(): j for j in map(plant.get_joint, plant.GetJointIndices())}
     body, chain = frame.body(), list[Joint]()
@@ -120,7 +120,7 @@ def check_chain(
 def weld_at(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld joints, by name, at the positions `hold` [rad, m]; return a note or raise an error."""
+    """Weld joints, by name, at the positions `hold` [rad, m]; return notes for the user."""
     known = {plant.get_joint(k).name(): plant.get_joint(k) for k in joints if moves(plant, k)}
     for name, position in hold.items():
         joint = known.get(name)
@@ -145,7 +145,7 @@ def weld_at(
 def weld_other_joints(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
-    """Weld moving joints outside the chain at their default positions; return a note."""
+    """Weld moving joints outside the chain at their default positions; return notes for the user."""
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     added = set(plant.GetJointIndices()) - before - set(chain)
@@ -205,7 +205,7 @@ def actuate(
 def assume_rotor_inertias(
     plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
 ) -> list[str]:
-    """Give joints a rotor inertia if the links that they move have none; return a note.
+    """Give joints a rotor inertia if the links that they move have none; return notes for the user.
 
     The links of a joint at an `auxiliary` body include those of the next joint.
     """

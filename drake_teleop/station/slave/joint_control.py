@@ -80,7 +80,7 @@ class JointControlConfig:
             interface.check(f"{where}.interface", rate)
 
     def check_computed_torque(self, what: str) -> None:
-        """Raise DrakeTeleopError, in the name of `what`, unless the servo is computed torque."""
+        """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
                 f"{what} does not support the servo {self.servo}",
@@ -204,7 +204,7 @@ def MakeJointControl(
 
 
 def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """Return a position interface by the name `servo` in a `joint_control` block, or None."""
+    """Return the position interface that `servo` of a `joint_control` block names, or None."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))
 
 

@@ -59,11 +59,8 @@ def ParseModel(
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
     A free base is welded to the world at `X_WBase`, the joints `hold` at the given positions
-    [rad, m], and other joints, such as a gripper's, at their defaults.
-
-    Raises:
-        DrakeTeleopError: if the file cannot be read, has no frame `sensor_frame` or joint of
-            `hold`, or fixes the base although `X_WBase` is not the identity.
+    [rad, m], and other joints, such as a gripper's, at their defaults. Unreadable or contradictory
+    models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     read = read_model(plant, path, package_paths, Purpose(sensor_frame, hold))
@@ -93,10 +90,7 @@ def ParseModel(
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Parse a tool with one root link, weld the root to S ("sensor_weld"), and weld other joints.
-
-    A DrakeTeleopError is raised if the file cannot be read or has another number of roots.
-    """
+    """Parse a tool with one root link, weld the root to S ("sensor_weld"), weld other joints."""
     before = set(plant.GetJointIndices())
     read = read_model(plant, path, package_paths, Purpose(is_tool=True))
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
@@ -117,10 +111,7 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
-    """Parse the surroundings of an arm; return the folder of their converted meshes.
-
-    A DrakeTeleopError is raised for an unreadable file, or elements that Drake ignores.
-    """
+    """Parse the surroundings of an arm; return the folder of their converted meshes."""
     read = read_model(plant, path, (), Purpose(is_scene=True))
     for name, what in read.dependent.items():
         raise DrakeTeleopError(

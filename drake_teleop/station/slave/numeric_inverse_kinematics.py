@@ -185,12 +185,12 @@ def _singularity_status(L, J):
 def follow_pose(
     table, L, pose, reference, lower, upper, max_step, posture, pull, singular, steps, q
 ):
-    """Write joint positions q (n,) near a reference that meet a pose or approach it smoothly.
+    """Write joint positions q (n,) near a reference that meet a pose; return the `IkStatus`.
 
     Args:
         table: `ArmModel.table`.
         L: length that weights orientation against position error [m].
-        pose: (7,) X_WS, the quaternion of any nonzero length.
+        pose: (7,) X_WS.
         reference: (n,) joint positions, normally the last command.
         lower, upper: (n,) joint limits.
         max_step: (n,) largest distance from the reference.
@@ -198,9 +198,6 @@ def follow_pose(
         pull: fraction of the distance to the posture.
         singular: singular value below which the motion is damped [m].
         steps: maximum number of steps.
-
-    Returns:
-        The `IkStatus` as a plain integer.
     """
     n = q.shape[0]
     low, high = np.empty(n), np.empty(n)
@@ -380,8 +377,7 @@ class NumericInverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions, for any serial arm.
 
     Its ports are those of `InverseKinematics`. Joints continue from the last command, not from the
-    measured position, so that a redundant arm does not drift. `q_start` is the first command, and
-    the posture that a redundant arm approaches.
+    measured position, so that a redundant arm does not drift towards another posture.
     """
 
     __slots__ = ONE_DICT

@@ -147,9 +147,7 @@ def AddSlavePlant(
 ) -> SlavePlant:
     """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the configured start.
 
-    Raises:
-        DrakeTeleopError: if a model cannot be read, or the arm cannot reach the start or hold its
-            load.
+    A DrakeTeleopError is raised if the arm cannot reach the start or hold its load.
     """
     if environment is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
@@ -210,10 +208,7 @@ class ParsedSlave:
     folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
-        """Return the arm of the finalized plant, and the assumptions about its limits.
-
-        A DrakeTeleopError is raised if the sensor carries no mass, or the arm is no serial chain.
-        """
+        """Return the arm of the finalized plant, and the assumptions about its limits."""
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
@@ -264,6 +259,7 @@ def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
 
 
 def finalize(plant: MultibodyPlant) -> None:
+    """Finalize a continuous plant without Drake's warnings about joint limits."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
     for joint, (lower, upper) in zip(joints, limits, strict=True):

@@ -244,7 +244,7 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Add visual shapes as collision shapes where a body has none; drop unlimited shapes.
+    """Give bodies without collision shapes their visual ones; drop unlimited shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     """

@@ -94,7 +94,6 @@ class Slave:
         return [path for path in paths if path.is_file()]
 
     def check(self, where: str) -> None:
-        """Raise DrakeTeleopError for invalid numbers, lengths or tool."""
         if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
             raise DrakeTeleopError(
                 "contains a number that is negative or not finite",

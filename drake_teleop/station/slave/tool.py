@@ -90,7 +90,6 @@ class Tool:
         return Path(self.model) if self.model else models_dir() / "tool.sdf"
 
     def check(self, where: str) -> None:
-        """Raise DrakeTeleopError for file plus mass, shapes without mass, or an invalid inertia."""
         if self.model and self.mass:
             raise DrakeTeleopError(
                 "both a file and a mass define the tool",
