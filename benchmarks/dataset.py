@@ -1,16 +1,19 @@
 """How many planted faults of a dataset are named, and how good are wrench and contacts?
 
-Usage: python benchmarks/dataset.py [EPISODES] [FRAMES]: clean episodes per rate, frames for time.
+Usage: python benchmarks/dataset.py [EPISODES] [FRAMES] [--rates HZ ...] [--tools N] [--json FILE]
+EPISODES are the clean ones of each dataset; FRAMES are for the CPU time (0: not measured).
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -25,7 +28,18 @@ from drake_teleop.logs.sample import NOISE, SampleEpisode
 RATES = (10.0, 15.0, 30.0, 50.0)
 TOOLS = [
     phi_from_mass_com_inertia(m, np.array(c), m * 2e-3 * np.eye(3))
-    for m, c in ((0.95, (0.004, -0.011, 0.058)), (0.5, (0, 0, 0.04)), (1.8, (0.02, 0.01, 0.09)))
+    for m, c in (
+        (0.95, (0.004, -0.011, 0.058)),
+        (1.8, (0.02, 0.01, 0.09)),
+        (0.5, (0, 0, 0.04)),
+        (0.7, (0.01, 0, 0.05)),
+        (0.8, (0, -0.02, 0.06)),
+        (1.1, (0.015, 0.01, 0.045)),
+        (1.2, (-0.02, 0, 0.08)),
+        (1.4, (0, 0.01, 0.05)),
+        (1.6, (-0.01, -0.01, 0.07)),
+        (2.0, (0, 0, 0.06)),
+    )
 ]
 OTHER = phi_from_mass_com_inertia(1.3, np.array([-0.01, 0.02, 0.07]), 3e-3 * np.eye(3))
 Fault = Callable[[SampleEpisode, np.ndarray], SampleEpisode]
@@ -99,7 +113,7 @@ FAULTS: dict[str, tuple[set[str], Fault]] = {
 }
 
 
-def planted(folder: Path, fps: float, phi: np.ndarray, clean: int) -> str:
+def planted(folder: Path, fps: float, phi: np.ndarray, clean: int) -> dict[str, Any]:
     changes = {k: {"phi": phi} for k in range(clean + len(FAULTS))}
     order = {clean + k: name for k, name in enumerate(FAULTS)}
     faults = {k: lambda x, f=FAULTS[n][1]: f(x, phi) for k, n in order.items()}
@@ -122,28 +136,49 @@ def planted(folder: Path, fps: float, phi: np.ndarray, clean: int) -> str:
     free = ~truth.any(axis=1)
     residual = np.sqrt(np.mean(contact[free] ** 2, axis=0)) / NOISE
     f1 = 2 * (touched & true).sum() / (touched.sum() + true.sum())
-    return (
-        f"{fps:3.0f} Hz {phi[0]:.2f} kg: named {len(FAULTS) - len(missed)}/{len(FAULTS)}, false"
-        f" {false}/{clean}, residual/noise force {residual[:3].mean():.2f} torque"
-        f" {residual[3:].mean():.2f}, F1 {f1:.3f}, mass {summary['mass']:.4f} kg, {cpu:.0f} s CPU;"
-        f" missed: {', '.join(missed) or 'none'}"
-    )
+    return {
+        "rate_hz": fps,
+        "mass_kg": float(phi[0]),
+        "planted": len(FAULTS),
+        "missed": missed,
+        "clean": clean,
+        "false": false,
+        "residual_of_noise": [float(residual[:3].mean()), float(residual[3:].mean())],
+        "contact_f1": float(f1),
+        "identified_kg": summary["mass"],
+        "cpu_s": cpu,
+    }
 
 
 def main() -> None:
-    clean = int(sys.argv[1]) if len(sys.argv) > 1 else 30
-    frames = int(sys.argv[2]) if len(sys.argv) > 2 else 10**6
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("episodes", type=int, nargs="?", default=30)
+    parser.add_argument("frames", type=int, nargs="?", default=10**6)
+    parser.add_argument("--rates", type=float, nargs="+", default=RATES)
+    parser.add_argument("--tools", type=int, default=len(TOOLS))
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    report: dict[str, Any] = {"cells": []}
     with tempfile.TemporaryDirectory() as name:
-        for fps in RATES:
-            for k, phi in enumerate(TOOLS):
-                print(planted(Path(name) / f"{fps}_{k}", fps, phi, clean), flush=True)
-        folder = Path(name) / "long"
-        length = 1000
-        write_sample_dataset(folder / "in", episodes=frames // length, duration_s=length / 30)
-        started = time.process_time()
-        dataset_command(folder / "in", folder / "out", identify=True, quiet=True)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        print(f"{frames} frames: {time.process_time() - started:.0f} s CPU, {peak:.2f} GB")
+        for fps in given.rates:
+            for k, phi in enumerate(TOOLS[: given.tools]):
+                cell = planted(Path(name) / f"{fps}_{k}", fps, phi, given.episodes)
+                report["cells"].append(cell)
+                print(cell, flush=True)
+        if given.frames:
+            report["long"] = long_dataset(Path(name) / "long", given.frames)
+            print(report["long"])
+    if given.json:
+        given.json.write_text(json.dumps(report, indent=2) + "\n")
+
+
+def long_dataset(folder: Path, frames: int) -> dict[str, float]:
+    length = 1000
+    write_sample_dataset(folder / "in", episodes=frames // length, duration_s=length / 30)
+    started = time.process_time()
+    dataset_command(folder / "in", folder / "out", identify=True, quiet=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return {"frames": frames, "cpu_s": time.process_time() - started, "peak_GB": peak}
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ RUNS = {
     "calls": "benchmarks/calls.py --json FILE",
     "compensate": "benchmarks/compensate.py --json FILE",
     "contact_detection": "benchmarks/contact_detection.py --json FILE",
+    "dataset": "benchmarks/dataset.py 10 0 --rates 30 50 --tools 2 --json FILE",
     "domain": "benchmarks/domain.py --json FILE",
     "errors_in_variables": "benchmarks/errors_in_variables.py --json FILE",
     "foreign_analysis": "benchmarks/foreign_analysis.py --json FILE",
@@ -289,6 +290,34 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *("30 kinds, two motions, poses, IMU, both", "logs.md", "planted_mistakes"),
         lambda f: 100 * f["total"]["named"][0] / f["total"]["named"][1],
         *("%", 95.0),
+    ),
+    Claim(
+        *(LOGS, "Planted faults of episodes of a dataset are named"),
+        *("20 kinds, two tools, 30 and 50 fps", "robot-learning.md", "dataset"),
+        lambda f: (
+            100
+            * (
+                1
+                - sum(len(x["missed"]) for x in f["cells"]) / sum(x["planted"] for x in f["cells"])
+            )
+        ),
+        *("%", 95.0),
+    ),
+    Claim(
+        *(LOGS, "Findings in clean episodes of a dataset"),
+        *("the same; 10 episodes for each tool and rate", "robot-learning.md", "dataset"),
+        *(lambda f: sum(x["false"] for x in f["cells"]), "", 0.0, 0.0),
+    ),
+    Claim(
+        *(LOGS, "Residual force and torque of a dataset in free motion, worst mean"),
+        *("the same", "robot-learning.md", "dataset"),
+        lambda f: max(max(x["residual_of_noise"]) for x in f["cells"]),
+        *("times the sensor's noise", 0.0, 1.2),
+    ),
+    Claim(
+        *(LOGS, "F1 of contact in a dataset, smallest"),
+        *("the same; contact of more than 0.5 N", "robot-learning.md", "dataset"),
+        *(lambda f: min(x["contact_f1"] for x in f["cells"]), "", 0.95),
     ),
     Claim(
         *(LOGS, "Error of the mass after ten seconds of motion"),

@@ -254,6 +254,68 @@ def test_mujoco_gives_sites_and_torque_limits(arms: ModuleType, tmp_path: Path) 
     np.testing.assert_allclose(X[:3, 0], [0, 1, 0], atol=1e-12)
 
 
+def write_boxes(path: Path, top: str, joint: str) -> Path:
+    """Write an arm with three joints along or about x, at one point, and boxes on its links."""
+    inertial = (
+        '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+        "</inertial>"
+    )
+    sizes = ("0.1 0.1 0.1", "0.1 0.1 0.1", "0.01 0.01 0.01", top)
+    links = "".join(
+        f'<link name="l{k}">{inertial}<collision><origin xyz="{0.5 * (k == 0)} 0 0"/><geometry>'
+        f'<box size="{size}"/></geometry></collision></link>'
+        for k, size in enumerate(sizes)
+    )
+    limit = f'<axis xyz="1 0 0"/><limit {joint} velocity="1" effort="900"/>'
+    kind = "revolute" if "-3" in joint else "prismatic"
+    joints = "".join(
+        f'<joint name="j{k}" type="{kind}"><parent link="l{k - 1}"/><child link="l{k}"/>'
+        f'<origin xyz="0.02 0 0"/>{limit}</joint>'
+        for k in (1, 2, 3)
+    )
+    path.write_text(f'<robot name="r">{links}{joints}</robot>', encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("top", "joint", "assumed", "found"),
+    [
+        # Link 3 is around link 1 in all postures.
+        ("0.3 0.3 0.3", 'lower="-3" upper="3"', "", True),
+        ("0.3 0.3 0.3", 'lower="-3" upper="3"', "overlaps left out: l3 and l1", False),
+        ("0.3 0.3 0.3", 'lower="-3" upper="3"', "overlaps left out: l3 and l2", True),
+        ("0.1 0.1 0.1", 'lower="-2" upper="2"', "", False),  # a telescope
+    ],
+)
+def test_overlaps_at_the_start_count_unless_stated_and_by_design(
+    arms: ModuleType, tmp_path: Path, top: str, joint: str, assumed: str, found: bool
+) -> None:
+    scenario = tmp_path / "a.yaml"
+    write_boxes(tmp_path / "arm.urdf", top, joint)
+    scenario.write_text(
+        "slave: {model: arm.urdf, sensor_frame: l3, home: [0.1, 0.1, 0.1], tool: {mass: 1}}"
+    )
+    figures = arms.start_figures(arms.LoadScenario(scenario), [assumed])
+    assert bool([text for text in figures["overlaps"] if "l1 and l3" in text]) == found
+
+
+def test_a_pair_that_overlaps_in_few_postures_counts_although_it_is_stated(
+    arms: ModuleType, tmp_path: Path
+) -> None:
+    path = write_boxes(tmp_path / "arm.urdf", "0.1 0.1 0.1", 'lower="-3" upper="3"')
+    # Link 3 is 0.2 m beside the axis and overlaps link 1, which is too, near equal angles only.
+    text = path.read_text(encoding="utf-8").replace(
+        '<origin xyz="0.0 0 0"/>', '<origin xyz="0 0.2 0"/>'
+    )
+    path.write_text(text, encoding="utf-8")
+    scenario = tmp_path / "a.yaml"
+    scenario.write_text(
+        "slave: {model: arm.urdf, sensor_frame: l3, home: [0.1, 0.1, 0.1], tool: {mass: 1}}"
+    )
+    figures = arms.start_figures(arms.LoadScenario(scenario), ["overlaps left out: l1 and l3"])
+    assert [text for text in figures["overlaps"] if "l1 and l3" in text]
+
+
 @pytest.mark.parametrize(("ending", "text"), [("exit", "exit 3"), ("sleep", "longer than")])
 def test_a_process_that_dies_or_hangs_is_a_row(
     arms: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, text: str

@@ -31,6 +31,7 @@ SAID = {
     "load-no_mass.json": "phi: has no mass",
     "log_parquet-panic.parquet": "cannot be read: it is damaged",
     "mjcf-latin_1.xml": "is not UTF-8 text (byte ",
+    "mjcf-size.xml": "geom of l2: size '1e300 0.2 0.1' exceeds 1e+06",
     "result-absent_column.parquet": "cannot be read: unable to find column",
     "result-dates.parquet": "cannot be read: wrench.f_x, wrench.f_y hold no numbers",
     "result-metadata_panic.parquet": "is not a simulation result",

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.new_station.place import _strong_ones, find_place
+from drake_teleop.lab.new_station.place import _rows_to_solve, _usable_rows, find_place
 from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
@@ -19,11 +20,13 @@ from drake_teleop.lab.new_station.random_postures import (
     random_postures,
     suitable,
 )
-from drake_teleop.lab.new_station.text import wall_of
+from drake_teleop.lab.new_station.text import scenario_text, wall_of
 from drake_teleop.station.environment.solids import Wall
+from drake_teleop.station.master.data_sheets import PHANTOM
+from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import holding_torque, pose_into
-from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.posture_shapes import PostureShapes, start_overlaps
+from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
+from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_texts, start_overlaps
 from drake_teleop.station.slave.slave_config import Slave
 
 pytestmark = pytest.mark.slow
@@ -111,7 +114,7 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     # The base link has a plate on the plane; everything that moves is above it.
     assert plan.plane == pytest.approx(0.0, abs=1e-9)
     assert plan.shapes.points(plan.shapes.moving())[:, 2].min() > 0.02
-    assert start_overlaps(slave_of(plan, path), wall_of(plan)) == ()
+    assert start_overlaps(slave_of(plan, path), wall_of(plan))[0] == ()
     assert wall_of(plan).position[2] < plan.lowest[2] - 0.01
 
 
@@ -134,10 +137,10 @@ def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
 def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
     path, plan = plain
     slave = slave_of(plan, path)
-    assert start_overlaps(slave, wall_of(plan)) == ()
+    assert start_overlaps(slave, wall_of(plan))[0] == ()
     elbow = postures_at(plan.shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
     (said,) = [
-        text for text in start_overlaps(slave, Wall(position=list(elbow))) if "link3" in text
+        text for text in start_overlaps(slave, Wall(position=list(elbow)))[0] if "link3" in text
     ]
     assert said.startswith("link3 and wall overlap by ") and " mm at the start" in said
     assert said.endswith("move the object in environment, or give another start in slave.home")
@@ -197,6 +200,96 @@ def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     assert not any(
         {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.overlaps()
     )
+    (said,) = [text for text in shapes.assumptions if "overlaps left out" in text]
+    assert "link3 and link5" in said and "link1" not in said
+    slave = Slave(model=str(path), sensor_frame="ft", tool=plain[1].tool, home=[0.3] * 6)
+    assert said in start_overlaps(slave, None)[1]
+
+
+def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
+    """Link 4 overlaps link 2 in most postures; the start avoids it, and no posture hides it."""
+    path = write_arm(tmp_path / "arm.urdf", ranges={3: (-2.6, 2.6)})
+    plate = '<collision><origin xyz="0 0 -0.02"/><geometry><box size="0.3 0.02 0.4"/></geometry>'
+    link = '<link name="link4">'
+    path.write_text(path.read_text().replace(link, f"{link}{plate}</collision>"))
+    plan = plan_station(path, "ft")
+    shapes = plan.shapes
+    random = np.random.default_rng(8).uniform(shapes.arm.lower, shapes.arm.upper, (200, 6))
+    counts = []
+    for q in random:
+        shapes.move_to(q)
+        near = [{each.first.name(), each.second.name()} for each in shapes.overlaps()]
+        counts.append({"link2", "link4"} in near)
+    assert 0.6 < np.mean(counts) < 0.95
+    assert start_overlaps(slave_of(plan, path), wall_of(plan))[0] == () == plan.overlaps
+    assert not any("link2 and link4" in text for text in plan.assumptions)
+
+
+def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
+    shapes = plain[1].shapes
+    postures, region = suitable(random_postures(shapes.arm), 0.0, 0.1)
+    usable, clear, clear_of_all = _rows_to_solve(shapes.arm, postures, region, shapes)
+    expected = _usable_rows(shapes.arm, postures.q)
+    np.testing.assert_array_equal(np.sort(usable), np.sort(expected))
+    assert 3 < len(clear) < len(usable) < len(postures.q)
+    assert set(clear) <= set(usable) and not set(clear_of_all) <= set(usable)
+    for row in usable[:: len(usable) // 500 + 1]:
+        shapes.move_to(postures.q[row])
+        assert (row in clear) != bool(overlap_texts(shapes, of_arm=True))
+    (only,) = _rows_to_solve(shapes.arm, postures, region, None)
+    np.testing.assert_array_equal(only, usable)
+
+
+def test_links_of_a_telescope_may_overlap_and_a_gantry_may_not(tmp_path):
+    def arm(last_axis):
+        text = write_arm(tmp_path / "arm.urdf").read_text()
+        axes = {1: "0 0 1", 2: "0 0 1", 3: last_axis}
+        for k, axis in axes.items():
+            start = text.index(f'<joint name="j{k}" type="revolute">')
+            end = text.index("</joint>", start)
+            slide = text[start:end].replace("revolute", "prismatic")
+            slide = slide[: slide.index("<axis")] + f'<axis xyz="{axis}"/>'
+            limit = '<limit lower="0" upper="0.1" velocity="1" effort="300"/>'
+            text = text[:start] + slide + limit + text[end:]
+        path = tmp_path / f"{last_axis[:1]}.urdf"
+        path.write_text(text.replace('xyz="0 0 0.4"', 'xyz="0 0 -0.2"'))
+        shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft"))
+        shapes.move_to(np.zeros(6))
+        near = [f"{each.first.name()} and {each.second.name()}" for each in shapes.overlaps()]
+        return [*near, *(text for text in shapes.assumptions if "overlaps left out" in text)]
+
+    assert not any("link1 and link3" in text for text in arm("0 0 1"))
+    assert any("link1 and link3" in text for text in arm("1 0 0"))
+
+
+@pytest.mark.parametrize(("effort", "weak"), [(300, ()), (4, ("j2", "j3"))])
+def test_torque_limits_that_cannot_hold_the_arm_are_left_out_and_stated(tmp_path, effort, weak):
+    path = write_arm(tmp_path / "arm.urdf")
+    path.write_text(path.read_text().replace('effort="300"', f'effort="{effort}"'))
+    plan = plan_station(path, "ft")
+    assert set(plan.weak_joints) <= set(weak) and bool(plan.weak_joints) == bool(weak)
+    stated = [text for text in plan.assumptions if text.startswith("no torque limit for j")]
+    assert len(stated) == len(plan.weak_joints)
+    text = scenario_text(plan, {"model": str(path), "sensor_frame": "ft"}, None, PHANTOM, None)
+    scenario = tmp_path / "station.yaml"
+    scenario.write_text(text)
+    slave = LoadScenario(scenario).slave
+    assert slave.torque_limits == dict.fromkeys(plan.weak_joints, np.inf)
+    arm = AddSlavePlant(DiagramBuilder(), slave, None).arm
+    np.testing.assert_array_equal(
+        np.isinf(arm.effort_limit), np.isin(arm.joint_names, plan.weak_joints)
+    )
+
+
+def test_weak_arm_with_a_heavy_tool_of_the_user_keeps_its_limits(plain, tmp_path):
+    path, _ = plain
+    tool = tmp_path / "tool.sdf"
+    tool.write_text(
+        '<sdf version="1.9"><model name="t"><link name="t"><inertial><pose>0 0 0.1 0 0 0</pose>'
+        "<mass>500</mass></inertial></link></model></sdf>"
+    )
+    plan = plan_station(path, "ft", tool=tool)
+    assert plan.weak_joints == ()
 
 
 @pytest.mark.parametrize("low", [-0.01, 0.02])
@@ -225,10 +318,12 @@ def test_postures_that_the_motors_cannot_hold_are_left_out(share: float) -> None
     torque = np.abs([holding_torque(arm, each) for each in q])
     limit = np.quantile(torque, 0.8, axis=0) if share < 1.0 else 0.1 * torque.min(axis=0)
     weak = replace(arm, effort_limit=limit)
-    kept = _strong_ones(weak, postures_at(arm, q)).q
+    kept = q[_usable_rows(weak, q)]
+    roomy = joint_margins(weak, q) > 0.22
+    assert 0 < roomy.sum() < len(q)
     if share > 1.0:
-        assert len(kept) == len(q)
+        np.testing.assert_array_equal(kept, q[roomy])
     else:
-        expected = q[(torque < 0.9 * limit).all(axis=1)]
+        expected = q[(torque < 0.7 * limit).all(axis=1) & roomy]
         assert 0 < len(expected) < len(q)
         np.testing.assert_array_equal(kept, expected)

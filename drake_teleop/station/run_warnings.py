@@ -74,7 +74,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_contact(result),
         _check_rendered_force(result),
     )
-    overlaps = start_overlaps(scenario.slave, scenario.surroundings)
+    overlaps, _ = start_overlaps(scenario.slave, scenario.surroundings)
     return [
         *overlaps,
         *(f"{condition} {_times_text(spans)}" for condition, spans in found if spans),

@@ -103,6 +103,18 @@ def test_clean_episodes_have_no_finding(fps: float) -> None:
     assert [verdict(sample_episode(k, fps=fps)) for k in range(3)] == [set()] * 3
 
 
+def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
+    phi = phi_from_mass_com_inertia(1.8, np.array([0.02, 0.01, 0.09]), 3.6e-3 * np.eye(3))
+    squares = []
+    for number in range(6):
+        x = sample_episode(number, phi=phi, contacts=0)
+        reading, load_wrench = EpisodeSignals(log_of(x), 4.0).predictor(phi)("sensor", 0.0)
+        rest = reading - load_wrench
+        squares.append(((rest - np.median(rest, axis=0)) / NOISE) ** 2)
+    assert np.sqrt(np.mean(squares)) < 1.2
+    assert np.sqrt(np.mean([x[[0, -1]] for x in squares])) < 4.0
+
+
 @settings(max_examples=4, deadline=None)
 @given(st.integers(0, 50), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0.35, 3.0))
 def test_any_large_rotation_of_the_wrench_is_found(

@@ -215,6 +215,9 @@ def test_arm_without_visuals_is_shown_as_sticks(scenario):
         ({"base_pose": [0.1, 0, 0, 0, 0, 0]}, "welds base to the world itself"),
         ({"inverse_kinematics": "closed_form"}, "closed form is that of an RX90"),
         ({"tool": Tool(mass=90.0)}, "hold its 90.9 kg at the start: j4 needs 566 of its 400 N;"),
+        ({"torque_limits": {"j4": 5.0}}, "j4 needs .* of its 5 N;.*set slave.torque_limits"),
+        ({"torque_limits": {"knee": 5.0}}, "the arm has no joint 'knee'; name one of j1, j2"),
+        ({"torque_limits": {"j4": 0.0}}, "torque_limits.j4: 0 is no limit"),
         ({"sensor_frame": "finger"}, "no body with a mass is attached to finger"),
         ({"model": "absent.urdf"}, "absent.urdf: there is no such file"),
         ({"tool": Tool(model="a.sdf", mass=1.0)}, "slave.tool.mass: both a file and a mass"),
@@ -227,6 +230,17 @@ def test_invalid_slave_raises_one_error(scenario, change, expected):
     changed = replace(scenario, **{f"slave__{name}": value for name, value in change.items()})
     with pytest.raises(DrakeTeleopError, match=expected):
         MakeTeleopStation(changed, load_estimate=np.ones(16))
+
+
+def test_torque_limits_of_the_scenario_replace_those_of_the_model(scenario):
+    own = NominalSlave(scenario.slave)
+    limits = {"j2": 30.0, "j4": np.inf}
+    slave = replace(scenario, slave__torque_limits=limits).slave
+    nominal = NominalSlave(slave)
+    assert own.arm.effort_limit[3] == 400.0 and nominal.arm.effort_limit[3] == np.inf
+    assert nominal.arm.effort_limit[1] == 30.0 != own.arm.effort_limit[1]
+    np.testing.assert_array_equal(nominal.arm.effort_limit[4:], own.arm.effort_limit[4:])
+    assert any(text == "no force limit for j4" for text in nominal.assumptions)
 
 
 def test_arm_without_inertia_gets_stated_rotor_inertias(folder, tmp_path):

@@ -384,6 +384,7 @@ BESIDE = (
             (2.28, r"(^|; )inertia replaced by the nearest .* of link flat \(4.09 %\)"))),
         (JOINT, '<body name="p"><inertial pos="0 0 0" mass="0" diaginertia="1 1 1"/></body>', "",
          "an inertia without a mass left out of p"),
+        (JOINT, "", '<option gravity="0 0 0"/>', r"gravity of 9.81 m/s\^2 instead of 0 0 0"),
         (JOINT, '<geom type="hfield" hfield="h"/>', "", "hfield are not supported; .* of b"),
     ],
 )  # fmt: skip

@@ -162,6 +162,31 @@ def test_mesh_outside_folder_is_removed_with_remedy(tmp_path: Path, where: str) 
     assert not any("shapes" in words for words in parse(path).assumptions)
 
 
+@pytest.mark.parametrize("case", ["installed", "source", "no package", "home", "link", "neighbour"])
+def test_model_reads_files_of_the_installed_python_package_around_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    package, mesh = tmp_path / "site-packages" / "robots", "../scene/solid.obj"
+    (package / "assets" / "arm").mkdir(parents=True)
+    (package / "assets" / "scene").mkdir()
+    (package.parent / "solid.obj").write_text(SOLID)
+    if case == "link":
+        (package / "assets" / "scene" / "solid.obj").symlink_to(package.parent / "solid.obj")
+    else:
+        (package / "assets" / "scene" / "solid.obj").write_text(SOLID)
+    if case != "no package":
+        (package / "__init__.py").touch()
+    if case != "source":
+        (package.parent / "robots-1.0.dist-info").mkdir()
+    if case == "neighbour":
+        mesh = "../../../solid.obj"
+    if case == "home":
+        monkeypatch.setenv("HOME", str(package / "assets"))
+    path = write(package / "assets" / "arm", a_urdf=urdf(mesh))
+    assumed = parse(path).assumptions
+    assert any(OUTSIDE in words for words in assumed) == (case != "installed")
+
+
 def include_cycle(text: Callable[[str], str], *names: str) -> dict[str, str]:
     """Return files that include each other."""
     others = (*names[1:], names[0])

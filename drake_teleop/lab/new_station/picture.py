@@ -95,7 +95,6 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
 
 
 def _hull_triangles(points: Array) -> Array:
-    """Return the triangles (k, 3, 3) of the convex hull of points, ordered outwards."""
     if len(points) > len(_DIRECTIONS):
         points = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]
     try:
@@ -137,7 +136,6 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
 
 
 def _chain(plan: Plan) -> Array:
-    """Return the joints and the sensor (n + 1, 3), which connect parts without shapes [m]."""
     at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
     return np.vstack([at_start.origins[0], at_start.p_WS])
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import Box, ProximityProperties
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
@@ -43,7 +44,7 @@ from drake_teleop.station.slave.arm import (
 from drake_teleop.station.slave.home import R_WS_HOME, tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.posture_shapes import PostureShapes
+from drake_teleop.station.slave.posture_shapes import MIN_DEPTH_M, PostureShapes, overlap_texts
 
 #: Edges of the walls that are tried, the first preferred [m].
 WALL_EDGES_M = (0.4, 0.25, 0.15)
@@ -57,12 +58,16 @@ TOOL_AXES = {
     "-z": RotationMatrix.MakeXRotation(np.pi),
 }
 _CUBE_HALVES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of tested cubes [m]
-# Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise.
-_NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES = 40, 12, 60
+# Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise; of
+# postures whose shapes are checked if all solved ones overlap.
+_NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES, _NUM_CHECKED = 40, 12, 60, 500
 _SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
-_MAX_TORQUE_USE = 0.9  # largest torque at rest, over its limit
+# Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
+# identification before a run uses 80 % of both.
+_MIN_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
+LEAST_LOAD = 0.05  #: Share of the load that weak arms have to hold.
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
@@ -70,8 +75,8 @@ _SAME_HEIGHT_M = 1e-4  # lowest points within this height share the contact [m]
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
 _WALL_ABOVE_M, _WALL_BELOW_M = 0.015, 0.16
 _MAX_WALL_SHARE = 0.6  # largest edge of a wall, over the reach
-# Cost of overlaps and of shapes below the base plane [1/m], and of each smaller wall.
-_COST_PER_M, _COST_OF_SMALLER_WALL = 30.0, 0.1
+# Cost of overlaps and of shapes below the base plane [1/m], of any overlap, of each smaller wall.
+_COST_PER_M, _COST_OF_OVERLAP, _COST_OF_SMALLER_WALL = 30.0, 1.0, 0.1
 
 
 class Place(NamedTuple):
@@ -86,6 +91,7 @@ class Place(NamedTuple):
         score: merit of the posture, see `scores`, without the cost of overlaps.
         wall: edge of the wall that the arm does not touch [m].
         vertical: True if the arm can only move up and down by `half`.
+        overlaps: True if shapes of the arm overlap.
     """
 
     pose: Array
@@ -96,6 +102,7 @@ class Place(NamedTuple):
     score: float = 0.0
     wall: float = WALL_EDGES_M[0]
     vertical: bool = False
+    overlaps: bool = False
 
     @property
     def reachable(self) -> str:
@@ -151,20 +158,18 @@ def find_place(
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
         plane: height of the base plane, below which the arm has no joints [m].
         axis: axis of S along the tool, one of `TOOL_AXES`.
-
-    Raises:
-        DrakeTeleopError: if no such start is found.
     """
     R_SA = TOOL_AXES[axis]
     pointed = with_tool_axis(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
     postures, region = suitable(random_postures(pointed), plane, length)
-    postures = _strong_ones(pointed, postures)
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
-    found = [
-        _examined(shapes, place, region)
-        for place in _candidates(pointed, postures, region, is_free)
-    ]
+    found = list[Place]()
+    for rows in _rows_to_solve(pointed, postures, region, shapes):
+        solved = _candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
+        found += [_examined(shapes, place, region) for place in solved]
+        if not all(place.overlaps for place in found):
+            break
     found.sort(key=lambda place: place.score, reverse=True)
     good = [place for place in found if place.score > found[0].score - _SCORE_TOLERANCE]
     best = None
@@ -186,11 +191,19 @@ def find_place(
     return best._replace(pose=pose, by_position=best.by_position and axis == "z")
 
 
-def _strong_ones(arm: ArmModel, postures: Postures) -> Postures:
-    """Return the postures that the motors can hold; all if none can be held."""
-    held = [np.abs(holding_torque(arm, q)) < _MAX_TORQUE_USE * arm.effort_limit for q in postures.q]
-    strong = np.flatnonzero(np.all(held, axis=1)) if held else np.empty(0, np.intp)
-    return postures[strong] if len(strong) else postures
+def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
+    """Return the rows of q (k, n) with room for motion, and that the motors can hold if possible.
+
+    If necessary with less load, and then without any condition.
+    """
+    roomy = joint_margins(arm, q) > _MIN_MARGIN
+    for share in (1.0, LEAST_LOAD):
+        loaded = arm.with_load(share * arm.phi_load)
+        torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
+        strong = (np.abs(torques) < MAX_TORQUE_USE * arm.effort_limit).all(axis=1)
+        if (roomy & strong).any():
+            return np.flatnonzero(roomy & strong)
+    return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
 
 
 def _removals(region: Region, left: int) -> str:
@@ -198,21 +211,41 @@ def _removals(region: Region, left: int) -> str:
     return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
 
+def _rows_to_solve(
+    arm: ArmModel, postures: Postures, region: Region, shapes: PostureShapes | None
+) -> Iterator[NDArray[np.intp]]:
+    """Yield the usable rows, the best first; then rows of all ranks whose shapes do not overlap."""
+    if not len(postures.q):
+        return
+    order = np.argsort(scores(arm, postures, region))[::-1]
+    usable = order[np.isin(order, _usable_rows(arm, postures.q))]
+    yield usable
+    if shapes is None:
+        return
+    for rows in (usable, order):
+        few = rows[:: len(rows) // _NUM_CHECKED + 1]
+        clear = np.ones(len(few), dtype=bool)
+        for k, row in enumerate(few):
+            shapes.move_to(postures.q[row])
+            clear[k] = not overlap_texts(shapes, of_arm=True)
+        yield few[clear]
+
+
 def _candidates(
     arm: ArmModel, postures: Postures, region: Region, is_free: bool
 ) -> Iterator[Place]:
-    """Yield starts near the best postures; `is_free`: with the tool exactly down."""
-    if not len(postures.q):
-        return
-    order = np.argsort(scores(arm, postures, region))[::-1][:_NUM_CANDIDATES]
+    """Yield starts near postures; `is_free`: with the tool exactly down."""
     if not is_free:  # position and orientation are coupled
-        solved = [(q, _pose(arm, q), False) for q in postures.q[order]]
+        solved = [(q, _pose(arm, q), False) for q in postures.q]
     else:
         solved = [
-            start for k in order for start in _exact_starts(arm, postures.q[k], postures.p_WS[k])
+            start
+            for q, position in zip(postures.q, postures.p_WS, strict=True)
+            for start in _exact_starts(arm, q, position)
         ]
     if not solved:
         return
+    solved = [solved[k] for k in _usable_rows(arm, np.array([q for q, _, _ in solved]))]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
     merits, rooms = scores(arm, exact, region), joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
@@ -249,6 +282,7 @@ def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Pla
     walls = _move_walls(shapes)
     depths = dict.fromkeys(walls, 0.0)
     cost = max(region.plane - shapes.points(shapes.moving())[:, 2].min(initial=np.inf), 0.0)
+    overlaps = False
     for first, second, distance in shapes.overlaps():
         pair = {first.index(), second.index()}
         if wall := pair & walls.keys():
@@ -256,12 +290,14 @@ def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Pla
                 depths[wall.pop()] -= distance
         else:
             cost -= distance
+            overlaps |= distance < -MIN_DEPTH_M
     large = sum(edge > _MAX_WALL_SHARE * region.reach for edge in WALL_EDGES_M[:-1])
     free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
     rank = next(free, len(walls) - 1)
     cost += list(depths.values())[rank]
-    score = place.score - _COST_PER_M * cost - _COST_OF_SMALLER_WALL * (rank - large)
-    return place._replace(score=score, wall=WALL_EDGES_M[rank])
+    score = place.score - _COST_PER_M * cost - _COST_OF_OVERLAP * overlaps
+    score -= _COST_OF_SMALLER_WALL * (rank - large)
+    return place._replace(score=score, wall=WALL_EDGES_M[rank], overlaps=overlaps)
 
 
 def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
@@ -301,12 +337,7 @@ def _merit(place: Place) -> tuple[float, float, bool, float]:
 
 
 def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
-    """Return the place with the half edge of its largest reachable cube, or 0.
-
-    Args:
-        is_free: False for an arm with less than six degrees of freedom, whose cube is a guess.
-        vertical: True examines displacements up and down only.
-    """
+    """Return the place with the half edge of its largest reachable cube, or 0."""
     moves = _meets if is_free else _reaches
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
@@ -328,7 +359,6 @@ def _meets(arm: ArmModel, place: Place, displacement: Array) -> bool:
 
 
 def _reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
-    """Return whether an arm with few joints follows a displacement approximately."""
     target = place.pose + np.append(np.zeros(4), displacement)
     q, _ = find_posture(arm, target, place.q)
     error = np.linalg.norm(_pose(arm, q)[4:] - target[4:])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.place import (
+    LEAST_LOAD,
+    MAX_TORQUE_USE,
     OPPOSITE,
     TOOL_AXES,
     Place,
@@ -33,7 +35,7 @@ from drake_teleop.station.slave.tool import Ball, Tool
 _PHANTOM_HALF_M = 0.08
 # Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
 # share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
-_STAND_IN_MASSES_KG, _MAX_TORQUE_USE = (1.0, 0.5, 0.2, 0.1, 0.05), 0.8
+_STAND_IN_MASSES_KG = (1.0, 0.5, 0.2, 0.1, 0.05)
 _MIN_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _COM_M, _LENGTH_M, _RADIUS_M, _FREE_LENGTH_M = 0.05, 0.1, 0.012, 0.05
 _STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _COM_M])
@@ -61,6 +63,7 @@ class Plan:
         axis_note: advice on unusual axes of the sensor frame.
         overlaps: sentences about overlaps of shapes at the start.
         plane: height of the base plane [m].
+        weak_joints: joints whose torque limits in the model cannot hold the arm.
         shapes: shapes of arm and tool, at the start.
     """
 
@@ -78,6 +81,7 @@ class Plan:
     axis_note: str
     overlaps: tuple[str, ...]
     plane: float
+    weak_joints: tuple[str, ...]
     shapes: PostureShapes
 
 
@@ -88,11 +92,7 @@ def plan_station(
     tool: Path | None = None,
     device: str = PHANTOM,
 ) -> Plan:
-    """Choose start, scales and motions for an arm and a device.
-
-    Raises:
-        DrakeTeleopError: for an unusable model, or an arm that cannot point its tool down.
-    """
+    """Choose start, scales and motions for an arm and a device."""
     stand_in = _stand_in("z", _LENGTH_M)
     slave = Slave(
         model=str(arm),
@@ -108,7 +108,9 @@ def plan_station(
         shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     plane = base_plane(shapes)
     place, axis, shapes = _find_start(slave, shapes, plane, axis)
-    model, on_sensor = shapes.arm, None if tool is not None else slave.tool
+    on_sensor = None if tool is not None else slave.tool
+    share = 1.0 if own_tool else LEAST_LOAD if tool is None else 0.0
+    model, weak_joints, assumed = _without_weak_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
         on_sensor.mass = _mass_to_hold(model, place.q)
     mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
@@ -136,10 +138,11 @@ def plan_station(
         swing=_round_down(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
         lowest=lowest,
         tip=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
-        assumptions=tuple(shapes.assumptions),
+        assumptions=(*shapes.assumptions, *assumed),
         axis_note=tool_frame_advice(model, arm, sensor_frame, axis),
         overlaps=tuple(overlap_texts(shapes, of_arm=True)),
         plane=plane,
+        weak_joints=weak_joints,
         shapes=shapes,
     )
 
@@ -173,18 +176,13 @@ def _find_start(
 
 
 def _tool_axis(shapes: PostureShapes, load: Array) -> str:
-    """Return the axis of S towards the model's own load, or else along the last joint; else z.
-
-    Args:
-        load: (4,) mass [kg] and first moments of the load [kg m] without a stand-in.
-    """
+    """Return the axis of S towards the model's own load, or else along the last joint; else z."""
     if load[0] > _MIN_MASS_KG and (axis := nearest_axis(load[1:] / load[0])):
         return axis
     return last_joint_axis(shapes.arm) or "z"
 
 
 def _reaches_beyond_link(shapes: PostureShapes, axis: str) -> bool:
-    """Return whether bodies beyond the sensor, without the stand-in, reach beyond its link."""
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
     link_end = extent(shapes, shapes.sensor_link() - shapes.tool_bodies, axis)
     return extent(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
@@ -211,12 +209,29 @@ def _rod_length(shapes: PostureShapes, axis: str) -> float:
     return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
 
 
+def _without_weak_limits(
+    arm: ArmModel, q: Array, share: float
+) -> tuple[ArmModel, tuple[str, ...], list[str]]:
+    """Return the arm without limits that cannot hold it at q, these joints, and a text for each.
+
+    Args:
+        share: share of the load that the arm must hold; 0 for a tool of the user.
+    """
+    torque = np.abs(holding_torque(arm.with_load(share * arm.phi_load), q))
+    weak = torque > MAX_TORQUE_USE * arm.effort_limit
+    names = tuple(np.array(arm.joint_names)[weak].tolist())
+    texts = [
+        f"no torque limit for {name}, as holding the arm takes {needed:.3g} of its {limit:.3g}"
+        for name, limit, needed in zip(names, arm.effort_limit[weak], torque[weak], strict=True)
+    ]
+    return replace(arm, effort_limit=np.where(weak, np.inf, arm.effort_limit)), names, texts
+
+
 def _mass_to_hold(arm: ArmModel, q: Array) -> float:
-    """Return the mass of a stand-in that the motors can hold [kg]."""
     phi = arm.phi_load
     for mass in _STAND_IN_MASSES_KG:
         torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)
-        if np.abs(torque / arm.effort_limit).max() < _MAX_TORQUE_USE:
+        if np.abs(torque / arm.effort_limit).max() < MAX_TORQUE_USE:
             break
     return mass
 

@@ -33,6 +33,7 @@ def scenario_text(
         "slave.position": "of the sensor at the start, tool down [m]",
         "slave.home": "joints at the start, tool down [rad, m]",
         "slave.tip": "contact point, p_STip [m]",
+        "slave.torque_limits": "those of the model cannot hold the arm",
         "kinematic_scaling": f"the arm can move {plan.place.reachable}",
         "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
         "operator.intent": "of the hand: up and down, then down onto the wall",
@@ -46,6 +47,8 @@ def scenario_text(
         slave["tool"] = {"mass": plan.tool.mass, "com": plan.tool.com}
         slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(plan.tool.shapes[0])]}
         comments["slave.tool"] = "a stand-in: put model file or numbers of your tool here"
+    if plan.weak_joints:
+        slave["torque_limits"] = dict.fromkeys(plan.weak_joints, float("inf"))
     if plan.tip:
         slave["tip"] = round_row(plan.tip)
     swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
@@ -83,7 +86,6 @@ def wall_of(plan: Plan) -> Wall:
 
 
 def _device_rates(device: str) -> dict[str, Any]:
-    """Return the rates of a slow device for the scenario, as `analyze` requires."""
     own = Master(model=device).own_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 

@@ -80,6 +80,7 @@ _UNITS = {
 _POSE_VECTOR = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _POSE_WIDTHS = (7, 8)
 _QUATERNION_TOLERANCE = 0.01  # of the length
+_NUMBERED_QUATERNION = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_COUNTS = 2000.0  # median of integers that are raw counts
 _FILL_IN = "FILL IN"
@@ -148,7 +149,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     """
     plain = {name: _normalized(name) for name in table.columns}
     found = _pose_vectors(table, plain) | _vectors(plain) | _euler_angles(plain)
-    found |= _numbered(plain) | _arrays(table, plain)
+    found |= _numbered(plain) | _numbered_quaternion(table, plain) | _arrays(table, plain)
     _resolve_translation(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
@@ -271,11 +272,26 @@ def _pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, 
     for columns in (group for group in groups.values() if len(group) in _POSE_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
-            length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
-            if np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE:
+            if _have_unit_length(table, quaternion):
                 position = columns[:3] if first else columns[4:7]
                 return {kind: _Columns(quaternion, ""), "position": _Columns(position, "")}
     return {}
+
+
+def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
+    length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
+    return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
+
+
+def _numbered_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    """Return four columns such as q1, q2, q3, q4 of ABB, if they have unit length."""
+    groups: dict[str, list[str]] = {}
+    for name, (words, _) in plain.items():
+        if re.search(_NUMBERED_QUATERNION, words):
+            groups.setdefault(_without_number(words), []).append(name)
+    fours = [group for group in groups.values() if len(group) == 4]
+    found = next((group for group in fours if _have_unit_length(table, group)), None)
+    return {"orientation": _Columns(found, "")} if found else {}
 
 
 def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:

@@ -355,7 +355,7 @@ class EpisodeSignals:
         self._splines = None
         if log.posed is not None:
             poses = log.posed.poses
-            self._splines = PoseSplines(poses, spacing / poses.rate)
+            self._splines = PoseSplines(poses, spacing / poses.rate, limit_ends=True)
         grid = np.arange(-_MARGIN * STEPS, (len(log) + _MARGIN) * STEPS) / STEPS
         self._fine = self.motion(log.t[0] + grid * log.dt)
 

@@ -75,10 +75,23 @@ class ImuRows:
 
 
 class PoseSplines:
-    """Least-squares splines of poses of a frame P, with knots every `spacing` [s]."""
+    """Least-squares splines of poses of a frame P, with knots every `spacing` [s].
 
-    def __init__(self, poses: Poses, spacing: float, imu_rows: ImuRows | None = None) -> None:
+    Args:
+        limit_ends: expect second and higher derivatives at the ends as large as inside. Poses on
+            one side alone determine them with a several times larger error.
+    """
+
+    def __init__(
+        self,
+        poses: Poses,
+        spacing: float,
+        imu_rows: ImuRows | None = None,
+        *,
+        limit_ends: bool = False,
+    ) -> None:
         self.poses, self.spacing, self.rate, self.imu_rows = poses, spacing, poses.rate, imu_rows
+        self._limit_ends = limit_ends
         self._start = float(poses.t[0])
         t = poses.t - self._start
         self._blocks = _row_blocks(len(t))
@@ -94,7 +107,8 @@ class PoseSplines:
         times = (t[x] for x in self._blocks)
         gram, right = _normal(zip(times, values, strict=True), knots, DEGREE, 7)
         if imu_rows is None:
-            return BSpline(knots, solveh_banded(gram, right), DEGREE)
+            spline = BSpline(knots, solveh_banded(gram, right), DEGREE)
+            return self._with_limited_ends(spline, gram, right) if self._limit_ends else spline
         columns = []
         shifted_t = imu_rows.t - self._start
         inside = (shifted_t >= knots[0]) & (shifted_t <= knots[-1])
@@ -113,6 +127,27 @@ class PoseSplines:
                 band, side = gram + weight * more, side + weight * other
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), DEGREE)
+
+    def _with_limited_ends(self, spline: BSpline, gram: Array, right: Array) -> BSpline:
+        t, count = self.poses.t - self._start, DEGREE + 1
+        inside = t[(t > t[0] + DEGREE * self.spacing) & (t < t[-1] - DEGREE * self.spacing)]
+        if not len(inside):
+            return spline
+        values = np.hstack([self.poses.position, self.poses.quaternion])
+        noise = np.square(spline(t) - values).sum(axis=0) / max(len(t) - gram.shape[1], 1)
+        coefficients = np.empty_like(right)
+        for part in (slice(0, 3), slice(3, 7)):
+            band = gram.copy()
+            for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
+                basis = BSpline(spline.t, np.eye(gram.shape[1])[:, columns], DEGREE)
+                for order in range(2, count):
+                    power = np.square(spline(inside, order)[:, part]).mean() + 1e-300
+                    x = basis(at, order)
+                    outer = noise[part].mean() / power * np.multiply.outer(x, x)
+                    for k in range(count):
+                        band[DEGREE - k, columns][k:] += np.diag(outer, k)
+            coefficients[:, part] = solveh_banded(band, right[:, part])
+        return BSpline(spline.t, coefficients, DEGREE)
 
     def quaternion(self, t: Array) -> Array:
         """Return quaternions (N, 4) [w, x, y, z] of R_WP at times t, nearly of unit length."""

@@ -145,7 +145,7 @@ def weld_at(
 def weld_other_joints(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
-    """Weld moving joints outside the chain at their default positions; return notes for the user."""
+    """Weld moving joints outside the chain at their defaults; return notes for the user."""
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     added = set(plant.GetJointIndices()) - before - set(chain)
@@ -200,6 +200,22 @@ def actuate(
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
         actuator.set_default_rotor_inertia(rotor)
         actuator.set_default_gear_ratio(gear)
+
+
+def set_torque_limits(
+    plant: MultibodyPlant, arm: ModelInstanceIndex, limits: dict[str, float]
+) -> None:
+    """Replace the effort limits of the named joints; raise DrakeTeleopError for an unknown one."""
+    motors = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    known = {each.joint().name(): each for each in motors if each.model_instance() == arm}
+    for name, limit in limits.items():
+        if name not in known:
+            raise DrakeTeleopError(
+                f"the arm has no joint {name!r}",
+                where="slave.torque_limits",
+                remedy=f"name one of {', '.join(known)}",
+            )
+        known[name].set_effort_limit(limit)
 
 
 def assume_rotor_inertias(

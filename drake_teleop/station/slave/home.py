@@ -95,5 +95,6 @@ def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
             f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {arm.joint_names[k]} "
             f"needs {abs(torque[k]):.3g} of its {arm.effort_limit[k]:.3g} {unit}",
             where="slave.tool",
-            remedy="give a lighter tool or payload, or start nearer to the base",
+            remedy="give a lighter tool or payload, start nearer to the base, or set"
+            " slave.torque_limits if the model's limits are wrong",
         )

@@ -54,7 +54,7 @@ class ReadModel(NamedTuple):
 def read_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: Purpose
 ) -> ReadModel:
-    """Repair a model's text and parse it into a plant, or raise DrakeTeleopError."""
+    """Repair a model's text and parse it into a plant."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()

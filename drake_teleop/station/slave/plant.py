@@ -25,6 +25,7 @@ from drake_teleop.common.rotations import quaternions
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.arm import FRICTION, ArmModel, forward_kinematics, pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
+from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
@@ -233,6 +234,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     if plant.HasModelInstanceNamed(ARM):
         plant.RenameModelInstance(plant.GetModelInstanceByName(ARM), f"{ARM}_of_model")
     plant.RenameModelInstance(model.instance, ARM)
+    set_torque_limits(plant, model.instance, slave.torque_limits)
     frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
     assumptions, folders = [*model.assumptions], [model.folder]
     if slave.tool is not None:

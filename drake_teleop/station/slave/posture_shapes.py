@@ -1,10 +1,13 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
 Collision shapes count; of a body without them, its visual shapes; of meshes, their convex hulls.
-Bodies that a joint connects, or that overlap in many random postures, may overlap."""
+Bodies that a joint or a telescope connects, or that overlap in nearly all random postures, may
+overlap, as in MoveIt's setup assistant; an assumption names the latter.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from functools import lru_cache
 from itertools import product
@@ -29,13 +32,14 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, Several
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.model.meshes import AddSkeleton
+from drake_teleop.station.slave.model.repair_report import listed
 from drake_teleop.station.slave.plant import (
     HashableByValue,
     NominalSlave,
@@ -46,11 +50,12 @@ from drake_teleop.station.slave.plant import (
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-# Larger overlaps are reported [m]; smaller ones are rounding of models.
-_MIN_DEPTH_M = 1e-3
+#: Larger overlaps are reported [m]; smaller ones are rounding of models.
+MIN_DEPTH_M = 1e-3
 _MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
-_NUM_POSTURES, _DESIGN_SHARE = 25, 0.4
+_NUM_POSTURES, _DESIGN_SHARE = 200, 0.95
+_SAME_DIRECTION = 0.999  # cosine of the angle between the axes of a telescope
 _SIDES = 24  # points on a circumference of a round shape
 
 
@@ -99,6 +104,11 @@ class PostureShapes:
             for index in map(BodyIndex, range(self.plant.num_bodies()))
         }
         self._by_design = self._overlaps_by_design()
+        names = [" and ".join(self.plant.get_body(k).name() for k in p) for p in self._by_design]
+        if names:
+            self.assumptions.append(
+                f"overlaps left out, as they are in nearly all postures: {listed(sorted(names))}"
+            )
 
     def shapes_of(self, body: BodyIndex) -> list[GeometryId]:
         inspector = self._scene_graph.model_inspector()
@@ -171,7 +181,7 @@ class PostureShapes:
         return found
 
     def _exclude_joined(self) -> None:
-        """Ignore overlaps in the environment, in a link, and of links with a common joint."""
+        """Ignore overlaps in the environment, in a link, and across a joint or telescope."""
         plant, manager = self.plant, self._scene_graph.collision_filter_manager()
 
         def link(body: RigidBody) -> set[BodyIndex]:
@@ -180,26 +190,36 @@ class PostureShapes:
         def shapes(bodies: Collection[BodyIndex]) -> GeometrySet:
             return GeometrySet([shape for each in bodies for shape in self.shapes_of(each)])
 
-        together = [self.surroundings]
+        context, together = plant.CreateDefaultContext(), [self.surroundings]
+        telescopes = list[tuple[Array, set[BodyIndex]]]()
         for joint in map(plant.get_joint, plant.GetJointIndices()):
-            if joint.child_body().index() not in self.surroundings:
-                together.append(link(joint.parent_body()) | link(joint.child_body()))
+            if joint.child_body().index() in self.surroundings:
+                continue
+            joined = link(joint.parent_body()) | link(joint.child_body())
+            if isinstance(joint, PrismaticJoint):
+                R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
+                axis, others = R_WF @ joint.translation_axis(), telescopes
+                telescopes = []
+                for other, bodies in others:
+                    if bodies & joined and abs(axis @ other) > _SAME_DIRECTION:
+                        joined |= bodies
+                    else:
+                        telescopes.append((other, bodies))
+                telescopes.append((axis, joined))
+            together.append(joined)
         for bodies in together:
             manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes(bodies)))
 
     def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
-        random, counts = np.random.default_rng(0), dict[tuple[BodyIndex, BodyIndex], int]()
-        for posture in random.uniform(
-            *sampled_range(self.arm), (_NUM_POSTURES, len(self.arm.lower))
-        ):
-            self.move_to(posture)
-            for pair in self._distances():
-                counts[pair] = counts.get(pair, 0) + 1
-        return {
-            pair
-            for pair, count in counts.items()
-            if count > _DESIGN_SHARE * _NUM_POSTURES and not self.surroundings & set(pair)
-        }
+        random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
+        least = int(np.ceil(_DESIGN_SHARE * _NUM_POSTURES))
+        limits = sampled_range(self.arm)
+        for left in range(_NUM_POSTURES, 0, -1):
+            self.move_to(random.uniform(*limits))
+            counts.update(p for p in self._distances() if not self.surroundings & set(p))
+            if max(counts.values(), default=0) + left <= least:
+                return set()
+        return {pair for pair, count in counts.items() if count >= least}
 
 
 def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
@@ -211,19 +231,23 @@ def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
     return np.where(around_zero, -np.pi, finite_lower), np.where(around_zero, np.pi, finite_upper)
 
 
-def start_overlaps(slave: Slave, environment: Environment | None) -> tuple[str, ...]:
-    """Return one sentence for each pair of bodies that overlap at the slave's start."""
+def start_overlaps(
+    slave: Slave, environment: Environment | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return sentences about pairs of bodies that overlap at the start, and the assumptions."""
     parts = [] if environment is None else list(environment.parts)
     written = tuple(path.stat().st_mtime_ns for path in slave.files())
     return _start_overlaps(HashableByValue((slave, parts)), written)
 
 
 @lru_cache(maxsize=4)
-def _start_overlaps(key: HashableByValue, _: tuple[int, ...]) -> tuple[str, ...]:
+def _start_overlaps(
+    key: HashableByValue, _: tuple[int, ...]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
     shapes = PostureShapes(slave, Several(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
-    return tuple(overlap_texts(shapes))
+    return tuple(overlap_texts(shapes)), tuple(shapes.assumptions)
 
 
 def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
@@ -231,7 +255,7 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
     found = []
     for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
-        if distance > -_MIN_DEPTH_M or (of_arm and with_surroundings):
+        if distance > -MIN_DEPTH_M or (of_arm and with_surroundings):
             continue
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:

@@ -60,6 +60,9 @@ class Slave:
     hold: dict[str, float] = plain(
         {}, "joints that are fixed, with their positions [rad, m], such as {torso_lift: 0.2}"
     )
+    torque_limits: dict[str, float] = plain(
+        {}, "torque limits by joint instead of the model's [N m, N]; .inf: no limit"
+    )
     friction: list[float] = plain(
         [],
         "dry friction of the joints [N m, N], one for all or each, not compensated by joint"
@@ -113,6 +116,13 @@ class Slave:
                     f"{position:g} is not a finite position",
                     where=f"{where}.hold.{joint}",
                     remedy="give an angle [rad] or a distance [m]",
+                )
+        for joint, limit in self.torque_limits.items():
+            if not limit > 0.0:
+                raise DrakeTeleopError(
+                    f"{limit:g} is no limit",
+                    where=f"{where}.torque_limits.{joint}",
+                    remedy="give a torque [N m] or force [N] above 0, or .inf",
                 )
         if self.tool is not None:
             self.tool.check(f"{where}.tool")

@@ -68,7 +68,6 @@ def remove_unusable_shapes(
 
 
 def _shape_fault(shape: ElementTree.Element) -> str | None:
-    """Return the fault of a shape's kind, size or place as text."""
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
     if inner is None or kind not in _DIMENSIONS:
@@ -127,11 +126,7 @@ def _mesh_fault(
 
 
 @lru_cache(maxsize=1024)
-def _is_readable(path: Path, _: int) -> bool:
-    """Return whether a mesh has faces with finite corners.
-
-    The second argument is the file's time, so that an edited file is read again.
-    """
+def _is_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
     if path.suffix.lower() in (".gltf", ".vtk"):
         try:
             with silent_stderr():
@@ -147,7 +142,6 @@ def _is_readable(path: Path, _: int) -> bool:
 
 @lru_cache(maxsize=1024)
 def _obj_of_stl(path: Path, _: int) -> str:
-    """Return the convex hull of an STL file, or its triangles if flat, as text of an OBJ file."""
     triangles = read_triangles(path)
     with suppress(ValueError):
         triangles = convex_hull(triangles.vertices)

@@ -12,7 +12,13 @@ from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
-from drake_teleop.station.slave.model.mjcf_elements import MIN_LENGTH, Attributes, Mjcf, rotation_to
+from drake_teleop.station.slave.model.mjcf_elements import (
+    MAX_VALUE,
+    MIN_LENGTH,
+    Attributes,
+    Mjcf,
+    rotation_to,
+)
 from drake_teleop.station.slave.model.mjcf_masses import (
     NO_MASS,
     MassProperties,
@@ -199,7 +205,7 @@ class BodyReader:
 
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
-        X_FG, size = self._mjcf.pose(given), given.numbers("size", (0.0, 0.0, 0.0))
+        X_FG, size = self._mjcf.pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
         if "fromto" in given and kind in (*_ROUND, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(rotation_to(ends[0] - ends[1]), ends.mean(axis=0))

@@ -18,11 +18,7 @@ _INTEGRATORS = ("integrator", "muscle", "user", "dcmotor")  # dynamics whose out
 
 
 def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
-    """Return the world's shapes and the body that carries the sensor; state the other bodies.
-
-    Raises:
-        DrakeTeleopError: if no body or site, or more than one, has the sensor's name.
-    """
+    """Return the world's shapes and the body that carries the sensor; state the other bodies."""
     tops = reader.take_top_bodies()
     kind = "body" if any(sensor in _names(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names(top[0], kind)]
@@ -168,7 +164,6 @@ def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
 
 
 def _carriers(arm: Body, chain: set[int]) -> dict[str, str]:
-    """Return, for each body by name, the outermost body of the chain that carries it."""
 
     def collect(body: Body, carrier: str) -> Iterator[tuple[str, str]]:
         carrier = body.name if id(body) in chain and body.joints else carrier

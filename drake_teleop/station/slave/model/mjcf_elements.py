@@ -19,7 +19,7 @@ from drake_teleop.station.slave.model.repair_report import RepairReport
 _MAX_DEPTH = 150  # largest depth of nested elements
 MIN_LENGTH = 1e-9
 """Shortest vector that has a direction."""
-_MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
+MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
 _PARTIAL = ("size", "gear", "gainprm", "biasprm", "friction")
@@ -35,7 +35,9 @@ class Attributes(dict[str, str]):
         super().__init__(values)
         self.label, self._report = label, report
 
-    def numbers(self, name: str, default: tuple[float, ...]) -> list[float]:
+    def numbers(
+        self, name: str, default: tuple[float, ...], largest: float = math.inf
+    ) -> list[float]:
         """Return the numbers of an attribute; `default` completes a list that is too short."""
         try:
             values = [float(word) for word in self.get(name, "").split()]
@@ -44,13 +46,16 @@ class Attributes(dict[str, str]):
         if not all(map(math.isfinite, values)):
             self._report.refuse(f"{self.label}: {name} {self[name]!r} is not a list of numbers")
             return list(default)
+        if max(map(abs, values), default=0.0) > largest:
+            self._report.refuse(f"{self.label}: {name} {self[name]!r} exceeds {largest:g}")
+            return list(default)
         return [*values, *default[len(values) :]][: len(default)]
 
     def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
         """Return the numbers of an attribute that has as many as `default`, each up to 1e6."""
         count, values = len(default), self.numbers(name, default)
-        if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > _MAX_VALUE:
-            what = f"{name} {self[name]!r} is not {count} numbers up to {_MAX_VALUE:g}"
+        if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > MAX_VALUE:
+            what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_VALUE:g}"
             self._report.refuse(f"{self.label}: {what}")
             return np.array(default)
         return np.array(values)

@@ -46,11 +46,7 @@ class Mesh:
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
 
     def triangles(self) -> Triangles:
-        """Return the transformed triangles.
-
-        Raises:
-            ValueError: if the file is damaged or of another kind.
-        """
+        """Return the transformed triangles."""
         if self._triangles is None:
             if self.file is not None:
                 vertices, faces = read_triangles(self.file)
@@ -106,7 +102,6 @@ class MeshLibrary:
         return mesh
 
     def _find(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
-        """Return the file of an asset, and its fault as text."""
         name = attributes.get("file", "")
         if not name:
             return None, "" if "vertex" in attributes else _UNREADABLE

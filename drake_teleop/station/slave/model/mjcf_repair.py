@@ -22,12 +22,14 @@ from drake_teleop.station.slave.model.mjcf_chain import (
     read_arm,
     report_couplings,
 )
-from drake_teleop.station.slave.model.mjcf_elements import Mjcf
+from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_masses import NO_MASS
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, listed
 from drake_teleop.station.slave.model.urdf_repair import Purpose
+
+_GRAVITY, _GRAVITY_TOLERANCE = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 
 
 def repair_mjcf(
@@ -36,15 +38,16 @@ def repair_mjcf(
     """Return the text of an MJCF file that Drake reads, with meshes converted in `folder`.
 
     A scene, or a file that directives add, keeps all bodies and joints.
-
-    Raises:
-        DrakeTeleopError: with all faults that cannot be repaired.
     """
     report = RepairReport(strict=purpose.is_scene)
     mjcf = Mjcf(root, path, files, report)
     reader = BodyReader(mjcf)
     if not root.get("model"):
         report.state("the model is named after its file:", path.stem)
+    for option in root.findall("option"):
+        gravity = Attributes(option.attrib, "option", report).vector("gravity", _GRAVITY)
+        if np.abs(np.subtract(gravity, _GRAVITY)).max() > _GRAVITY_TOLERANCE:
+            report.state("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.in_directives
     if is_complete or not purpose.sensor:
         world = read_all(reader)
@@ -125,14 +128,12 @@ def _set_mass(
 
 
 def _file_mass(mjcf: Mjcf) -> float:
-    """Return the mass of all bodies of the file, also of those that are left out."""
     reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
     mass = sum(reader.mass(body).mass for body in reader.read_world().all()[1:])
     return mass if mass > 0.0 else np.inf
 
 
 def _state_lost_shapes(reader: BodyReader, report: RepairReport) -> None:
-    """State lost shapes: visuals only of bodies without shapes."""
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if touches(shape) or not body.geoms:

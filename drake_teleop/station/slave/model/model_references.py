@@ -1,8 +1,9 @@
 """Files that a robot model references, and access rules for them.
 
 Models may be untrusted. Only files inside the model's folder and its packages are read, after
-resolving symbolic links. Packages are `package_paths` and ROS packages (package.xml) around the
-model. Include cycles are errors; number and size of files are limited.
+resolving symbolic links. Packages are `package_paths`, ROS packages (package.xml) around the model
+and the installed Python package around it. Include cycles are errors; number and size of files are
+limited.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class ModelFiles:
             for folder in (*(each / name for each in inside), *named, *(e / name for e in beside)):
                 if folder.resolve() == folder:  # neither a link nor ".."
                     self.packages.setdefault(name, folder)
+        own += filter(_is_installed_package, around)
         self._roots = {self._folder, *own, *(folder.resolve() for folder in package_paths)}
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._bases = {""}
@@ -90,12 +92,7 @@ class ModelFiles:
         return any(path.resolve().is_relative_to(root) for root in roots)
 
     def check(self, path: Path) -> None:
-        """Check a file and all files that it references, except meshes of the model's own links.
-
-        Raises:
-            DrakeTeleopError: for a file outside the allowed folders, a cycle, or too many or too
-                large files.
-        """
+        """Check a file and all files that it references, except meshes of the model's own links."""
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
@@ -133,7 +130,6 @@ class ModelFiles:
         return self._sizes[real]
 
     def _referenced_files(self, path: Path) -> Iterator[Path]:
-        """Yield the existing files and folders that a file references."""
         tops = [path.parent, self._folder]
         if path.suffix.lower() == ".sdf" and path != self._model.resolve():
             tops.append(Path.cwd())  # Drake resolves nested includes from here
@@ -172,6 +168,15 @@ class ModelFiles:
             for line in (_OBJ if kind == ".obj" else _MTL).findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
+
+
+def _is_installed_package(folder: Path) -> bool:
+    """Return whether a folder is a Python package beside its `.dist-info`, and no home folder."""
+    return (
+        os.path.isfile(folder / "__init__.py")
+        and any(each.is_dir() for each in folder.parent.glob("*.dist-info"))
+        and not Path(os.path.expanduser("~")).resolve().is_relative_to(folder)
+    )
 
 
 def _existing_paths(path: Path | None) -> list[Path]:

@@ -29,11 +29,7 @@ _PARTS = {
 def repair_sdf(
     root: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of an SDF that Drake reads, with meshes and included files in `folder`.
-
-    Raises:
-        DrakeTeleopError: with all faults of the arm that cannot be repaired.
-    """
+    """Return the text of an SDF that Drake reads, with meshes and included files in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
         _keep_one_model(root, file, files, purpose.sensor, report)
@@ -78,7 +74,6 @@ def _repair_included(
 
 
 def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
-    """Return the file at an address, or in the model folder there if it names one file."""
     found = files.file(address, file.resolve().parent) or files.file(address)
     if found is not None and (found / _MODEL_CONFIG).is_file():
         named = read_xml(found / _MODEL_CONFIG).findall("sdf")

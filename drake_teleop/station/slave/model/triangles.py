@@ -23,11 +23,7 @@ class Triangles(NamedTuple):
 
 
 def read_triangles(file: Path) -> Triangles:
-    """Return the triangles of an STL, OBJ or MSH file.
-
-    Raises:
-        ValueError: if the file is damaged or of another kind.
-    """
+    """Return the triangles of an STL, OBJ or MSH file."""
     read = {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}
     try:
         return checked_triangles(read[file.suffix.lower()](file.read_bytes()))
@@ -53,11 +49,7 @@ def obj_text(triangles: Triangles) -> str:
 
 
 def convex_hull(vertices: _Array) -> Triangles:
-    """Return the convex hull with triangles that face outwards.
-
-    Raises:
-        ValueError: if the points have no volume.
-    """
+    """Return the convex hull with triangles that face outwards."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -71,7 +63,6 @@ def convex_hull(vertices: _Array) -> Triangles:
 
 
 def _merged(corners: _Array) -> Triangles:
-    """Return triangles (m, 3, 3) with each vertex once."""
     points = corners.reshape(-1, 3).astype(float)
     order = np.lexsort(points.T)
     is_new = np.ones(len(points), bool)

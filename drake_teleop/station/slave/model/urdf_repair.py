@@ -60,11 +60,7 @@ class Purpose(NamedTuple):
 def repair_urdf(
     root: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of a URDF that Drake reads, with meshes converted in `folder`.
-
-    Raises:
-        DrakeTeleopError: with all faults of the arm that cannot be repaired.
-    """
+    """Return the text of a URDF that Drake reads, with meshes converted in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     root.set("name", root.get("name") or file.stem)
     if not purpose.is_scene:
@@ -142,7 +138,6 @@ def dependent_joints(root: Element) -> dict[str, str]:
 
 
 def _tree(scopes: list[Element], purpose: Purpose, report: RepairReport) -> ModelTree | None:
-    """Return the chain to the sensor if one robot or model contains it all."""
     if purpose.is_tool:
         for joint in (joint for scope in scopes for joint in joints_of(scope)):
             fix_joint(joint, report)
