@@ -166,7 +166,6 @@ class LogOnDisk:
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
-    """Return a simulator at t = 0 with the scenario's integrator and seed."""
     context = diagram.CreateDefaultContext()
     diagram.SetRandomContext(context, RandomGenerator(simulation.seed))
     simulator = Simulator(diagram, context)

@@ -119,6 +119,8 @@ class PassivityAtMaster(_PassivityEnd):
         output_ports:
         - packet: (38,) for the slave
         - wrench_to_master: (6,) F_E_B to render at the hand [N, N m]
+
+    Arguments as for the base class.
     """
 
     __slots__ = ()
@@ -156,6 +158,8 @@ class PassivityAtSlave(_PassivityEnd):
         output_ports:
         - packet: (38,) for the master
         - pose_to_slave: (7,) X_WS to follow
+
+    Arguments as for the base class.
     """
 
     __slots__ = ()

@@ -77,7 +77,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
 @njit(cache=True)
 def _place_box(pair, bodies, placed):
-    """Write the pair, with its box at the pose of its body, to `placed` (28,), and return this."""
+    """Write the pair, with its box at the pose of its body, to `placed` (28,); return `placed`."""
     body = bodies[int(pair[BODY])]
     put(placed, 0, pair, 0, WIDTH)
     turn = (body[0], body[1], body[2], body[3])

@@ -155,7 +155,6 @@ class PostureShapes:
         return [(X_WB @ points.T).T for points in hulls]
 
     def anchored(self) -> set[BodyIndex]:
-        """Return the indices of the slave's bodies that are fixed to the world."""
         fixed = self.plant.GetBodiesWeldedTo(self.plant.world_body())
         return {body.index() for body in fixed} - self.surroundings
 

@@ -70,7 +70,6 @@ class Scene(Environment):
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the file's bodies to a plant and place its free roots, or raise DrakeTeleopError."""
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
@@ -103,7 +102,6 @@ class Scene(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Make the tool's shapes hydroelastic, if configured, or raise DrakeTeleopError."""
         if not self.hydroelastic:
             return
         inspector = scene_graph.model_inspector()
