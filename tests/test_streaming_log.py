@@ -140,7 +140,7 @@ def test_a_log_replaces_an_earlier_one_but_nothing_else(tmp_path, in_memory):
     in_memory.write_part(folder, 7000)
     assert_same(run(log=folder), in_memory)
     (folder / "thesis.tex").write_text("all of it")
-    with pytest.raises(DrakeTeleopError, match=r"log: holds thesis\.tex"):
+    with pytest.raises(DrakeTeleopError, match=r"log: contains thesis\.tex"):
         run(log=folder)
     assert len(list(folder.iterdir())) > 3
 

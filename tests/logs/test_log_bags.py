@@ -293,7 +293,7 @@ def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
     for word in ("/odometry", "geometry_msgs/msg/PoseStamped", "600"):
         assert word in shown
     draft = (tmp_path / "out" / "draft.yaml").read_text()
-    assert "DRAFT" in draft and "would do: /odometry (pose)" in draft
+    assert "DRAFT" in draft and "suitable topics: /odometry (pose)" in draft
     # The draft is complete: every stream is used, without findings.
     found = inspect_command(tmp_path / "out" / "draft.yaml", tmp_path / "again", quiet=True)
     assert set(found["streams"]) == {"wrench", "imu", "pose"}
@@ -324,14 +324,14 @@ def test_draft_of_a_bag_without_wrench_topic_has_a_placeholder(tmp_path: Path) -
         ("wrench", {"file": "broken.mcap"}, ["broken.mcap", "cannot be read"]),
         ("wrench", {"file": "broken.bag"}, ["broken.bag", "cannot be read"]),
         ("wrench", {"file": "broken"}, ["cannot be read"]),
-        ("imu", {"topic": "/blind"}, ["not provide 'linear_acceleration.x'"]),
+        ("imu", {"topic": "/blind"}, ["marks 'linear_acceleration.x' as not provided"]),
         ("pose", {}, ["/tf", "several child frames", "camera, tool0"]),
         ("pose", {"topic": "/tf", "child_frame": "hand"}, ["no child frame 'hand'", "tool0"]),
         ("pose", {"topic": "/imu", "child_frame": "x"}, ["no child frame 'x'", "leave it out"]),
         (
             "pose",
             {"topic": "/imu", "position": None},
-            ["not provide 'orientation.w' (covariance -1)"],
+            ["marks 'orientation.w' as not provided (covariance -1)"],
         ),
     ],
 )

@@ -11,6 +11,7 @@ import pytest
 import rich
 from rich.console import Console
 
+import drake_teleop
 from drake_teleop import identify_load, run_scenario, simulate
 from drake_teleop.cli.excitation import excite_command
 from drake_teleop.common.progress import show_progress, silent
@@ -42,7 +43,8 @@ def terminal(monkeypatch):
 @pytest.mark.parametrize("function", SLOW, ids=lambda function: function.__name__)
 def test_long_functions_show_progress_unless_disabled(function):
     assert inspect.signature(function).parameters["progress"].default is True
-    assert "progress" in (function.__doc__ or "") or function is run_study
+    if function.__name__ in drake_teleop.__all__ and function is not run_study:
+        assert "progress" in function.__doc__
 
 
 def shown(progress, **options) -> None:
