@@ -76,7 +76,7 @@ def scene(name: str, own: Scenario) -> Scenario:
 
 
 def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with all choices of the driver."""
+    """Return the scenario with the driver's choices (network, method, grip, ...) in `inputs`."""
     method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {
         "passivity__method": method,

@@ -138,7 +138,7 @@ class CrossFade(LeafSystem):
         context.get_mutable_discrete_state(self._state)[1] = most
 
     def removed_force(self, context: Context) -> float:
-        """Return by how much the limit reduces the force [N]."""
+        """Return the force [N] by which `Limit` reduces the wrench; 0 during a cross-fade."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 

@@ -32,9 +32,9 @@ from drake_teleop.station.passivity.packet import (
     ENERGY,
     INTEGRAL,
     LOAD,
+    PACKET_NUMBER,
     PACKET_SIZE,
     POSE,
-    SEQUENCE,
     VELOCITY,
     WRENCH,
 )
@@ -90,7 +90,7 @@ def exchange(config: NetworkConfig, packets: np.ndarray, seed=0, neutral=None):
 
 def random_packets(steps: int = STEPS, seed: int = 0) -> np.ndarray:
     packets = np.random.default_rng(seed).normal(size=(steps, PACKET_SIZE))
-    packets[:, SEQUENCE] = np.arange(steps)
+    packets[:, PACKET_NUMBER] = np.arange(steps)
     return packets
 
 

@@ -50,7 +50,7 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return sigma, sigma_object and gamma [%] that render a stimulus of this level.
+        """Return a stimulus's scales [%]: sigma and sigma_object of the load, gamma of contact.
 
         `level` is a force [N] or mass [kg], `pressed` the expected contact force [N].
         """

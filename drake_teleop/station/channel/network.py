@@ -16,7 +16,14 @@ from drake_teleop.common.config import check_ranges, choice, plain, quantity, se
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity.packet import LOAD, POSE, VELOCITY, WRENCH, arrived, moved_into
+from drake_teleop.station.passivity.packet import (
+    LOAD,
+    POSE,
+    VELOCITY,
+    WRENCH,
+    has_arrived,
+    moved_pose_into,
+)
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 LONGEST_DELAY = 10.0  # [s], bounds the memory
@@ -294,8 +301,8 @@ def _fill_silence(policy, silent, packet):
     if policy == _ZERO:
         velocity[:] = 0.0
         packet[WRENCH] = packet[LOAD] = 0.0
-    elif policy == _EXTRAPOLATE and arrived(packet):
-        moved_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
+    elif policy == _EXTRAPOLATE and has_arrived(packet):
+        moved_pose_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
         if silent > LONGEST_EXTRAPOLATION:
             velocity[:] = 0.0
 

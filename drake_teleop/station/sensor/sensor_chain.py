@@ -404,7 +404,7 @@ def read_into(constants, memory, noise, truth, reading):
         for i in range(_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_CHANNELS * NOISE_BLOCK + i]
 
-    _calibrate(constants, truth, channels)
+    _apply_calibration_errors(constants, truth, channels)
     if place == _BEFORE_NOISE:
         if count == 0:
             settle(sections, filtered, channels)
@@ -450,7 +450,7 @@ def shift(line, width):
 
 
 @njit(cache=True)
-def _calibrate(constants, truth, out):
+def _apply_calibration_errors(constants, truth, out):
     wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
     omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
     for i in range(6):
