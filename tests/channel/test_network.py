@@ -291,7 +291,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
         taken.append((k, draw))
         return 0.6  # nothing is lost, all comes twice
 
-    monkeypatch.setattr(network, "_uniform", uniform)
+    monkeypatch.setattr(network, "_random_uniform", uniform)
     monkeypatch.setattr(network, "_delay_steps", network._delay_steps.py_func)
     for k in range(100, 120):
         network._advance_chain.py_func(p, k, 0.0)

@@ -34,7 +34,7 @@ _AVERAGING_S, _TOUCH_FORCE_N = 0.02, 0.5
 _FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
-def load_for(scenario: Scenario) -> IdentifiedLoad | None:
+def identified_load_of(scenario: Scenario) -> IdentifiedLoad | None:
     """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 

@@ -213,7 +213,7 @@ def master_end(
         work[g] -= dot(held, dx, g)
     hand[:] = 0.0
     if sound(hand_B):
-        _to_world(hand_B, frame, hand)
+        _wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
     healthy = fresh and received[INPUTS_FINITE] > 0.5
@@ -225,7 +225,7 @@ def master_end(
     )  # fmt: skip
     if not valid:
         packet[INPUTS_FINITE] = 0.0
-    _to_master(held, frame, wrench_received[_RENDERED])
+    _wrench_to_master(held, frame, wrench_received[_RENDERED])
     wrench_received[_CONTACT_FLAG] = received[CONTACT_FLAG]
 
 
@@ -252,11 +252,11 @@ def slave_end(
         ends[_VALID_TIME] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
-        _to_world(wrench_B, frame, wrench)
+        _wrench_to_world(wrench_B, frame, wrench)
         share = T / max(STOP_TIME - ends[_VALID_TIME], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
-        _to_world(load_B, frame, wrench)
+        _wrench_to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_VALID_TIME] += T
@@ -291,7 +291,7 @@ def _increment_into(pose, before, dx):
 
 
 @njit(cache=True)
-def _to_world(wrench_B, frame, out):
+def _wrench_to_world(wrench_B, frame, out):
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -302,7 +302,7 @@ def _to_world(wrench_B, frame, out):
 
 
 @njit(cache=True)
-def _to_master(wrench, frame, out):
+def _wrench_to_master(wrench, frame, out):
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
