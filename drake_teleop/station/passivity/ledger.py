@@ -421,4 +421,4 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
         wrench[i] -= drag * velocity[i] / max(speed, _DRAG_SPEED * ANGLE_PER_LENGTH[g])
 
 
-slave_step, command_sent = ledger_slave.slave_step, ledger_slave.record_command
+slave_step, record_command = ledger_slave.slave_step, ledger_slave.record_command

@@ -79,7 +79,7 @@ class PassivityMethod(NamedTuple):
     """Both ends of a passivity method, and what it needs from the station.
 
     Attributes:
-        master_step, slave_step, command_sent: compiled functions with the arguments of those of
+        master_step, slave_step, record_command: compiled functions with the arguments of those of
             this module except `steps`.
         initialize: `initialize(p, memory)` of one channel end before its first step.
         config: settings dataclass of a registered method with `pack_into(p)`, or None.
