@@ -29,13 +29,13 @@ import numpy as np
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_link import DeviceLink
-from drake_teleop.live.device_packets import DeviceState, packed_state, unpacked_state
+from drake_teleop.live.device_packets import DeviceState, pack_state, unpack_state
 from drake_teleop.live.haply import read_message
 from drake_teleop.live.live import Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.scenarios import live_scenario, with_device
 from drake_teleop.live.session import Session
-from drake_teleop.live.virtual_device import VirtualDevice, tapping
+from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -121,7 +121,7 @@ def pressed(stiffness: float, grip: str, late: np.ndarray, *, observe: bool) -> 
         late: by how many ticks a force is late, in a circle.
         observe: whether the observer is on.
     """
-    virtual, most = VirtualDevice(tapping(0.02), grip), int(late.max())
+    virtual, most = VirtualDevice(tapping_motion(0.02), grip), int(late.max())
     guard, heights = DeviceGuard(Limits(37.5), observe=observe), [0.01] * (most + 1)
     least, resting, newest = 0.0, [], 0
     for k in range(4000):
@@ -164,7 +164,7 @@ def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
         force_scaling__force_scale=scale,
     )  # fmt: skip
     session = Session(scenario, None, device=True)
-    virtual = VirtualDevice(tapping(0.02), grip)
+    virtual = VirtualDevice(tapping_motion(0.02), grip)
     guard, start = DeviceGuard(Limits(37.5), observe=observe), virtual.position[2]
     wrench, least, resting = np.zeros(6), 0.0, []
     for k in range(800):
@@ -185,7 +185,7 @@ def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
 def fuzzed(count: int = 10_000) -> dict[str, float]:
     """Values that are not finite among what random packets and texts led to, of each kind."""
     random, wrong, refused = np.random.default_rng(1), 0, 0
-    good = packed_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
+    good = pack_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
     place = {"cursor_position": {"x": 0.1, "y": 0.2, "z": 0.3}}
     said = json.dumps({"inverse3": [{"device_id": "a", "state": place}]})
     link = DeviceLink("udp://127.0.0.1:0")
@@ -197,7 +197,7 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
         link._handle_packet(cut, "peer", 1e-3 * k)
         led = link.hand_inputs(1e-3 * k)
         wrong += not all(np.isfinite(value) for value in led.values())
-        state = unpacked_state(cut)
+        state = unpack_state(cut)
         refused += state is None
         text = list(said)
         for i in random.integers(0, len(text), random.integers(1, 8)):

@@ -35,7 +35,7 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import INPUTS, Inputs, read_inputs
-from drake_teleop.live.record import Record, made_by
+from drake_teleop.live.record import Record, versions_and_digest
 from drake_teleop.robots import lines
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Compensated, Reading
@@ -311,7 +311,9 @@ def killed(path: Path) -> None:
     text = (folder / INPUTS).read_text()
     if text.count("\n") < 4:
         return
-    changes = read_inputs(folder / INPUTS, made_by(LoadScenario(folder / "scenario.yaml")))
+    changes = read_inputs(
+        folder / INPUTS, versions_and_digest(LoadScenario(folder / "scenario.yaml"))
+    )
     expected = [(0, 0), *((ms, ms % 1000) for ms in range(1, len(changes)))]
     if [(ms, inputs.x) for ms, inputs in changes] != expected:
         raise AssertionError("inputs are lost")

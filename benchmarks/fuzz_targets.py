@@ -35,9 +35,9 @@ from drake_teleop.common.parquet_sizes import check_parquet_content
 from drake_teleop.common.texts import read_json, yaml_data
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
-from drake_teleop.live.inputs import RANGES, Inputs, header, range_of, read_inputs
-from drake_teleop.live.inputs import row as inputs_row
-from drake_teleop.live.live import MAX_SLOWDOWN, parse
+from drake_teleop.live.inputs import RANGES, Inputs, csv_header, range_of, read_inputs
+from drake_teleop.live.inputs import csv_row as inputs_row
+from drake_teleop.live.live import MAX_SLOWDOWN, parse_message
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -497,7 +497,7 @@ def _drives(_: Path) -> list[bytes]:
     lines = [
         inputs_row(ms, Inputs(x=ms, sigma=ms % 100, clutch=ms % 2)) for ms in range(0, 200, 20)
     ]
-    return ["".join([header(), *lines]).encode()]
+    return ["".join([csv_header(), *lines]).encode()]
 
 
 _MESSAGES = (
@@ -511,7 +511,7 @@ _MESSAGES = (
 def _message(path: Path) -> None:
     """What a page says: nothing that is not bounded comes of it, whatever it is."""
     content = path.read_bytes()
-    said = [parse(text) for text in (content, content.decode(errors="replace"))]
+    said = [parse_message(text) for text in (content, content.decode(errors="replace"))]
     for found in filter(None, said):
         inputs = Inputs().changed(found.get("set", {}))
         for name in RANGES:

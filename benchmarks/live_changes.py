@@ -20,8 +20,8 @@ import numpy as np
 
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.inputs import names
-from drake_teleop.live.scenarios import chosen_scenario, fill_time, live_scenario
+from drake_teleop.live.inputs import choice_names
+from drake_teleop.live.scenarios import channel_fill_time, chosen_scenario, live_scenario
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -82,7 +82,7 @@ class Driven:
 def measured(driven: Driven, z: int, network: int, method: int) -> dict[str, float]:
     """Figures of one network and method."""
     still = driven.inputs.changed({"network": network, "method": method})
-    fills = fill_time(chosen_scenario(driven.scenario, driven.load, still))
+    fills = channel_fill_time(chosen_scenario(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
     driven.go(0.8 + fills, z=z)  # at rest, with nothing on its way
     back = driven.change(0.8, network=0, method=0)
@@ -92,8 +92,8 @@ def measured(driven: Driven, z: int, network: int, method: int) -> dict[str, flo
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    networks = [name for name in names()["network"][1:] if name != "custom"]
-    parser.add_argument("--methods", default=",".join(names()["method"]))
+    networks = [name for name in choice_names()["network"][1:] if name != "custom"]
+    parser.add_argument("--methods", default=",".join(choice_names()["method"]))
     parser.add_argument("--networks", default=",".join(networks))
     parser.add_argument("--depth", type=float, default=95.0, help="of the hand's target [mm]")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
@@ -105,7 +105,7 @@ def main() -> None:
         for network in options.networks.split(","):
             driven = Driven(scenario, load)
             driven.go(1.0, z=z)
-            pair = names()["network"].index(network), names()["method"].index(method)
+            pair = choice_names()["network"].index(network), choice_names()["method"].index(method)
             row = measured(driven, z, *pair)
             figures |= {f"{method}.{network}.{name}": round(x, 4) for name, x in row.items()}
             print(

@@ -40,7 +40,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     WristSensorConfig,
     read_into,
     sensor_chain,
-    without,
+    without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.home import R_WS_HOME, home_position
@@ -181,7 +181,7 @@ def rms(rows: Array) -> float:
 
 
 def sensors() -> dict[str, WristSensorConfig]:
-    jr3, ati = (without(PRESETS[name], "drift") for name in ("jr3_85m35a3", "ati_gamma_imu"))
+    jr3, ati = (without_parts(PRESETS[name], "drift") for name in ("jr3_85m35a3", "ati_gamma_imu"))
     wrong = replace(jr3, acceleration_gain_error=0.01, acceleration_misalignment=0.01)
     return {"JR3": jr3, "JR3, accelerometer 1 % wrong": wrong, "ATI with IMU": ati}
 
@@ -210,7 +210,7 @@ def identified(arm: Any) -> dict[str, dict[str, float]]:
 
 def by_mismatch(record: Record) -> dict[str, dict[str, float]]:
     """The accelerometer is late, and the estimation does not know."""
-    jr3 = without(PRESETS["jr3_85m35a3"], "drift")
+    jr3 = without_parts(PRESETS["jr3_85m35a3"], "drift")
     return {
         source: {
             f"{1e3 * late:g} ms": record.left(

@@ -50,10 +50,10 @@ from drake_teleop.station.passivity.packet import (
     INTEGRAL,
     PACKET_SIZE,
     WRENCH,
-    difference_into,
     dot,
     limit,
-    moved_into,
+    moved_pose_into,
+    pose_difference_into,
 )
 
 Array = NDArray[np.float64]
@@ -103,7 +103,7 @@ def _move(push, most, T, dx, pose):
             v[i] += a[i] * T
             x[i] += v[i] * T
             dx[k, i] = v[i] * T
-        moved_into(now, dx[k], now)
+        moved_pose_into(now, dx[k], now)
         pose[k] = now
 
 
@@ -166,11 +166,11 @@ def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent,
             for g in range(2):
                 work[1, g] += dot(motor, motion[1, k], g)
             # The pull of the slave's servo from now until the next step.
-            difference_into(command, poses[1, k], pull)
+            pose_difference_into(command, poses[1, k], pull)
             for i in range(6):
                 motor[i] = p[STIFFNESS][i // 3] * pull[i] - p[DAMPING][i // 3] * twists[1, i]
         else:
-            difference_into(command, old, moved)
+            pose_difference_into(command, old, moved)
             old[:] = command[:7]
             for g in range(2):
                 energy[0, g] += dot(f_e, moved, g) - dot(wrench, motion[0, k], g)
@@ -217,7 +217,7 @@ def _slave(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, comman
         b, u = p[wave.IMPEDANCE][i // 3], received[INTEGRAL][i]
         step[i] = T * (math.sqrt(2.0 * b) * u + wrench[i]) / b
         packet[INTEGRAL][i] = u + math.sqrt(2.0 / b) * wrench[i]
-    moved_into(memory[COMMAND_POSE], step, memory[COMMAND_POSE])
+    moved_pose_into(memory[COMMAND_POSE], step, memory[COMMAND_POSE])
     command[:] = memory[COMMAND]
 
 
@@ -234,7 +234,7 @@ def cases() -> dict[str, tuple[str, Array]]:
         found[name] = name, parameters(PassivityConfig(method=name, **soft))
     tank = PassivityConfig(method="two_layer", **soft)
     found["two_layer_no_margin"] = "two_layer", parameters(tank)
-    found["two_layer_no_margin"][1][two_layer.ACCELERATION] = 0.0
+    found["two_layer_no_margin"][1][two_layer.MAX_ACCELERATION] = 0.0
     found["wave_hold"] = WAVE_HOLD, parameters(PassivityConfig(method="wave"))
     return found
 

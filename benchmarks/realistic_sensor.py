@@ -49,7 +49,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     WristSensorConfig,
     read_into,
     sensor_chain,
-    without,
+    without_parts,
 )
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
@@ -218,7 +218,7 @@ def same_samples(trajectory: FourierTrajectory, motion: Array) -> float:
 
     Without noise, which the two draw from different sources.
     """
-    sensor = without(JR3, "noise", "random_walk")
+    sensor = without_parts(JR3, "noise", "random_walk")
     scenario = scenarios.replace(IDENTIFICATION, wrist_sensor=sensor, rates__log_hz=RATE)
     result = identify_load(scenario, trajectory=trajectory).result
     samples = sampled(sensor, motion, 0)
@@ -230,7 +230,7 @@ def same_samples(trajectory: FourierTrajectory, motion: Array) -> float:
 
 def sources(motion: Array, swing: Array, seeds: int) -> dict[str, dict[str, float]]:
     """Each source of error alone; `all` adds them up, with the true load and with a found one."""
-    nothing = without(JR3, *(part for part in PARTS if part not in ("place", "saturation")))
+    nothing = without_parts(JR3, *(part for part in PARTS if part not in ("place", "saturation")))
     wrench, motion_noise = (
         ("force_noise", "torque_noise"),
         (

@@ -33,7 +33,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     NOISE_SIZE,
     read_into,
     sensor_chain,
-    without,
+    without_parts,
 )
 
 ASKED = "mass 0.1 %, com 0.1 mm, inertia 1 %"
@@ -64,7 +64,7 @@ def reached(
     vectors = np.empty((3, len(motions), 3))
     sensor_vectors(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
-    noisy = without(sensor, "calibration")
+    noisy = without_parts(sensor, "calibration")
     constants, memory = sensor_chain(noisy, joints[0].shape[1], period)
     estimator, remembered = motion_estimator(
         scenario.motion_estimation, noisy, joints[0].shape[1], period

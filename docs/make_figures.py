@@ -41,7 +41,7 @@ from drake_teleop.lab.reproduction.reproduce import reproduce_command
 from drake_teleop.logs.processing import detect_log, identify_log
 from drake_teleop.logs.sample import sample_log_command
 from drake_teleop.station.sensor.presets import PRESETS
-from drake_teleop.station.sensor.sensor_chain import without
+from drake_teleop.station.sensor.sensor_chain import without_parts
 
 FIGURES = Path(__file__).parent / "figures"
 NOISE = runpy.run_path(str(Path(__file__).parent / "_ext" / "sensor_noise.py"))
@@ -325,7 +325,7 @@ def noise_figure() -> Picture:
         figure = Picture(figsize=(8.2, 3.2), facecolor="white")
         spectrum, allan = figure.subplots(1, 2)
         for name, colour in (("jr3_85m35a3", BLUE), ("ati_gamma_imu", VERMILION)):
-            config = without(PRESETS[name], "drift")
+            config = without_parts(PRESETS[name], "drift")
             record = NOISE["rest_record"](config, count, period, seed=1)[:, :1]
             f, density = welch(record[:, 0], 1 / period, nperseg=2**19)
             edges = np.logspace(np.log10(0.05), np.log10(3000), 32)

@@ -16,7 +16,7 @@ from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import REGISTRIES, Registry, register_from
 from drake_teleop.lab.identification import true_load
-from drake_teleop.live.inputs import Inputs, header, read_inputs, row
+from drake_teleop.live.inputs import Inputs, csv_header, csv_row, read_inputs
 from drake_teleop.live.scenarios import chosen_scenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification
@@ -147,7 +147,7 @@ def test_a_live_session_records_the_registered_name(folder):
     assert inputs.method == before + 1
     assert chosen_scenario(Scenario(), None, inputs).passivity.method == "share"
     path = folder / "inputs.csv"
-    path.write_text(header() + row(0, inputs) + row(10, inputs))
+    path.write_text(csv_header() + csv_row(0, inputs) + csv_row(10, inputs))
     assert ",share," in path.read_text() and read_inputs(path)[0][1] == inputs
     METHODS.remove("share")
     with pytest.raises(DrakeTeleopError, match="has an unknown method, 'share'"):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
-from drake_teleop.live.experiment.procedure import trials_of
+from drake_teleop.live.experiment.procedure import plan_trials
 from drake_teleop.live.experiment.results import write_results
 from drake_teleop.live.experiment.store import MAX_PARTICIPANT, Store, open_results
 from drake_teleop.station.scenario import Scenario
@@ -36,7 +36,7 @@ def experiment_command(
             else:
                 from drake_teleop.live.experiment.server import serve_experiment
 
-                number = next_participant(store, len(trials_of(experiment, 1)), participant)
+                number = next_participant(store, len(plan_trials(experiment, 1)), participant)
                 serve_experiment(experiment, scenarios, store, number, **page)
         finally:
             table = write_results(experiment, store)

@@ -48,7 +48,7 @@ def _columns_at_limit(values, limits):
 
 
 @njit(cache=True)
-def _add_work(table, t, states, contact_S, hand_E, twist, before, energy):
+def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
     """Add the work at hand and tool in new rows to `energy` (2,) [J]."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
@@ -90,7 +90,7 @@ class Cockpit:
         _norm_range_into(rows["force_to_master"], zeros, rendered)
         in_contact = rows["contact"].any() if "contact" in rows else contact[1] > CONTACT_FORCE_N
         self._forces[:2] *= inputs.scales["force_scale"]
-        _add_work(
+        _integrate_work(
             self._table,
             rows["t"],
             rows["slave_state"],

@@ -25,11 +25,11 @@ from drake_teleop.live.device_packets import (
     DevicePose,
     DeviceState,
     ForceCommand,
-    packed_state,
-    unpacked_force,
+    pack_state,
+    unpack_force,
 )
 from drake_teleop.live.haply import HaplyDevice
-from drake_teleop.live.virtual_device import VirtualDevice, tapping
+from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.robots.udp import endpoint
 from drake_teleop.station.operator.operator import GRIPS
 
@@ -96,7 +96,7 @@ class Client:
                 return
             except ConnectionError:  # the station is not started yet
                 continue
-            command = unpacked_force(packet)
+            command = unpack_force(packet)
             if command is None or command.number > self._number:
                 continue
             if self._command is None or command.number >= self._command.number:
@@ -111,7 +111,7 @@ class Client:
         w, i, j, k = map(float, pose.orientation)
         state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind)
         try:
-            self._socket.send(packed_state(state))
+            self._socket.send(pack_state(state))
         except (BlockingIOError, ConnectionError):  # the next one is newer
             return
 
@@ -151,7 +151,7 @@ class RealTimeDevice:
 def open_device(address: str, grip: str, depth: float) -> Device:
     """Return the device at an address: `virtual` or haply://HOST:PORT."""
     if address == "virtual":
-        return RealTimeDevice(VirtualDevice(tapping(depth), grip))
+        return RealTimeDevice(VirtualDevice(tapping_motion(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
     raise DrakeTeleopError(

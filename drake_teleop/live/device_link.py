@@ -19,9 +19,9 @@ from drake_teleop.live.device_packets import (
     MAX_PACKET_BYTES,
     DeviceState,
     ForceCommand,
-    packed_force,
-    refusal,
-    unpacked_state,
+    pack_force,
+    rejection_reason,
+    unpack_state,
 )
 from drake_teleop.live.inputs import ANGLE, LENGTH
 from drake_teleop.robots.udp import THIS_MACHINE, endpoint, listening
@@ -75,10 +75,10 @@ class DeviceLink:
         return None if self.silent(now) else self._state
 
     def _handle_packet(self, packet: bytes, peer: Any, now: float) -> None:
-        state, silent = unpacked_state(packet), self.silent(now)
+        state, silent = unpack_state(packet), self.silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1
-            self.refusal = refusal(packet) if state is None else "is from a second device"
+            self.refusal = rejection_reason(packet) if state is None else "is from a second device"
             return
         if silent:  # a new device, or the same one after a pause
             self._peer, self._connected_at, self._state = peer, now, None
@@ -102,7 +102,7 @@ class DeviceLink:
             return
         command = ForceCommand(self._state.number, self._state.t, tuple(wrench.tolist()))
         try:
-            self._socket.sendto(packed_force(command), self._peer)
+            self._socket.sendto(pack_force(command), self._peer)
         except OSError:  # a later attempt would send an old force
             return
 

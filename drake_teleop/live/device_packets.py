@@ -55,12 +55,12 @@ class ForceCommand(NamedTuple):
     wrench: tuple[float, ...]
 
 
-def packed_state(state: DeviceState) -> bytes:
+def pack_state(state: DeviceState) -> bytes:
     numbers = (*state.position, *state.orientation, state.behind)
     return _STATE.pack(_FROM_DEVICE, state.flags, state.number, state.t, *numbers)
 
 
-def unpacked_state(packet: bytes) -> DeviceState | None:
+def unpack_state(packet: bytes) -> DeviceState | None:
     """Return the device state in a packet, or None if it is invalid or implausible."""
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
@@ -89,8 +89,8 @@ def plausible_state(
     return DeviceState(number, t, (x, y, z), orientation, flags & CLUTCH_OPEN, behind)
 
 
-def refusal(packet: bytes) -> str:
-    """Return as text why `unpacked_state` rejects a packet."""
+def rejection_reason(packet: bytes) -> str:
+    """Return as text why `unpack_state` rejects a packet."""
     if len(packet) != _STATE.size:
         length = len(packet) if len(packet) < _STATE.size else f"more than {_STATE.size}"
         return f"is {length} bytes long, not {_STATE.size}"
@@ -101,11 +101,11 @@ def refusal(packet: bytes) -> str:
     return "has a position, orientation or time out of range"
 
 
-def packed_force(command: ForceCommand) -> bytes:
+def pack_force(command: ForceCommand) -> bytes:
     return _FORCE.pack(_TO_DEVICE, 0, command.number, command.t, *command.wrench)
 
 
-def unpacked_force(packet: bytes) -> ForceCommand | None:
+def unpack_force(packet: bytes) -> ForceCommand | None:
     """Return the force command in a packet, or None if it is invalid."""
     if len(packet) != _FORCE.size or packet[:4] != _TO_DEVICE:
         return None

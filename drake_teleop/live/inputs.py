@@ -37,7 +37,7 @@ _SHARE_UNIT, _SCALE_UNIT = 1e-2, 1e-5
 MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
-def names() -> dict[str, tuple[str, ...]]:
+def choice_names() -> dict[str, tuple[str, ...]]:
     """Return the names of each choice; a choice is the index of its name."""
     shipped = {"network": NETWORKS, "grip": tuple(GRIPS), "sensor": SENSORS}
     return shipped | {"method": tuple(METHODS)}
@@ -199,14 +199,14 @@ def range_of(name: str) -> tuple[int, int]:
 _VERSION = {"drake_teleop": __version__}
 
 
-def header(made_by: Mapping[str, str] = _VERSION) -> str:
+def csv_header(made_by: Mapping[str, str] = _VERSION) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
 
-def row(ms: int, inputs: Inputs) -> str:
+def csv_row(ms: int, inputs: Inputs) -> str:
     values = {name: getattr(inputs, name) for name in RANGES}
-    values |= {name: words[values[name]] for name, words in names().items()}
+    values |= {name: words[values[name]] for name, words in choice_names().items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
@@ -243,7 +243,7 @@ def _cannot_repeat(what: str, path: Path) -> DrakeTeleopError:
 
 
 def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
-    earlier, choices = -1, names()
+    earlier, choices = -1, choice_names()
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
         if len(line) != len(_COLUMNS):

@@ -24,7 +24,7 @@ from drake_teleop.live.inputs import (
     RANGES,
     SLICE_MS,
     Inputs,
-    names,
+    choice_names,
     range_of,
 )
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
@@ -96,7 +96,7 @@ class Live:
         self._start_drive(now)
 
     def _start_drive(self, now: float) -> None:
-        folder = None if self._record is None else _free_folder(self._record)
+        folder = None if self._record is None else _make_unused_folder(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
         by_device = self._link is not None
@@ -128,9 +128,9 @@ class Live:
 
     def _restart(self, now: float) -> None:
         self.stopped = ""
-        self._try(self.end)
+        self._stop_on_failure(self.end)
         failure = self.stopped
-        self._try(lambda: self._start_drive(now))
+        self._stop_on_failure(lambda: self._start_drive(now))
         self._refusal = failure
 
     def reject_scene(self, why: str, now: float) -> None:
@@ -144,7 +144,7 @@ class Live:
         return {
             "scenario": self._scenario.description or "a station",
             "ranges": {name: range_of(name) for name in RANGES},
-            "names": names(),
+            "names": choice_names(),
             "object": self._scenario.force_scaling.gripper_phi is not None,
             "touch": TOUCH_FORCE_N,
             "known": self._load is not None,
@@ -166,7 +166,7 @@ class Live:
             self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        message = parse(text)
+        message = parse_message(text)
         if message is None:
             self.refused += 1
             return
@@ -224,7 +224,7 @@ class Live:
         self._poll_device(now)
         if self._driver is None and not self._asleep and now - self._alone_since >= _SLEEP_AFTER_S:
             self._asleep = True
-            self._try(self._session.flush)
+            self._stop_on_failure(self._session.flush)
         # A new input or contact is shown at once; the schedule of frames then restarts.
         show_now = self._show_now and now >= self._last_frame_at + _MIN_FRAME_PERIOD_S
         if now < self._frame_due and not show_now:
@@ -242,7 +242,7 @@ class Live:
             self._asleep = False
             self.pace.start(now)
 
-    def _try(self, action: Callable[[], None]) -> None:
+    def _stop_on_failure(self, action: Callable[[], None]) -> None:
         try:
             action()
         except _FAILURES as error:
@@ -254,7 +254,7 @@ class Live:
         self._show_now |= self._requested.target != self._last_target
         self._last_target = self._requested.target
         try:
-            self._session.apply(self._limited(self._requested.changed(by_device)))
+            self._session.apply(self._limit_motion(self._requested.changed(by_device)))
         except _FAILURES as error:
             present = self._session.inputs
             if self._requested.station == present.station:
@@ -264,7 +264,7 @@ class Live:
                 removed = {name: getattr(present, name) for name in CHOICES}
                 self._requested = self._requested.changed(removed)
         if not self.stopped:
-            self._try(lambda: self._session.advance(self._slice_ms))
+            self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
             pressed = self._session.contact_force() > TOUCH_FORCE_N
             self._show_now |= pressed and not self._pressed
             self._pressed = pressed
@@ -273,7 +273,7 @@ class Live:
         if self._session.ms >= MAX_DURATION_MS:
             self.stopped = "the limit of ten hours is reached"
 
-    def _limited(self, wanted: Inputs) -> Inputs:
+    def _limit_motion(self, wanted: Inputs) -> Inputs:
         by_device = self._link is not None
         free = not self._session.inputs.held or (by_device and not wanted.clutch)
         return self._limiter.step(wanted, free=free)
@@ -328,14 +328,14 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        self._try(self.end)
+        self._stop_on_failure(self.end)
         if self._link is not None:
             self._link.close()
         if self._write_error:
             raise CannotWrite(self._write_error)
 
 
-def _free_folder(folder: Path) -> Path:
+def _make_unused_folder(folder: Path) -> Path:
     folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no name to number
     if not folder.is_dir() or not any(folder.iterdir()):
         return folder
@@ -343,7 +343,7 @@ def _free_folder(folder: Path) -> Path:
     return next(name for name in names if not name.exists())
 
 
-def parse(text: Any) -> dict[str, Any] | None:
+def parse_message(text: Any) -> dict[str, Any] | None:
     """Return the valid requests in a page's message, or None."""
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None

@@ -42,7 +42,7 @@ class PageScene:
             with quiet_drake():
                 meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
             self._scene = ReplayScene(meshcat, scenario, recorded)
-            self.objects = _objects(meshcat.StaticHtml())
+            self.objects = _extract_objects(meshcat.StaticHtml())
             self._scene.canvas = _Moves()  # only this thread may destroy Meshcat
         except _FAILURES as error:
             self._fail(error)
@@ -87,7 +87,7 @@ class _Moves:
         return {"poses": dict(zip(self._poses, columns, strict=True)), "sizes": self._sizes}
 
 
-def _objects(html: str) -> bytes:
+def _extract_objects(html: str) -> bytes:
     commands = _COMMAND.findall(html)
     if not commands:
         raise ValueError("Drake's Meshcat writes its static page in an unknown form")

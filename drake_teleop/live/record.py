@@ -17,7 +17,7 @@ from pydrake.systems.analysis import Simulator
 from drake_teleop.common.files import make_folder, wrap_write_errors, write_text
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
-from drake_teleop.live.inputs import INPUTS, Inputs, header, row
+from drake_teleop.live.inputs import INPUTS, Inputs, csv_header, csv_row
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.scenario_reference import write_scenario
@@ -28,7 +28,7 @@ LOAD, SCENARIO = "load.npz", "scenario.yaml"
 DEVICE = "device.txt"
 
 
-def made_by(scenario: Scenario) -> dict[str, str]:
+def versions_and_digest(scenario: Scenario) -> dict[str, str]:
     """Return the versions, and a digest of the files that the scenario names."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
@@ -63,7 +63,7 @@ class Record:
                 write_text(folder / DEVICE, "x to rz of inputs.csv are the places of a device.\n")
             if load is not None:
                 write_load(folder / LOAD, load)
-            self._append(header(made_by(scenario)))
+            self._append(csv_header(versions_and_digest(scenario)))
             self.write(0, inputs)
         except BaseException:
             self._remove()
@@ -71,7 +71,7 @@ class Record:
 
     def write(self, ms: int, inputs: Inputs) -> None:
         """Write the inputs at a time [ms], if they have changed."""
-        line = row(ms, inputs)
+        line = csv_row(ms, inputs)
         if line != self._last:
             self._append(line)
             self._last = line

@@ -63,7 +63,7 @@ def with_device(scenario: Scenario) -> Scenario:
     return replace(scenario, master=Master(model="haply_inverse3"))
 
 
-def scene(name: str, own: Scenario) -> Scenario:
+def load_scene(name: str, own: Scenario) -> Scenario:
     """Return the scenario of a scene in `SCENES`; `own` is the user's scenario."""
     if name == "own":
         return own
@@ -76,7 +76,7 @@ def scene(name: str, own: Scenario) -> Scenario:
 
 
 def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with all choices of the driver."""
+    """Return the scenario with the driver's choices (network, method, grip, ...) in `inputs`."""
     method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {
         "passivity__method": method,
@@ -141,7 +141,7 @@ def _sensor_offset(scenario: Scenario) -> Array:
     return np.zeros(6) if sensor.ideal else np.array(sensor.offset)
 
 
-def fill_time(scenario: Scenario) -> float:
+def channel_fill_time(scenario: Scenario) -> float:
     """Return the time until all packets of a new channel arrive [s]."""
     if scenario.is_direct:
         return 0.0

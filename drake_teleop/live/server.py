@@ -42,7 +42,7 @@ from drake_teleop.live.device_link import DeviceConnection
 from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.scenarios import SCENES, live_scenario, scene, with_device
+from drake_teleop.live.scenarios import SCENES, live_scenario, load_scene, with_device
 from drake_teleop.live.session import Session
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
@@ -102,13 +102,13 @@ class LiveDrive:
 
     def _prepare(self, scenario: Scenario, device: bool) -> None:
         with show_progress(True) as stage:
-            self._load = _load_of(scenario, stage)
+            self._load = _identify_load(scenario, stage)
             self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
 
     def _make_scenes(self, scenario: Scenario, device: bool, progress: Progress) -> None:
         self._scene_scenarios: dict[str, Scenario] = {}
         for name in SCENES:
-            setup = scene(name, scenario)
+            setup = load_scene(name, scenario)
             self._scene_scenarios[name] = with_device(setup) if device else setup
             self._views[name] = PageScene(name, self._scene_scenarios[name])
             progress(len(self._views) / (1 + len(SCENES)))
@@ -253,7 +253,7 @@ class LiveDrive:
 
         def identify() -> None:
             try:
-                found.set_result(_load_of(scenario, self._until_stopped))
+                found.set_result(_identify_load(scenario, self._until_stopped))
             except Exception as error:
                 found.set_exception(error)
 
@@ -290,13 +290,13 @@ class LiveDrive:
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
         ours = secrets.compare_digest(token, self._token.encode())
         if request.headers.get_all("Host") != [host] or not ours:
-            return _response(
+            return _make_response(
                 HTTPStatus.FORBIDDEN, "text/plain", b"The address requires its token.\n"
             )
         if path == "/socket":
             origin = request.headers.get_all("Origin")
             if origin != [f"http://{host}"]:
-                return _response(
+                return _make_response(
                     HTTPStatus.FORBIDDEN,
                     "text/plain",
                     b"Only this server's page may open the socket.\n",
@@ -305,15 +305,15 @@ class LiveDrive:
         if path == "/":
             page = self._page()
             content_policy = policy(page, host)
-            return _response(
+            return _make_response(
                 HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), content_policy
             )
         if path.startswith("/scene/") and (view := self._views.get(path[len("/scene/") :])):
-            return _response(HTTPStatus.OK, "application/json", view.objects)
+            return _make_response(HTTPStatus.OK, "application/json", view.objects)
         if path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
-            return _response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
-        return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Not found.\n")
+            return _make_response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
+        return _make_response(HTTPStatus.NOT_FOUND, "text/plain", b"Not found.\n")
 
     async def _serve_page(self, connection: ServerConnection) -> None:
         live = self._live
@@ -338,7 +338,7 @@ class LiveDrive:
                 )
 
 
-def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
+def _identify_load(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()
@@ -355,7 +355,9 @@ def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> No
     session.inputs_at_stylus()
 
 
-def _response(status: HTTPStatus, kind: str, body: bytes, content_policy: str = "") -> Response:
+def _make_response(
+    status: HTTPStatus, kind: str, body: bytes, content_policy: str = ""
+) -> Response:
     headers = Headers(
         {
             "Content-Type": kind,

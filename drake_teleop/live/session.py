@@ -21,8 +21,13 @@ from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
 from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, read_inputs
-from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, LogBeside, Record, made_by
-from drake_teleop.live.scenarios import CROSS_FADE_S, adapted_estimate, chosen_scenario, fill_time
+from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, LogBeside, Record, versions_and_digest
+from drake_teleop.live.scenarios import (
+    CROSS_FADE_S,
+    adapted_estimate,
+    channel_fill_time,
+    chosen_scenario,
+)
 from drake_teleop.live.station_swap import copy_state
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -74,7 +79,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
     simulator.set_monitor(after_step)
 
 
-def with_all_signals(log: SimulationResult) -> SimulationResult:
+def add_missing_signals(log: SimulationResult) -> SimulationResult:
     """Return the log, with missing signals of channel and contact detection added."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
@@ -134,7 +139,7 @@ class _Station:
         if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block("wrist_sensor")
             sensor.reset_queue(context)
-        wait_s = fill_time(self.scenario) if channel_anew else 0.0
+        wait_s = channel_fill_time(self.scenario) if channel_anew else 0.0
         cross_fade, context = self.block("cross_fade")
         rendered = other.value("force_to_master")
         cross_fade.Begin(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
@@ -188,7 +193,7 @@ class Session:
             self._record = Record(record, scenario, load, self.inputs, device=device)
         self._on_disk: LogBeside | None = None
         if log is not None:
-            self._on_disk = LogBeside(log, self._station.simulator, 0.0, with_all_signals)
+            self._on_disk = LogBeside(log, self._station.simulator, 0.0, add_missing_signals)
         self._earlier_rows: list[SimulationResult] = []
         self._station.simulator.Initialize()
 
@@ -292,7 +297,7 @@ class Session:
             self._on_disk.finish()
 
     def _rows(self) -> SimulationResult:
-        return with_all_signals(read_log(self._station.simulator, 0.0))
+        return add_missing_signals(read_log(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
         parts = [*self._earlier_rows, self._rows()]
@@ -343,7 +348,7 @@ class Drive:
 def read_drive(folder: str | Path) -> Drive:
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO)
-    changes = read_inputs(folder / INPUTS, made_by(scenario))
+    changes = read_inputs(folder / INPUTS, versions_and_digest(scenario))
     load = read_load(folder / LOAD)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD).exists()):

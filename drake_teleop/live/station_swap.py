@@ -41,7 +41,7 @@ def copy_state(
             or excluded & set(path.split("/"))
         ):
             continue
-        _copy(
+        _copy_block(
             source_block.GetMyContextFromRoot(then),
             block.GetMyMutableContextFromRoot(context),
             path.rpartition("/")[2] in _BLOCKS_WITH_PARAMETERS,
@@ -57,7 +57,7 @@ def _blocks(diagram: Diagram, path: str = "") -> Iterator[tuple[str, System]]:
             yield name, system
 
 
-def _copy(source: Context, target: Context, with_parameters: bool) -> None:
+def _copy_block(source: Context, target: Context, with_parameters: bool) -> None:
     if source.num_continuous_states() == target.num_continuous_states() > 0:
         target.SetContinuousState(source.get_continuous_state_vector().CopyToVector())
     groups = source.num_discrete_state_groups()
@@ -75,7 +75,7 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 
 @njit(cache=True)
-def _weight(change, time):
+def _cross_fade_share(change, time):
     u = min(max((time - change[0]) / change[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
@@ -84,14 +84,14 @@ def _weight(change, time):
 def _cross_fade_into(wrench, before, share, most, out):
     for i in range(6):
         out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
-    force = _force(out)
+    force = _force_norm(out)
     if force > most:
         for i in range(6):
             out[i] *= most / force
 
 
 @njit(cache=True)
-def _force(wrench):
+def _force_norm(wrench):
     return math.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
 
 
@@ -138,16 +138,16 @@ class CrossFade(LeafSystem):
         context.get_mutable_discrete_state(self._state)[1] = most
 
     def removed_force(self, context: Context) -> float:
-        """Return by how much the limit reduces the force [N]."""
+        """Return the force [N] by which `Limit` reduces the wrench; 0 during a cross-fade."""
         share, most = context.get_discrete_state(self._state).value()
-        return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
+        return max(_force_norm(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         share, most = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()
-            state.get_mutable_value(self._state)[0] = _weight(change, context.get_time())
-        elif most < math.inf and _force(self._wrench.Eval(context)) <= most:
+            state.get_mutable_value(self._state)[0] = _cross_fade_share(change, context.get_time())
+        elif most < math.inf and _force_norm(self._wrench.Eval(context)) <= most:
             state.get_mutable_value(self._state)[1] = math.inf
 
     def _calc(self, context: Context, output: BasicVector) -> None:

@@ -45,7 +45,7 @@ class VirtualDevice:
                 self.energy -= force[i] * h * v
 
 
-def tapping(
+def tapping_motion(
     depth: float, *, hertz: float = 0.5
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
     """Return a hand motion along z between 10 mm and -`depth` [m], `hertz` times a second."""

@@ -198,7 +198,7 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     if speed_limit is None or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
-    config, row = scenario.passivity.of_method(), t[1] - t[0]
+    config, row = scenario.passivity.method_config(), t[1] - t[0]
     mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale(scenario)
     limit = speed_limit(config, mass)
     then = t - _packet_ages(t, scenario)

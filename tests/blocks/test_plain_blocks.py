@@ -25,7 +25,7 @@ from drake_teleop.station import blocks
 from drake_teleop.station.channel.channel import Channel, TeleopChannel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.estimation import contact_detection, load_estimator
-from drake_teleop.station.master.force_display import display_into, initial_display
+from drake_teleop.station.master.force_display import display_into, initial_display_state
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.scaling.force_scaling import (
@@ -259,7 +259,7 @@ def test_force_display_equals_the_display_of_the_station():
     rows[20]["wrench_command"] = np.full(6, np.nan)
     # The outputs are of the period that follows the update at its start.
     found = stepped(blocks.ForceDisplay(device, T, q), rows, "joint_torque")
-    memory, J, expected = initial_display(q, device.numbers), np.zeros((6, 6)), []
+    memory, J, expected = initial_display_state(q, device.numbers), np.zeros((6, 6)), []
     for row in rows:
         for _ in range(2):
             drive, memory[:6] = np.zeros(len(memory)), row["joint_position"]

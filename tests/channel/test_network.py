@@ -32,9 +32,9 @@ from drake_teleop.station.passivity.packet import (
     ENERGY,
     INTEGRAL,
     LOAD,
+    PACKET_NUMBER,
     PACKET_SIZE,
     POSE,
-    SEQUENCE,
     VELOCITY,
     WRENCH,
 )
@@ -90,7 +90,7 @@ def exchange(config: NetworkConfig, packets: np.ndarray, seed=0, neutral=None):
 
 def random_packets(steps: int = STEPS, seed: int = 0) -> np.ndarray:
     packets = np.random.default_rng(seed).normal(size=(steps, PACKET_SIZE))
-    packets[:, SEQUENCE] = np.arange(steps)
+    packets[:, PACKET_NUMBER] = np.arange(steps)
     return packets
 
 
@@ -291,7 +291,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
         taken.append((k, draw))
         return 0.6  # nothing is lost, all comes twice
 
-    monkeypatch.setattr(network, "_uniform", uniform)
+    monkeypatch.setattr(network, "_random_uniform", uniform)
     monkeypatch.setattr(network, "_delay_steps", network._delay_steps.py_func)
     for k in range(100, 120):
         network._advance_chain.py_func(p, k, 0.0)

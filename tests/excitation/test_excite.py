@@ -47,7 +47,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     WristSensorConfig,
     read_into,
     sensor_chain,
-    without,
+    without_parts,
 )
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.models import ParseModel
@@ -684,7 +684,7 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
     """Design, execution, noisy measurement, log file, identification."""
     _, joints, recording = foreign
     sensor = dataclasses.replace(
-        without(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
+        without_parts(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
     )
     constants, memory = sensor_chain(sensor, joints, 1e-3)
     rng = np.random.default_rng(0)

@@ -19,7 +19,7 @@ from drake_teleop.live.experiment.design import (
     LoadExperiment,
     PegInSlot,
 )
-from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, trials_of
+from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, plan_trials
 from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
 from drake_teleop.live.experiment.store import Store, open_results
 
@@ -55,13 +55,13 @@ def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) 
 
 
 def test_order_is_random_and_each_round_has_every_condition_once():
-    one, other = trials_of(SMALL, 1), trials_of(SMALL, 2)
-    assert one == trials_of(SMALL, 1) != other
+    one, other = plan_trials(SMALL, 1), plan_trials(SMALL, 2)
+    assert one == plan_trials(SMALL, 1) != other
     counted = [t.condition for t in one if t.task == 0 and not t.practice]
     assert all(sorted(counted[k : k + 3]) == [0, 1, 2] for k in range(0, 18, 3))
-    orders = {tuple(dict.fromkeys(t.task for t in trials_of(SMALL, n))) for n in range(30)}
+    orders = {tuple(dict.fromkeys(t.task for t in plan_trials(SMALL, n))) for n in range(30)}
     assert len(orders) == 6
-    signals = [t.signal for n in range(30) for t in trials_of(SMALL, n) if t.task == 0]
+    signals = [t.signal for n in range(30) for t in plan_trials(SMALL, n) if t.task == 0]
     assert {t.signal for t in one if t.task == 2} == {0}
     assert 0.4 < np.mean(np.array(signals) == 1) < 0.6
 
@@ -79,7 +79,7 @@ def test_participant_continues_with_the_same_levels(tmp_path):
     assert (again.phase, again.number) == ("consent", 17)
     go_through(again, rng, 2.0)
     assert cut.path(3).read_bytes() == whole.path(3).read_bytes()
-    assert len(cut.rows(3)) == len(trials_of(SMALL, 3))
+    assert len(cut.rows(3)) == len(plan_trials(SMALL, 3))
 
 
 def goes_through(folder: str) -> None:
@@ -114,7 +114,7 @@ def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     process.communicate()
     cut = Store(tmp_path / "cut")
     left = len(cut.rows(1))
-    assert message <= left < len(trials_of(SHORT, 1))
+    assert message <= left < len(plan_trials(SHORT, 1))
     goes_through(str(tmp_path / "cut"))
     goes_through(str(tmp_path / "whole"))
     assert cut.rows(1) == Store(tmp_path / "whole").rows(1)

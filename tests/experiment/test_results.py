@@ -12,7 +12,7 @@ from test_procedure import SMALL, go_through
 from drake_teleop.cli.experiment import next_participant
 from drake_teleop.common.style import Picture
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
-from drake_teleop.live.experiment.procedure import Procedure, trials_of
+from drake_teleop.live.experiment.procedure import Procedure, plan_trials
 from drake_teleop.live.experiment.results import Result, _draw, results, write_results
 from drake_teleop.live.experiment.store import Row, Store
 
@@ -57,7 +57,7 @@ def test_axis_of_a_quantity_has_tick_labels(least, most):
 
 
 def test_next_participant_has_trials_left_or_is_new(tmp_path):
-    store, trials = Store(tmp_path), len(trials_of(SMALL, 1))
+    store, trials = Store(tmp_path), len(plan_trials(SMALL, 1))
     assert next_participant(store, trials) == 1
     go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0)
     assert next_participant(store, trials) == 2

@@ -22,17 +22,17 @@ from drake_teleop.live.device_packets import (
     DevicePose,
     DeviceState,
     ForceCommand,
-    packed_force,
-    packed_state,
-    unpacked_force,
-    unpacked_state,
+    pack_force,
+    pack_state,
+    unpack_force,
+    unpack_state,
 )
 from drake_teleop.live.haply import HaplyDevice, force_message, read_message
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.scenarios import with_device
 from drake_teleop.live.session import Session, read_drive
-from drake_teleop.live.virtual_device import VirtualDevice, tapping
+from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.result import SimulationResult
 
 MS = 1e-3
@@ -47,13 +47,13 @@ class Sender:
         self._socket.settimeout(1.0)
 
     def send(self, number, position=(0.0, 0.0, 0.0), **more):
-        self._socket.send(packed_state(DeviceState(number, MS * number, position, **more)))
+        self._socket.send(pack_state(DeviceState(number, MS * number, position, **more)))
 
     def raw(self, packet):
         self._socket.send(packet)
 
     def force(self):
-        return unpacked_force(self._socket.recv(1000))
+        return unpack_force(self._socket.recv(1000))
 
 
 @pytest.fixture
@@ -68,14 +68,14 @@ def test_packets_match_the_c_header():
     sizes = [int(size) for size in re.findall(r"device: (\d+) bytes", text)]
     state = DeviceState(7, 1.5, (0.1, -0.2, 0.3), (0.0, 0.6, 0.8, 0.0), CLUTCH_OPEN, 0.004)
     command = ForceCommand(7, 1.5, (1.0, 2.0, 3.0, 0.1, 0.2, 0.3))
-    assert [len(packed_state(state)), len(packed_force(command))] == sizes
-    assert unpacked_state(packed_state(state)) == state
-    assert unpacked_force(packed_force(command)) == command
-    assert packed_state(state)[24:32] == np.array([0.1], "<f8").tobytes()  # after 4 + 4 + 8 + 8
+    assert [len(pack_state(state)), len(pack_force(command))] == sizes
+    assert unpack_state(pack_state(state)) == state
+    assert unpack_force(pack_force(command)) == command
+    assert pack_state(state)[24:32] == np.array([0.1], "<f8").tobytes()  # after 4 + 4 + 8 + 8
 
 
 def test_invalid_packets_only_change_a_counter(link):
-    random, good = np.random.default_rng(0), packed_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
+    random, good = np.random.default_rng(0), pack_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
     said = json.dumps(
         {"inverse3": [{"device_id": "a", "state": {"cursor_position": {"x": 1, "y": 2, "z": 3}}}]}
     )
@@ -84,10 +84,10 @@ def test_invalid_packets_only_change_a_counter(link):
         for value in (1e308, 1e30, np.nan, np.inf, -np.inf):
             odd.append(good[:place] + np.array([value], "<f8").tobytes() + good[place + 8 :])
             # `behind` is only displayed: it is clipped to its range.
-            assert unpacked_state(odd[-1]) is None or (place == 80 and np.isfinite(value))
+            assert unpack_state(odd[-1]) is None or (place == 80 and np.isfinite(value))
     far = DeviceState(1, 0.0, (0.0, 0.0, 0.0), (0.0, 1.8, 0.0, 0.0), 7, 1e9)
     near = far._replace(orientation=(0.0, 1.0, 0.0, 0.0), flags=CLUTCH_OPEN, behind=1.0)
-    assert unpacked_state(packed_state(far)) == near
+    assert unpack_state(pack_state(far)) == near
     for places, values in zip(
         random.integers(0, 88, (500, 6)), random.integers(0, 256, (500, 6)), strict=True
     ):
@@ -133,23 +133,23 @@ def test_force_and_position_of_haply_use_the_same_axes():
     ("packet", "reason"),
     [
         (b"", "is 0 bytes long, not 88"),
-        (packed_state(DeviceState(1, 0.0, (0.0, 0.0, 0.0)))[:-1], "is 87 bytes long, not 88"),
+        (pack_state(DeviceState(1, 0.0, (0.0, 0.0, 0.0)))[:-1], "is 87 bytes long, not 88"),
         (
-            packed_state(DeviceState(1, 0.0, (0.0, 0.0, 0.0))) + b"more",
+            pack_state(DeviceState(1, 0.0, (0.0, 0.0, 0.0))) + b"more",
             "is more than 88 bytes long",
         ),
         (b"HELO" + bytes(84), "begins with b'HELO', not b'DTD1'"),
         (b"DTD2" + bytes(84), "has version b'2', not b'1'"),
         (
-            packed_state(DeviceState(1, 0.0, (np.nan, 0.0, 0.0))),
+            pack_state(DeviceState(1, 0.0, (np.nan, 0.0, 0.0))),
             "has a position, orientation or time out",
         ),
         (
-            packed_state(DeviceState(1, 0.0, (11.0, 0.0, 0.0))),
+            pack_state(DeviceState(1, 0.0, (11.0, 0.0, 0.0))),
             "has a position, orientation or time out",
         ),
         (
-            packed_state(DeviceState(1, 0.0, (0.0,) * 3, (0.0,) * 4)),
+            pack_state(DeviceState(1, 0.0, (0.0,) * 3, (0.0,) * 4)),
             "has a position, orientation or time out",
         ),
     ],
@@ -238,7 +238,7 @@ def test_at_most_300_mJ_of_stored_energy_return(axis, force, pressed):
 
 def tap_on_wall(stiffness, grip, delay, *, observe):
     """Return the least energy of the port and the final speed after one tap on a wall."""
-    virtual = VirtualDevice(tapping(0.02, hertz=1.0), grip)
+    virtual = VirtualDevice(tapping_motion(0.02, hertz=1.0), grip)
     guard, heights = DeviceGuard(Limits(37.5), observe=observe), [virtual.position[2]] * delay
     energy, speed = [], []
     for k in range(950):
@@ -291,7 +291,7 @@ def test_client_displays_the_stations_force_and_none_after_silence(link):
             link.hand_inputs(now)
             link.send(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
         if k == 120:  # of an earlier client
-            late = packed_force(ForceCommand(10**6, now, (0.0, 9.0, 9.0, 0.0, 0.0, 0.0)))
+            late = pack_force(ForceCommand(10**6, now, (0.0, 9.0, 9.0, 0.0, 0.0, 0.0)))
             link._socket.sendto(late, link._peer)
     force = [wrench[2] for wrench in device.was_set]
     assert force[99] == pytest.approx(4.0)

@@ -13,7 +13,7 @@ from full_disk import small_disk
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.progress import silent
-from drake_teleop.live.live import FRAME_PERIOD_S, MAX_MESSAGE_BYTES, Live, parse
+from drake_teleop.live.live import FRAME_PERIOD_S, MAX_MESSAGE_BYTES, Live, parse_message
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.result import SimulationResult
@@ -343,4 +343,4 @@ def test_all_values_stay_finite_after_10000_random_messages(scenario, load, cloc
     ],
 )
 def test_unexpected_entries_of_a_message_are_ignored(text, found):
-    assert parse(text) == found
+    assert parse_message(text) == found

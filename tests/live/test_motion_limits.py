@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.live.device_link import DeviceLink
-from drake_teleop.live.device_packets import DeviceState, packed_state
+from drake_teleop.live.device_packets import DeviceState, pack_state
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
@@ -153,7 +153,7 @@ def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
     while live.ms < 600:
         now, number = now + 1e-3, number + 1
         up = 0.045 * max(-1.0, min(3.0 * math.sin(2.0 * math.pi * now), 1.0))
-        packet = packed_state(DeviceState(number, now, (up, 0.0, up)))
+        packet = pack_state(DeviceState(number, now, (up, 0.0, up)))
         link._handle_packet(packet, ("127.0.0.1", 9), now)
         if now >= due:
             for _ in range(burst):

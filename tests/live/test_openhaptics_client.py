@@ -14,8 +14,8 @@ from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
     ForceCommand,
-    packed_force,
-    unpacked_state,
+    pack_force,
+    unpack_state,
 )
 
 pytestmark = [
@@ -63,9 +63,9 @@ def test_client_sends_the_pose_and_displays_the_force(tmp_path):
         ) as process:
             for _ in range(300):
                 packet, sender = station.recvfrom(1000)
-                state = unpacked_state(packet)
+                state = unpack_state(packet)
                 command = ForceCommand(state.number, state.t, (0.3, 0.2, 0.1, 0.0, 0.0, 0.0))
-                station.sendto(packed_force(command), sender)
+                station.sendto(pack_force(command), sender)
             output, _ = process.communicate("\n")
         assert process.returncode == 0
     # HDAPI (10, 20, 30) mm: z is B's x, x its y, y its z. A rotation about up is one about B's z.

@@ -15,7 +15,7 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.common.progress import silent
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import LEAD_TIME_S
-from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
+from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, csv_header, csv_row, read_inputs
 from drake_teleop.live.session import Drive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
@@ -282,7 +282,7 @@ def test_unclosed_drive_loses_two_seconds_of_log_and_no_input(scenario, load, tm
 
 
 MADE_BY = {"drake_teleop": "1.2", "drake": "3.4"}
-HEADER = header(MADE_BY)
+HEADER = csv_header(MADE_BY)
 
 
 def test_inputs_are_clipped_and_invalid_ones_ignored():
@@ -297,21 +297,27 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
     [
         ("", "is not a record of a drive"),
         (HEADER, "has a duration of 0 s"),
-        (HEADER + row(0, Inputs()), "has a duration of 0 s"),
-        (HEADER + row(5, Inputs()), "5 ms is not a valid time"),
-        (HEADER + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is not a valid time"),
-        (HEADER + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":4.*x = 1000000 is outside"),
-        (HEADER + "0,1\n", "has 2 values, must have 23"),
-        (HEADER + row(0, Inputs()).replace("0,", "a,", 1), "a value that is not a whole number"),
+        (HEADER + csv_row(0, Inputs()), "has a duration of 0 s"),
+        (HEADER + csv_row(5, Inputs()), "5 ms is not a valid time"),
+        (HEADER + csv_row(0, Inputs()) + csv_row(-5, Inputs()), "-5 ms is not a valid time"),
         (
-            HEADER + row(0, Inputs()).replace("none", "share"),
+            HEADER + csv_row(0, Inputs()) + csv_row(5, Inputs(x=1_000_000)),
+            ":4.*x = 1000000 is outside",
+        ),
+        (HEADER + "0,1\n", "has 2 values, must have 23"),
+        (
+            HEADER + csv_row(0, Inputs()).replace("0,", "a,", 1),
+            "a value that is not a whole number",
+        ),
+        (
+            HEADER + csv_row(0, Inputs()).replace("none", "share"),
             "has an unknown method, 'share'; it ca",
         ),
         (
-            HEADER + row(0, Inputs()).replace("none", "0"),
+            HEADER + csv_row(0, Inputs()).replace("none", "0"),
             "has an unknown method, '0'; it cannot be",
         ),
-        (HEADER + row(0, Inputs()).replace("medium", "iron"), "has an unknown grip, 'iron'"),
+        (HEADER + csv_row(0, Inputs()).replace("medium", "iron"), "has an unknown grip, 'iron'"),
         (
             HEADER.replace("1.2", "1.1"),
             "recorded with drake_teleop 1.1, and this is 1.2; it cannot",
@@ -341,7 +347,9 @@ def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
 
 def test_incomplete_last_line_is_ignored(tmp_path):
     path = tmp_path / INPUTS
-    path.write_text(HEADER + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
+    path.write_text(
+        HEADER + csv_row(0, Inputs()) + csv_row(5, Inputs(x=3)) + csv_row(10, Inputs())[:9]
+    )
     assert read_inputs(path, MADE_BY) == [(0, Inputs()), (5, Inputs(x=3))]
     assert len(RANGES) == 22
 

@@ -12,7 +12,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.master import device, dynamics, phantom
 from drake_teleop.station.master.data_sheets import JointFriction, Master
-from drake_teleop.station.master.force_display import initial_display
+from drake_teleop.station.master.force_display import initial_display_state
 
 NO_FRICTION = JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 
@@ -351,7 +351,7 @@ def simulate(q_initial, duration, motor_torque):
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     diagram.GetInputPort("hand_wrench_E").FixValue(context, np.zeros(6))
-    drive = np.append(motor_torque, initial_display(q_initial, parameters())[6:])
+    drive = np.append(motor_torque, initial_display_state(q_initial, parameters())[6:])
     diagram.GetInputPort("drive").FixValue(context, drive)
     simulator.AdvanceTo(duration)
     return {

@@ -8,7 +8,11 @@ import pytest
 from drake_teleop.common.blocks import Fault
 from drake_teleop.station.master import phantom
 from drake_teleop.station.master.data_sheets import Master
-from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display
+from drake_teleop.station.master.force_display import (
+    ForceDisplay,
+    display_into,
+    initial_display_state,
+)
 from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
 
 DEVICE = Master().device(0.1, 1e-4)
@@ -25,7 +29,7 @@ def display(wrench, q) -> tuple[np.ndarray, np.ndarray]:
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
     block.GetInputPort("wrench_command").FixValue(context, np.asarray(wrench, dtype=float))
-    start = initial_display(np.array(q, dtype=float), DEVICE.numbers)
+    start = initial_display_state(np.array(q, dtype=float), DEVICE.numbers)
     block.GetInputPort("for_display").FixValue(context, start)
     return (
         block.GetOutputPort("drive").Eval(context)[:6].copy(),
@@ -96,7 +100,7 @@ def test_command_that_is_not_finite_displays_zero(bad, index):
 def test_fault_has_its_own_port_and_a_combined_one():
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
-    start = initial_display(POSTURES[1], DEVICE.numbers)
+    start = initial_display_state(POSTURES[1], DEVICE.numbers)
     block.GetInputPort("for_display").FixValue(context, start)
     for wrench, fault in ((np.ones(6), Fault.NONE), (np.full(6, np.nan), Fault.WRENCH)):
         block.GetInputPort("wrench_command").FixValue(context, wrench)
@@ -118,7 +122,11 @@ WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
 
 def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
     """Return (N, 7) displayed wrench and fault, and (N, 6) torque, per period."""
-    device, J, drive = initial_display(POSTURES[1], DEVICE.numbers), np.empty((6, 6)), np.empty(27)
+    device, J, drive = (
+        initial_display_state(POSTURES[1], DEVICE.numbers),
+        np.empty((6, 6)),
+        np.empty(27),
+    )
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
         device[:6] = q

@@ -97,12 +97,16 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     training = decision.Training(R_WB, 1.5, 0.3, 0.0, 0.0, 0)
     person = decision.pack_person(training, Perception(), Movement())
     # As Python, so that nothing else is compiled.
-    monkeypatch.setattr(decision, "_pressed_force", decision._pressed_force.py_func)
+    monkeypatch.setattr(
+        decision, "_contact_force_along_axis", decision._contact_force_along_axis.py_func
+    )
     force_W, across = np.array([3.0, -5.0, 8.0]), np.zeros(3)
     packed, felt = decision.pack_task(task), 0.3 * R_WB.T @ force_W
     axis = np.array(task.translation) / np.linalg.norm(task.translation)
-    assert decision._pressed_force(packed, person, felt) == pytest.approx(-force_W @ axis)
-    size = decision._sideways_into.py_func(packed, person, felt, across)
+    assert decision._contact_force_along_axis(packed, person, felt) == pytest.approx(
+        -force_W @ axis
+    )
+    size = decision._lateral_force_into.py_func(packed, person, felt, across)
     np.testing.assert_allclose(across, force_W - (force_W @ axis) * axis, atol=1e-12)
     assert size == pytest.approx(np.linalg.norm(across))
 
@@ -112,10 +116,12 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     training = decision.Training(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_person(training, Perception(), movement), []
-    monkeypatch.setattr(decision, "_to_hand", decision._to_hand.py_func)
+    monkeypatch.setattr(decision, "_convert_to_hand", decision._convert_to_hand.py_func)
     monkeypatch.setattr(decision, "_random_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
-    took = decision._submovement.py_func(person, None, 0, 1.0, np.array([0.0, 1.5 * length, 0.0]))
+    took = decision._plan_submovement.py_func(
+        person, None, 0, 1.0, np.array([0.0, 1.5 * length, 0.0])
+    )
     _, time, planned, change, _ = plans[0]
     np.testing.assert_allclose(change, [0.0, length, 0.0])
     # x = L (10 u^3 - 15 u^4 + 6 u^5), of which the second derivative has this maximum.

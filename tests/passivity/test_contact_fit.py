@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.station.passivity.contact_fit import NUM_SUMS, slip_change, update_fit
+from drake_teleop.station.passivity.contact_fit import (
+    NUM_SUMS,
+    force_change_by_slip,
+    update_contact_fit,
+)
 
 
 def found(stiffness, damping, way, faster, keep=0.8):
     sums, values = np.zeros(NUM_SUMS), (0.0, 0.0)
     for dx, dv in zip(way, faster, strict=True):
-        values = update_fit(sums, stiffness * dx + damping * dv, dx, dv, keep)
+        values = update_contact_fit(sums, stiffness * dx + damping * dv, dx, dv, keep)
     return values
 
 
@@ -33,12 +37,12 @@ def test_proportional_speed_is_stiffness_and_old_stretches_fade():
     sums = np.zeros(NUM_SUMS)
     for stiffness in (2000.0, 100.0):
         for step in 2e-4 * np.array([1.0, -1.0, 2.0, -1.0, 1.0, 2.0] * 4):
-            k, _ = update_fit(sums, stiffness * step, step, 0.0, 0.5)
+            k, _ = update_contact_fit(sums, stiffness * step, step, 0.0, 0.5)
     assert k == pytest.approx(100.0, rel=0.01)
 
 
 def test_stiffness_and_damping_are_not_negative():
-    assert update_fit(np.zeros(NUM_SUMS), -1.0, 1e-3, 0.1, 0.5) == (
+    assert update_contact_fit(np.zeros(NUM_SUMS), -1.0, 1e-3, 0.1, 0.5) == (
         0.0,
         pytest.approx(0.0, abs=1e-9),
     )
@@ -47,8 +51,8 @@ def test_stiffness_and_damping_are_not_negative():
 def test_slip_is_excluded_from_stiffness_and_a_hit_stop_is_not():
     """Over 0.2 mm up to 0.12 N belong to the spring, and at most 0.4 N to friction."""
     for sign in (1.0, -1.0):
-        assert sign * slip_change(sign * 0.1, sign * 0.12, 0.4) == 0.0
-        assert sign * slip_change(sign * 0.4, sign * 0.12, 0.4) == pytest.approx(0.28)
-        assert sign * slip_change(-sign * 0.1, sign * 0.12, 0.4) == pytest.approx(-0.1)
-        assert sign * slip_change(sign * 2.0, sign * 0.12, 0.4) == pytest.approx(0.4)
-        assert slip_change(sign * 2.0, sign * 0.12, 0.0) == 0.0
+        assert sign * force_change_by_slip(sign * 0.1, sign * 0.12, 0.4) == 0.0
+        assert sign * force_change_by_slip(sign * 0.4, sign * 0.12, 0.4) == pytest.approx(0.28)
+        assert sign * force_change_by_slip(-sign * 0.1, sign * 0.12, 0.4) == pytest.approx(-0.1)
+        assert sign * force_change_by_slip(sign * 2.0, sign * 0.12, 0.4) == pytest.approx(0.4)
+        assert force_change_by_slip(sign * 2.0, sign * 0.12, 0.0) == 0.0

@@ -14,7 +14,7 @@ from drake_teleop.station.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.station.passivity.packet import PACKET_SIZE, difference_into, moved_into
+from drake_teleop.station.passivity.packet import PACKET_SIZE, moved_pose_into, pose_difference_into
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
@@ -34,7 +34,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
         rng.normal(size=(2, 6)),
     )
     pose, wrench, command = START.copy(), np.zeros(6), np.zeros(13)
-    moved_into(START, moved, pose)  # the hand's; the slave is at the start
+    moved_pose_into(START, moved, pose)  # the hand's; the slave is at the start
 
     slave_step(
         steps_of("four_channel"),
@@ -67,7 +67,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
     )
     K, D = (np.repeat(x, 3) for x in (own.stiffness, own.damping))
     behind = np.empty(6)
-    difference_into(START, pose, behind)
+    pose_difference_into(START, pose, behind)
     expected = 0.6 * contact - 0.4 * hand + K * behind + D * (twist[1] - twist[0])
     np.testing.assert_allclose(wrench, expected, rtol=1e-12)
 
@@ -77,6 +77,6 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
     )  # fmt: skip
     K, D = (np.repeat(p[x], 3) for x in (STIFFNESS, DAMPING))
     shift = np.empty(6)
-    difference_into(command[:7], pose, shift)
+    pose_difference_into(command[:7], pose, shift)
     np.testing.assert_allclose(K * shift, 1.3 * hand + 0.3 * contact + D * twist[0], rtol=1e-9)
     np.testing.assert_array_equal(command[7:], twist[0])

@@ -25,9 +25,9 @@ from drake_teleop.station.passivity.ledger_slave import (
     NORMAL,
     OWN_VELOCITY,
     ROUND_TRIP,
-    _wall_is_removed,
-    component_along,
-    find_direction,
+    _is_wall_removed,
+    update_contact_direction,
+    wrench_component_along,
 )
 from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOAD_WRENCH, LOST, SENT
 from drake_teleop.station.passivity.methods import (
@@ -41,9 +41,9 @@ from drake_teleop.station.passivity.methods import (
 from drake_teleop.station.passivity.packet import (
     LOAD,
     MAX_WRENCH_RATE,
+    PACKET_NUMBER,
     PACKET_SIZE,
     POSE,
-    SEQUENCE,
     WRENCH,
 )
 
@@ -70,7 +70,7 @@ class Hand:
         dx = np.zeros(6) if dx is None else np.asarray(dx)
         self.pose[4:] += dx[:3]
         self.pose[1:4] += 0.5 * dx[3:]
-        self.packet[SEQUENCE] += 1.0
+        self.packet[PACKET_NUMBER] += 1.0
         sent, still = np.zeros(PACKET_SIZE), np.zeros(6)
         master_step(
             steps_of("ledger"), self.packet, True, self.pose, dx / T, dx, still, self.p[LIMIT], T,
@@ -216,9 +216,9 @@ def test_friction_stays_across_the_direction_as_it_turns():
         felt = hand.step(rng.normal(size=6) * np.repeat([1e-6, 1e-5], 3))
         normal = hand.memory[NORMAL]
         for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
-            assert abs(component_along(hand.memory[friction], normal, hand.p)) < 1e-12
-        pressed = component_along(hand.packet[WRENCH], normal, hand.p)
-        assert component_along(felt, normal, hand.p) == pytest.approx(pressed, abs=1e-9)
+            assert abs(wrench_component_along(hand.memory[friction], normal, hand.p)) < 1e-12
+        pressed = wrench_component_along(hand.packet[WRENCH], normal, hand.p)
+        assert wrench_component_along(felt, normal, hand.p) == pytest.approx(pressed, abs=1e-9)
     assert np.linalg.norm(felt[:2]) > 0.4
 
 
@@ -319,7 +319,7 @@ def test_wrench_cross_fades_after_missing_packets():
     hand.packet[WRENCH][2] = 1.0
     assert hand.step()[2] == pytest.approx(1.0), "nothing is missing"
     hand.packet[WRENCH][2] = 3.0
-    hand.packet[SEQUENCE] += 3.0
+    hand.packet[PACKET_NUMBER] += 3.0
     course = [hand.step()[2] for _ in range(10)]
     assert course[0] == pytest.approx(1.0 + MAX_WRENCH_RATE[0] * T)
     assert np.diff(course).max() <= MAX_WRENCH_RATE[0] * T + 1e-12 and course[-1] == pytest.approx(
@@ -339,7 +339,7 @@ def test_wall_is_removed_if_its_motion_does_not_explain_the_lost_force(
     memory[_LAST_SPEED], memory[_DISPLAYED_FORCE] = speeds[1], shown
     memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = stiffness, damping
     explained = stiffness * abs(step) + damping * abs(speeds[1] - speeds[0])
-    removed = _wall_is_removed(step * normal, memory)
+    removed = _is_wall_removed(step * normal, memory)
     assert removed == (shown > max(0.3, 2.0 * explained))
 
 
@@ -358,7 +358,7 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
         wrench = np.array([rub, 0.0, force, 0.0, 0.2 * rub, 0.0])
         received[POSE] = pose
         received[POSE][6] -= 0.005
-        received[SEQUENCE] += 1.0
+        received[PACKET_NUMBER] += 1.0
         slave_step(
             steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
             packet,
@@ -383,7 +383,7 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
         rubs = 0.125 * 200.0 * depth if k < 2000 else 0.0
         force = 200.0 * depth - (k >= 2500)
         wrench = np.array([rubs, 0.0, force, 0.0, 0.1 * rubs, 0.0])
-        received[SEQUENCE] += 1.0
+        received[PACKET_NUMBER] += 1.0
         slave_step(
             steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
             packet,
@@ -404,12 +404,12 @@ def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
         p = parameters(config, motion_scale=motion)
         memory = initial_memory("ledger", p, START)
         wrench = contact / 17.5 / np.repeat(motion, 3)
-        size = find_direction(wrench, 0.01, 1e-3, p, memory)
+        size = update_contact_direction(wrench, 0.01, 1e-3, p, memory)
         sizes.append(size * motion[0])
         memory[IN_CONTACT] = 1.0
         turned = wrench * np.repeat([-1.0, 0.5], 3)
-        assert find_direction(turned, 0.01, 1e-3, p, memory) > 0.9 * size
-        assert component_along(memory[NORMAL], wrench, p) < 0.0
+        assert update_contact_direction(turned, 0.01, 1e-3, p, memory) > 0.9 * size
+        assert wrench_component_along(memory[NORMAL], wrench, p) < 0.0
     np.testing.assert_allclose(sizes, np.hypot(18.0, 7.0) / 17.5, rtol=1e-12)
 
 
@@ -429,7 +429,7 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
         contact = np.array([0.0, 0.0, max(depth := -pose[6] - 0.004, 0.0) * 200.0, 0.0, 0.0, 0.0])
         memory[LOAD_WRENCH] = load + 0.5 * np.sin(0.3 * k) * np.eye(6)[1]
         wrench = contact + memory[LOAD_WRENCH]
-        received[SEQUENCE] += 1.0
+        received[PACKET_NUMBER] += 1.0
         slave_step(
             steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
             packet,

@@ -24,7 +24,7 @@ from drake_teleop.station.passivity.memory import (
     LEDGER,
     LIMIT,
     MASS,
-    MEMORY,
+    MEMORY_SIZE,
     MOTION_SCALE,
     SENT,
     STIFFNESS,
@@ -40,14 +40,14 @@ from drake_teleop.station.passivity.methods import (
 )
 from drake_teleop.station.passivity.packet import (
     ENERGY,
-    HEALTHY,
+    INPUTS_FINITE,
+    PACKET_NUMBER,
     PACKET_SIZE,
-    SEQUENCE,
     WRENCH,
-    difference_into,
-    moved_into,
+    moved_pose_into,
+    pose_difference_into,
 )
-from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _exchange
+from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _exchange_energy
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
@@ -60,7 +60,7 @@ def poses(rng: np.random.Generator, steps: int) -> np.ndarray:
     phase, rate = rng.uniform(0, 6, 6), rng.uniform(3, 12, 6)
     e = 0.05 * (np.sin(np.outer(t, rate) + phase) - np.sin(phase))
     for k in range(steps):
-        moved_into(START, e[k], pose[k])
+        moved_pose_into(START, e[k], pose[k])
     return pose
 
 
@@ -89,7 +89,7 @@ def run(method, config, master_poses, slave_poses, f_e, newest):
     m = steps_of(method)
     for k in range(steps):
         for end, pose in enumerate((master_poses, slave_poses)):
-            difference_into(pose[k], pose[max(k - 1, 0)], dx[end, k])
+            pose_difference_into(pose[k], pose[max(k - 1, 0)], dx[end, k])
             j, before = newest[1 - end, k], newest[1 - end, max(k - 1, 0)]
             received = nothing if j < 0 else sent[1 - end, j]
             fresh = j >= 0 and (k == 0 or j != before)
@@ -133,8 +133,8 @@ def test_outputs_are_finite_limited_and_numbered(method):
     assert np.linalg.norm(wrench[:, :3], axis=1).max() > 1e-3, "nothing was ever displayed"
     np.testing.assert_allclose(np.linalg.norm(command[:, :4], axis=1), 1.0, atol=1e-9)
     for end in range(2):
-        np.testing.assert_array_equal(sent[end, :, SEQUENCE], np.arange(1500))
-        assert (sent[end, :, HEALTHY] == 1).all()
+        np.testing.assert_array_equal(sent[end, :, PACKET_NUMBER], np.arange(1500))
+        assert (sent[end, :, INPUTS_FINITE] == 1).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -178,11 +178,11 @@ def test_input_not_finite_gives_zero_force_and_keeps_the_ledgers(method, bad):
     received[20] = bad
     wrench[:] = 1.0
     master_step(m, received, True, START, zero, zero, zero, p[LIMIT], T, p, memory, wrench, packet)
-    assert (wrench == 0).all() and packet[HEALTHY] == 0 and np.isfinite(packet).all()
+    assert (wrench == 0).all() and packet[INPUTS_FINITE] == 0 and np.isfinite(packet).all()
     np.testing.assert_array_equal(memory[1:], before[1:])
     slave_step(m, received, True, START, zero, zero, zero, T, p, memory, command, packet)
     np.testing.assert_array_equal(command[:7], START)
-    assert (command[7:] == 0).all() and packet[HEALTHY] == 0 and packet[SEQUENCE] == 2
+    assert (command[7:] == 0).all() and packet[INPUTS_FINITE] == 0 and packet[PACKET_NUMBER] == 2
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -205,7 +205,7 @@ def test_step_writes_only_into_its_arguments(method):
     path = poses(rng, 200)
     for k in range(1, 200):
         pose, dx, f_e = guarded(path[k]), guarded(np.zeros(6)), guarded(rng.normal(size=6))
-        difference_into(pose, path[k - 1], dx)
+        pose_difference_into(pose, path[k - 1], dx)
         twist, given = guarded(dx / T), [packet.copy() for packet in packets]
         master_step(
             m, given[1], True, pose, twist, dx, hand, limits, T, p, ends[0], wrench, packets[0]
@@ -259,7 +259,7 @@ def test_unknown_method_is_rejected():
         initial_memory("waves", np.zeros(1), START)
     with pytest.raises(DrakeTeleopError, match="method"):
         check_ranges(PassivityConfig(method="waves"), "passivity")
-    assert initial_memory("none", np.zeros(1), START).shape == (MEMORY,)
+    assert initial_memory("none", np.zeros(1), START).shape == (MEMORY_SIZE,)
 
 
 @pytest.mark.slow
@@ -315,7 +315,7 @@ def test_tank_with_fastest_sending_is_not_overdrawn():
         memory, packet = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
         full = memory[LEDGER].copy()
         assert np.all(full > 0.0)
-        _exchange(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
+        _exchange_energy(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
         assert np.all(memory[LEDGER] >= 0.0)
         np.testing.assert_allclose(memory[LEDGER] + memory[SENT], full, rtol=1e-12)
 
@@ -326,5 +326,5 @@ def test_overdrawn_tank_keeps_its_deficit():
     memory, received = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
     memory[LEDGER] = -1e-3
     received[ENERGY] = 4e-4
-    _exchange(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
+    _exchange_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
     np.testing.assert_allclose(memory[LEDGER], -6e-4, rtol=1e-12)

@@ -7,8 +7,13 @@ import pytest
 from test_methods import T, line, poses, run, wrenches
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.passivity.energy import created, in_flight, ledger, port_work
-from drake_teleop.station.passivity.memory import LEDGER, LIMIT, MEMORY
+from drake_teleop.station.passivity.energy import (
+    created_energy,
+    energy_balance,
+    energy_in_flight,
+    port_work,
+)
+from drake_teleop.station.passivity.memory import LEDGER, LIMIT, MEMORY_SIZE
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
@@ -48,12 +53,12 @@ def test_tdpa_ledger_is_the_work_at_the_hand():
     master, f_e = poses(rng, 1200), wrenches(rng, 1200)
     config = PassivityConfig(method="tdpa", retreat=[1e3, 1e3])  # what that withholds is lost
     wrench, _, _, _, memory = run("tdpa", config, master, poses(rng, 1200), f_e, line(rng, 1200))
-    hand, slave = ledger(memory[0]), ledger(memory[1])
+    hand, slave = energy_balance(memory[0]), energy_balance(memory[1])
     put_in = -port_work(wrench, master, "backward")[-1]
     # What was put in is sent, kept, or was balanced by what came from the slave.
     kept = put_in - hand.sent + hand.received - hand.stored
     assert (kept >= -1e-12).all() and (kept <= [2e-3 + 1e-12, 1e-4 + 1e-12]).all()
-    assert (in_flight(hand, slave) >= 0.0).all() and (hand.lost > 0.0).any()
+    assert (energy_in_flight(hand, slave) >= 0.0).all() and (hand.lost > 0.0).any()
 
 
 @pytest.mark.parametrize("short", [None, "master", "slave"])
@@ -80,7 +85,7 @@ def test_drag_acts_only_below_the_reserve(short):
 
 def test_created_energy_never_falls():
     energy = np.array([0.0, 1.0, -2.0, 3.0, -1.0])
-    np.testing.assert_array_equal(created(energy), [0.0, 0.0, 2.0, 2.0, 2.0])
+    np.testing.assert_array_equal(created_energy(energy), [0.0, 0.0, 2.0, 2.0, 2.0])
 
 
 def test_arrays_of_wrong_shape_are_rejected():
@@ -89,4 +94,4 @@ def test_arrays_of_wrong_shape_are_rejected():
     with pytest.raises(DrakeTeleopError, match="wrench has the shape"):
         port_work(np.zeros((3, 6)), np.zeros((2, 7)))
     with pytest.raises(DrakeTeleopError, match="memory: has the shape"):
-        ledger(np.zeros(MEMORY + 1))
+        energy_balance(np.zeros(MEMORY_SIZE + 1))

@@ -26,10 +26,10 @@ from drake_teleop.lab.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.energy import ledger, port_work
+from drake_teleop.station.passivity.energy import energy_balance, port_work
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.packet import ENERGY, difference_into
+from drake_teleop.station.passivity.packet import ENERGY, pose_difference_into
 from drake_teleop.station.passivity.tdpa import TdpaConfig
 from drake_teleop.station.passivity.wave import WaveConfig
 
@@ -76,7 +76,7 @@ def test_backward_pair_creates_no_energy_between_hand_and_command(method):
     step = np.zeros(6)
     energy = np.zeros((steps, 2))
     for k in range(1, steps):
-        difference_into(command[k, :7], command[k - 1, :7], step)
+        pose_difference_into(command[k, :7], command[k - 1, :7], step)
         into = f_e[k] * step - wrench[k] * dx[0, k]
         energy[k] = energy[k - 1] + [into[:3].sum(), into[3:].sum()]
     assert (energy.max(0) > [1e-2, 1e-4]).all(), "somebody should have put something in"
@@ -110,7 +110,7 @@ def test_wave_end_releases_only_received_energy():
     )
     at_hand = -port_work(wrench, master, "backward")[-1]
     at_command = port_work(f_e, command[:, :7], "backward")[-1]
-    for put_in, end in zip((at_hand, at_command), map(ledger, memory), strict=True):
+    for put_in, end in zip((at_hand, at_command), map(energy_balance, memory), strict=True):
         assert (end.received > 1e-3).all() and (end.stored >= 0.0).all()
         kept = end.stored + end.sent + end.lost
         np.testing.assert_allclose(put_in + end.received, kept, rtol=1e-9)

@@ -23,7 +23,12 @@ from drake_teleop.station.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.station.passivity.packet import PACKET_SIZE, WRENCH, difference_into, moved_into
+from drake_teleop.station.passivity.packet import (
+    PACKET_SIZE,
+    WRENCH,
+    moved_pose_into,
+    pose_difference_into,
+)
 
 T, STEPS, START = 1e-3, 1500, np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 K, D = np.repeat([300.0, 5.0], 3), np.repeat([2.0, 0.02], 3)
@@ -66,10 +71,10 @@ def test_stored_energy_is_what_was_put_in(end):
     B = np.repeat(config.pspm.damping, 3)
     largest = 0.0
     for k in range(STEPS):
-        moved_into(START, ours[k], pose)
-        difference_into(pose, before, dx)
+        moved_pose_into(START, ours[k], pose)
+        pose_difference_into(pose, before, dx)
         before[:] = pose
-        moved_into(START, theirs[k], target)
+        moved_pose_into(START, theirs[k], target)
         dx_other[:] = theirs[k] - theirs[max(k - 1, 0)]
         f_e = np.repeat([4.0, 0.05], 3) * np.sin(k * T * np.arange(3, 9))
         twist = dx / T
@@ -95,7 +100,7 @@ def test_stored_energy_is_what_was_put_in(end):
                     other, wrench, received,
                 )  # fmt: skip
             slave_step(m, received, fresh, pose, twist, dx, f_e, T, p, memory, output, packet)
-            difference_into(output[:7], pose, e)
+            pose_difference_into(output[:7], pose, e)
             held = K * e - D * twist
             spring = 0.5 * K * e**2
         left = memory[LEDGER] + groups(spring)
@@ -136,11 +141,11 @@ def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     p, rng = parameters(config), np.random.default_rng(1)
     memory, before = initial_memory("pspm", p, START), initial_memory("pspm", p, START)[LEDGER]
     pose, wanted, command = np.empty(7), np.empty(7), np.empty(7)
-    moved_into(START, 0.1 * rng.normal(size=6), pose)
+    moved_pose_into(START, 0.1 * rng.normal(size=6), pose)
     asked, left, twist = 0.2 * rng.normal(size=6), 0.1 * rng.normal(size=6), rng.normal(size=6)
-    moved_into(pose, asked, wanted)
-    moved_into(pose, left, command)
-    pspm.command_sent.py_func(wanted, command, pose, twist, p, memory)
+    moved_pose_into(pose, asked, wanted)
+    moved_pose_into(pose, left, command)
+    pspm.record_command.py_func(wanted, command, pose, twist, p, memory)
     np.testing.assert_allclose(memory[HELD_WRENCH], K * left - D * twist, rtol=1e-9)
     np.testing.assert_array_equal(memory[COMMAND_POSE], command)
     more = groups(0.5 * K * (left**2 - asked**2))

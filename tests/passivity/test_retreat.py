@@ -7,7 +7,7 @@ import pytest
 
 from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operators_intent, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import HELD_WRENCH, MEMORY
+from drake_teleop.station.passivity.memory import HELD_WRENCH, MEMORY_SIZE
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters
 from drake_teleop.station.passivity.safe_state import retreat
 
@@ -38,7 +38,7 @@ def test_only_wrench_along_a_fast_hand_fades():
     along = np.array([0.6, 0.8, 0.0, 0.0, 0.0, 1.0])
 
     def left(before: np.ndarray, now: np.ndarray) -> np.ndarray:
-        memory, wrench = np.zeros(MEMORY), given.copy()
+        memory, wrench = np.zeros(MEMORY_SIZE), given.copy()
         retreat(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
         wrench[:] = given
         retreat(now, 1e-9, p, memory, wrench)
@@ -54,6 +54,6 @@ def test_only_wrench_along_a_fast_hand_fades():
 
 
 def test_wrench_is_unchanged_without_a_method():
-    memory, wrench = np.zeros(MEMORY), np.ones(6)
+    memory, wrench = np.zeros(MEMORY_SIZE), np.ones(6)
     retreat(np.full(6, 50.0), 1.0, parameters(PassivityConfig()), memory, wrench)
     np.testing.assert_array_equal(wrench, np.ones(6))

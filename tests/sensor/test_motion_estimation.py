@@ -35,7 +35,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     butterworth_sections,
     read_into,
     sensor_chain,
-    without,
+    without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.home import R_WS_HOME, home_position
@@ -51,7 +51,7 @@ ARM = AddSlavePlant(DiagramBuilder(), Slave(), None, np.zeros(6)).arm
 JR3 = PRESETS["jr3_85m35a3"]
 #: Nothing but its low-pass, and an accelerometer that is somewhere and looks somewhere else.
 QUIET = dataclasses.replace(
-    without(JR3, "noise", "random_walk", "offset", "drift", "quantisation"),
+    without_parts(JR3, "noise", "random_walk", "offset", "drift", "quantisation"),
     p_SoAo_S=[0.02, -0.03, 0.05],
     R_SA=[0.0, -1.0, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0],
 )
@@ -210,7 +210,7 @@ def test_wrench_and_motion_are_in_phase(source, preset, frequency):
     Source `encoders` has a low-pass whose phase exceeds its delay by 0.1 samples at 5 Hz
     and 1.6 at 20 Hz.
     """
-    sensor = without(
+    sensor = without_parts(
         PRESETS[preset], "noise", "random_walk", "offset", "drift", "quantisation", "saturation"
     )
     config = MotionEstimationConfig(source=source)
@@ -353,7 +353,7 @@ def left(fast: Array, sensor: WristSensorConfig, source: str) -> tuple[float, fl
 
 
 def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
-    sensor = without(JR3, "drift")
+    sensor = without_parts(JR3, "drift")
     assert np.linalg.norm(fast[SETTLED:, :3], axis=1).max() == pytest.approx(97.0, abs=3.0)
     wrong = dataclasses.replace(
         sensor, acceleration_gain_error=0.01, acceleration_misalignment=0.01
@@ -373,11 +373,11 @@ def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
 @pytest.mark.parametrize("source", ["encoders", "accelerometer"])
 def test_motion_noise_equals_the_prediction(source, preset):
     """For encoders on average over the axes."""
-    real = without(PRESETS[preset], "random_walk", "offset", "drift", "saturation")
+    real = without_parts(PRESETS[preset], "random_walk", "offset", "drift", "saturation")
     config = MotionEstimationConfig(source)
     truth = truth_of(swinging(np.arange(16000) * T))
     noisy = sampled(truth, real, config)
-    noise = (noisy - sampled(truth, without(real, "noise", "quantisation"), config))[4000:]
+    noise = (noisy - sampled(truth, without_parts(real, "noise", "quantisation"), config))[4000:]
     left = np.mean(noise[:, :6].std(axis=0) / real.wrench_std())  # by the low-pass, of any noise
     stated = left * estimated_motion_std(config, real, 6, T)
     for axes, expected in ((noise[:, 6:9], stated[:3]), (noise[:, 12:15], stated[6:])):
@@ -389,7 +389,7 @@ def test_motion_noise_equals_the_prediction(source, preset):
 
 def test_the_offset_of_an_accelerometer_is_found(fast):
     """0.76 m/s^2 of the ATI's IMU: 2.4 N of a tool of 3.1 kg."""
-    sensor = without(PRESETS["ati_gamma_imu"], "noise", "random_walk", "drift")
+    sensor = without_parts(PRESETS["ati_gamma_imu"], "noise", "random_walk", "drift")
     assert left(fast, sensor, "accelerometer")[0] == pytest.approx(2.4, abs=0.1)
     assert left(fast, sensor, "fused")[0] < 0.05
 

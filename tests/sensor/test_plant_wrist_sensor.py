@@ -34,7 +34,7 @@ from drake_teleop import AddWristSensor
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import LOST, non_contact_wrench
 from drake_teleop.station.sensor.presets import PRESETS
-from drake_teleop.station.sensor.sensor_chain import PARTS, WristSensorConfig, without
+from drake_teleop.station.sensor.sensor_chain import PARTS, WristSensorConfig, without_parts
 
 ARM = Path(__file__).parents[2] / "docs" / "gallery" / "arm.urdf"
 TOOL = SpatialInertia.MakeFromCentralInertia(
@@ -310,7 +310,7 @@ def test_sample_has_all_parts_side_by_side():
 
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "bota_sensone"])
 def test_a_preset_has_its_noise_and_offset(preset):
-    config = without(PRESETS[preset], "low_pass", "drift", "random_walk", "calibration")
+    config = without_parts(PRESETS[preset], "low_pass", "drift", "random_walk", "calibration")
     run = at_rest(config)
     wrench = record(run, "measured_wrench_S", 600, 1e-3)
     truth = -9.81 * 1.3 * np.array([0.0, 0.0, -1.0])
@@ -320,7 +320,7 @@ def test_a_preset_has_its_noise_and_offset(preset):
 
 
 def test_saturation_is_flagged_and_limited():
-    config = without(WristSensorConfig(force_range=[200.0, 200.0, 5.0]), "low_pass", "noise")
+    config = without_parts(WristSensorConfig(force_range=[200.0, 200.0, 5.0]), "low_pass", "noise")
     run = at_rest(config)
     run.simulator.AdvanceTo(2.5e-3)
     assert reading(run, "status") == [1.0]
@@ -329,7 +329,7 @@ def test_saturation_is_flagged_and_limited():
 
 def test_latencies_of_all_paths_meet_in_one_instant():
     """V phi equals the wrench in motion, although the accelerations are 3 samples late."""
-    config = without(WristSensorConfig(), *PARTS)
+    config = without_parts(WristSensorConfig(), *PARTS)
     config.acceleration_latency = 3e-3
     run = moving(config=config)
     run.simulator.AdvanceTo(0.0405)
@@ -362,7 +362,7 @@ def test_two_sensors_in_one_diagram_read_their_own_weld():
     plant, weld = arm(builder, 1e-3)
     foot = plant.GetJointByName("world_welds_to_base")
     plant.Finalize()
-    quiet = without(WristSensorConfig(saturates=False), "low_pass")
+    quiet = without_parts(WristSensorConfig(saturates=False), "low_pass")
     sensors = [
         AddWristSensor(builder, plant, weld, quiet),
         AddWristSensor(builder, plant, foot, quiet, name="foot_sensor"),

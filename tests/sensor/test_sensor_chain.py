@@ -30,7 +30,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     is_plausible,
     read_into,
     sensor_chain,
-    without,
+    without_parts,
 )
 
 NOISE = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "_ext" / "sensor_noise.py"))
@@ -40,7 +40,7 @@ allan_deviation, predicted_allan_deviation, rest_record, spectral_density = (
 )
 
 RATE, PERIOD, JOINTS = 8000.0, 125e-6, 3
-BARE = without(WristSensorConfig(), *PARTS)
+BARE = without_parts(WristSensorConfig(), *PARTS)
 QUIET = ("noise", "random_walk")
 RECORDS = Path(__file__).parents[2] / ".." / "shared" / "data"
 ATI_AT_REST = RECORDS / "ntnu_fts_imu_contact"
@@ -97,7 +97,7 @@ def test_presets_are_plausible_and_settle_at_the_first_sample(name):
     check_ranges(config, "sensor")
     config.check("sensor", RATE)
     truths = np.repeat(random_truths(1), 400, axis=0)
-    found = readings(without(config, *QUIET, "drift"), truths)
+    found = readings(without_parts(config, *QUIET, "drift"), truths)
     # The low-pass keeps what the converter rounded, so that it moves within a quantum.
     quantum = config.resolution * config.ranges()
     assert np.all(np.ptp(found[:, :12], axis=0) <= quantum)
@@ -198,7 +198,7 @@ def test_the_place_of_the_low_pass_decides_what_it_filters():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_ramp_is_delayed_by_the_stated_delays(name):
-    config = without(
+    config = without_parts(
         PRESETS[name], *QUIET, "calibration", "offset", "drift", "quantisation", "place"
     )
     config = dataclasses.replace(config, encoder_latency=1e-3)
@@ -345,9 +345,9 @@ AT_REST = {
         resolution=2e-4,
     ),
     "walk": part(force_walk=0.05, angular_acceleration_walk=0.3),
-    "jr3_85m35a3": without(PRESETS["jr3_85m35a3"], "drift"),
-    "ati_gamma_imu": without(PRESETS["ati_gamma_imu"], "drift"),
-    "before the noise": without(
+    "jr3_85m35a3": without_parts(PRESETS["jr3_85m35a3"], "drift"),
+    "ati_gamma_imu": without_parts(PRESETS["ati_gamma_imu"], "drift"),
+    "before the noise": without_parts(
         dataclasses.replace(PRESETS["jr3_85m35a3"], low_pass="before_noise"), "drift"
     ),
 }

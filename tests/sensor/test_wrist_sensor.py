@@ -20,7 +20,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
-    without,
+    without_parts,
 )
 from drake_teleop.station.sensor.wrist_sensor import WristSensor
 from drake_teleop.station.simulation import simulate
@@ -28,7 +28,7 @@ from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
-QUIET = without(
+QUIET = without_parts(
     WristSensorConfig(), "place", "noise", "random_walk", "offset", "drift", "quantisation"
 )
 

@@ -33,10 +33,10 @@ from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.point_contact import FRICTION
-from drake_teleop.station.master.force_display import initial_display
+from drake_teleop.station.master.force_display import initial_display_state
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
-from drake_teleop.station.sensor.sensor_chain import without
+from drake_teleop.station.sensor.sensor_chain import without_parts
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
 from drake_teleop.station.slave.joint_commands import AUTOMATIC, ik_method_name
@@ -482,7 +482,7 @@ class _Period:
             np.append(q, np.zeros(len(q))),
             pose_B,
             np.zeros(6),
-            initial_display(self._device.display_axes(q), self._device.numbers),
+            initial_display_state(self._device.display_axes(q), self._device.numbers),
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
@@ -573,7 +573,7 @@ def _linear_part(scenario: Scenario) -> Scenario:
         operator__intent=[],
         channel=Channel(),
         passivity=PassivityConfig(),
-        wrist_sensor=without(scenario.wrist_sensor, *parts),
+        wrist_sensor=without_parts(scenario.wrist_sensor, *parts),
         master=scenario.master.without_coulomb_friction(),
         slave__friction=[],
         load_estimator__enabled=False,

@@ -14,7 +14,7 @@ from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.energy import ledger, port_work
+from drake_teleop.station.passivity.energy import energy_balance, port_work
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import (
@@ -96,7 +96,7 @@ def start_energy(scenario: Scenario) -> Array:
     power = scenario.force_scaling.force_scale / scales
     p = methods.parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return 2 * ledger(methods.initial_memory(scenario.passivity.method, p, pose)).stored
+    return 2 * energy_balance(methods.initial_memory(scenario.passivity.method, p, pose)).stored
 
 
 def _motion_scale(scenario: Scenario) -> Array:

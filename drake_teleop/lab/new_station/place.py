@@ -33,7 +33,7 @@ from drake_teleop.lab.new_station.random_postures import (
     suitable,
     with_tool_axis,
 )
-from drake_teleop.station.environment.environment import Environment, LetFloat, NewInstance
+from drake_teleop.station.environment.environment import AddFreeJoint, Environment, NewInstance
 from drake_teleop.station.slave.arm import (
     ROTATION,
     TRANSLATION,
@@ -134,7 +134,7 @@ class TrialWalls(Environment):
             name = _wall_name(edge)
             inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
             body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
-            LetFloat(plant, body, RigidTransform([0.0, 0.0, -100.0]))
+            AddFreeJoint(plant, body, RigidTransform([0.0, 0.0, -100.0]))
             shape = Box(edge, edge, _WALL_ABOVE_M + _WALL_BELOW_M)
             plant.RegisterCollisionGeometry(
                 body, RigidTransform(), shape, name, ProximityProperties()

@@ -34,7 +34,7 @@ _AVERAGING_S, _TOUCH_FORCE_N = 0.02, 0.5
 _FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
-def load_for(scenario: Scenario) -> IdentifiedLoad | None:
+def identified_load_of(scenario: Scenario) -> IdentifiedLoad | None:
     """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
@@ -50,7 +50,7 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return sigma, sigma_object and gamma [%] that render a stimulus of this level.
+        """Return a stimulus's scales [%]: sigma and sigma_object of the load, gamma of contact.
 
         `level` is a force [N] or mass [kg], `pressed` the expected contact force [N].
         """

@@ -15,10 +15,10 @@ from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot
 from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
-from drake_teleop.live.experiment.simulated import seeded
+from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.live import FRAME_PERIOD_S, Live, Show, parse
+from drake_teleop.live.live import FRAME_PERIOD_S, Live, Show, parse_message
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
@@ -75,7 +75,7 @@ class Guided:
         self._stimulus = self._apparatus.inputs(procedure.present_level, procedure.expected_force)
         name = f"{procedure.number:04}-{procedure.interval}"
         self._live = Live(
-            seeded(self._apparatus.scenario, procedure),
+            with_interval_seed(self._apparatus.scenario, procedure),
             self._apparatus.load,
             self._drives / f"{procedure.participant:02}" / name,
             self._add_rows,
@@ -235,7 +235,7 @@ class Guided:
 
 def parse_study(text: Any) -> dict[str, Any] | None:
     """Return the valid requests in a page's message, or None."""
-    message = parse(text) or {}
+    message = parse_message(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:
         found[kind] = {name: value for name, value in message[kind].items() if name in HAND}

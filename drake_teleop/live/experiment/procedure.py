@@ -48,7 +48,7 @@ class IntervalResult:
     lost_s: float = 0.0
 
 
-def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
+def plan_trials(experiment: Experiment, participant: int) -> list[Trial]:
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -77,7 +77,7 @@ class Procedure:
 
     def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
         self.experiment, self.participant, self._store = experiment, participant, store
-        self.trials = trials_of(experiment, participant)
+        self.trials = plan_trials(experiment, participant)
         self._rows = store.rows(participant)
         self._psi = {
             (t, c): Psi(task.low, task.high)

@@ -68,7 +68,7 @@ def _participant_estimates(task: Task, rows: Sequence[Row]) -> dict[str, Estimat
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
-        found = {_SHARE: _wilson(len(done), len(rows))}
+        found = {_SHARE: _wilson_interval(len(done), len(rows))}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -94,7 +94,7 @@ def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Esti
     return Estimate(*(math.exp(v) for v in found))
 
 
-def _wilson(successes: int, n: int) -> Estimate:
+def _wilson_interval(successes: int, n: int) -> Estimate:
     p, z2 = successes / n, _NORMAL_QUANTILE**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = _NORMAL_QUANTILE / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))

@@ -7,7 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog, load_for, make_apparatus
+from drake_teleop.live.experiment.apparatus import (
+    Apparatus,
+    IntervalLog,
+    identified_load_of,
+    make_apparatus,
+)
 from drake_teleop.live.experiment.design import (
     ApparentMass,
     Experiment,
@@ -41,13 +46,13 @@ def all_apparatus(
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = load_for(scenario)
+        load = identified_load_of(scenario)
         for c, condition in enumerate(experiment.conditions):
             stations[t, c] = make_apparatus(task, condition, scenario, load)
     return stations
 
 
-def seeded(scenario: Scenario, procedure: Procedure) -> Scenario:
+def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
     """Return the scenario with a seed for the present interval."""
     number = 2 * procedure.number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
@@ -100,7 +105,7 @@ def compare_responses(
 def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
-    session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
+    session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
     stimulus = apparatus.inputs(procedure.present_level, procedure.expected_force)
     rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
@@ -126,7 +131,7 @@ def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) ->
     task, condition = apparatus.task, apparatus.condition
     assert isinstance(task, PegInSlot) and isinstance(own.operator.task, Insert)
     scenario = replace(
-        seeded(apparatus.scenario, procedure),
+        with_interval_seed(apparatus.scenario, procedure),
         operator__task=own.operator.task,
         simulation__duration=task.timeout,
         simulation__settle=own.simulation.settle,

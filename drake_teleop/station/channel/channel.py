@@ -22,19 +22,19 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.memory import FILL_TIME, LIMIT, LOAD_WRENCH, MEMORY, Slots
+from drake_teleop.station.passivity.memory import FILL_TIME, LIMIT, LOAD_WRENCH, MEMORY_SIZE, Slots
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import (
-    CONTACT,
-    HEALTHY,
+    CONTACT_FLAG,
+    INPUTS_FINITE,
     LOAD,
     PACKET_SIZE,
-    difference_into,
     dot,
+    pose_difference_into,
 )
 from drake_teleop.station.passivity.safe_state import (
     MASTER_WATCH,
-    SILENT,
+    SILENCE_S,
     SLAVE_WATCH,
     STOP_TIME,
     initial_master_watch,
@@ -96,7 +96,7 @@ class Channel(NetworkConfig):
 
 
 # State of both ends in one array.
-_SIZE = 2 + 2 * (8 + 6 + MEMORY) + MASTER_WATCH + SLAVE_WATCH
+_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_WATCH + SLAVE_WATCH
 _places = Slots(_SIZE)
 _STEP = _places.number()  # number of the step
 _POSE_M = _places.vector(8)  # last finite command (7); 1 if the newest command is not finite
@@ -105,7 +105,7 @@ _WRENCH_M = _places.vector(6)  # wrench rendered since the last step
 _WRENCH_S = _places.vector(6)  # slave's wrench at the last step
 _VALID_TIME = _places.number()  # time with valid wrenches [s]
 _WATCH_M, _WATCH_S = _places.vector(MASTER_WATCH), _places.vector(SLAVE_WATCH)
-MEMORY_M, MEMORY_S = _places.vector(MEMORY), _places.vector(MEMORY)
+MEMORY_M, MEMORY_S = _places.vector(MEMORY_SIZE), _places.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world, one array.
 _places = Slots(11)
 _ROTATION = _places.vector(9)  # R_WB by rows
@@ -190,7 +190,7 @@ def channel_step(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send(backward_parameters, backward, k, packet)
-    ports[_SILENCE][0], ports[_SILENCE][1] = ends[_WATCH_M][SILENT], ends[_WATCH_S][SILENT]
+    ports[_SILENCE][0], ports[_SILENCE][1] = ends[_WATCH_M][SILENCE_S], ends[_WATCH_S][SILENCE_S]
 
 
 @njit(cache=True)
@@ -213,10 +213,10 @@ def master_end(
         work[g] -= dot(held, dx, g)
     hand[:] = 0.0
     if sound(hand_B):
-        _to_world(hand_B, frame, hand)
+        _wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
-    healthy = fresh and received[HEALTHY] > 0.5
+    healthy = fresh and received[INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
     master_limits_into(healthy, fault, T, timeout, parameters[LIMIT], held, watch, limits)
     methods.master_step(
@@ -224,9 +224,9 @@ def master_end(
         packet,
     )  # fmt: skip
     if not valid:
-        packet[HEALTHY] = 0.0
-    _to_master(held, frame, wrench_received[_RENDERED])
-    wrench_received[_CONTACT_FLAG] = received[CONTACT]
+        packet[INPUTS_FINITE] = 0.0
+    _wrench_to_master(held, frame, wrench_received[_RENDERED])
+    wrench_received[_CONTACT_FLAG] = received[CONTACT_FLAG]
 
 
 @njit(cache=True)
@@ -252,27 +252,27 @@ def slave_end(
         ends[_VALID_TIME] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
-        _to_world(wrench_B, frame, wrench)
+        _wrench_to_world(wrench_B, frame, wrench)
         share = T / max(STOP_TIME - ends[_VALID_TIME], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
-        _to_world(load_B, frame, wrench)
+        _wrench_to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_VALID_TIME] += T
     put(wrench, 0, held, 0, 6)
-    healthy = fresh and received[HEALTHY] > 0.5
+    healthy = fresh and received[INPUTS_FINITE] > 0.5
     methods.slave_step(
         steps, received, fresh, before[:7], twist, dx, wrench, T, parameters, memory, command,
         packet,
     )  # fmt: skip
     if not valid:
-        packet[HEALTHY] = 0.0
-    packet[CONTACT] = contact
+        packet[INPUTS_FINITE] = 0.0
+    packet[CONTACT_FLAG] = contact
     fault, requested = (fresh and not healthy) or not valid, command[:7]
     slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
-    methods.command_sent(steps, requested, pose_received, before[:7], twist, parameters, memory)
-    difference_into(pose_received, left, dx)
+    methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
+    pose_difference_into(pose_received, left, dx)
     for g in range(2):
         ports[_WORK_C][g] += dot(held, dx, g)
 
@@ -282,7 +282,7 @@ def _increment_into(pose, before, dx):
     """Write the increment `dx` (6,) since the last finite pose; return whether `pose` is finite."""
     valid = sound(pose)
     if valid:
-        difference_into(pose, before, dx)
+        pose_difference_into(pose, before, dx)
         put(before, 0, pose, 0, 7)
     if not valid or before[7] > 0.0:
         dx[:] = 0.0
@@ -291,7 +291,7 @@ def _increment_into(pose, before, dx):
 
 
 @njit(cache=True)
-def _to_world(wrench_B, frame, out):
+def _wrench_to_world(wrench_B, frame, out):
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -302,7 +302,7 @@ def _to_world(wrench_B, frame, out):
 
 
 @njit(cache=True)
-def _to_master(wrench, frame, out):
+def _wrench_to_master(wrench, frame, out):
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):

@@ -16,7 +16,14 @@ from drake_teleop.common.config import check_ranges, choice, plain, quantity, se
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity.packet import LOAD, POSE, VELOCITY, WRENCH, arrived, moved_into
+from drake_teleop.station.passivity.packet import (
+    LOAD,
+    POSE,
+    VELOCITY,
+    WRENCH,
+    has_arrived,
+    moved_pose_into,
+)
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
 LONGEST_DELAY = 10.0  # [s], bounds the memory
@@ -193,7 +200,7 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _uniform(p, k, draw):
+def _random_uniform(p, k, draw):
     return (float(random_bits(np.uint64(p[_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
 
 
@@ -206,14 +213,14 @@ def _delay_steps(p, k, draw):
     mean, spread = p[_DELAY], p[_DELAY] * p[_JITTER]
     if spread == 0.0:
         return int(p[_LONGEST])
-    u = _uniform(p, k, draw)
+    u = _random_uniform(p, k, draw)
     if p[_DISTRIBUTION] == 0:
         delay = mean + spread * (2.0 * u - 1.0)
     elif p[_DISTRIBUTION] == 1:  # Box and Muller
-        angle = 2.0 * math.pi * _uniform(p, k, draw + 1)
+        angle = 2.0 * math.pi * _random_uniform(p, k, draw + 1)
         delay = mean + spread / math.sqrt(3.0) * math.sqrt(-2.0 * math.log(u)) * math.cos(angle)
     else:  # sum of three exponential waits
-        u *= _uniform(p, k, draw + 1) * _uniform(p, k, draw + 2)
+        u *= _random_uniform(p, k, draw + 1) * _random_uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
     return int(min(max(delay + 0.5, p[_MIN_DELAY]), p[_LONGEST]))
 
@@ -223,14 +230,14 @@ def _advance_chain(p, k, bad):
     """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none)."""
     if p[_BAD_SHARE] > 0.0:
         likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
-        bad = 1.0 if _uniform(p, k, 0) <= likely else 0.0
+        bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
     if p[_RATE] < 1.0 and math.floor(k * p[_RATE] + 1e-9) == math.floor((k - 1) * p[_RATE] + 1e-9):
         return bad, -1, -1
-    if bad == 1.0 and _uniform(p, k, 1) <= p[_BURST_LOSS]:
+    if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BURST_LOSS]:
         return bad, -1, -1
     first = _delay_steps(p, k, 2)
     second = -1
-    if first >= 0 and p[_DUPLICATE] > 0.0 and _uniform(p, k, 5) <= p[_DUPLICATE]:
+    if first >= 0 and p[_DUPLICATE] > 0.0 and _random_uniform(p, k, 5) <= p[_DUPLICATE]:
         second = _delay_steps(p, k, 6)
     return bad, first, second
 
@@ -294,8 +301,8 @@ def _fill_silence(policy, silent, packet):
     if policy == _ZERO:
         velocity[:] = 0.0
         packet[WRENCH] = packet[LOAD] = 0.0
-    elif policy == _EXTRAPOLATE and arrived(packet):
-        moved_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
+    elif policy == _EXTRAPOLATE and has_arrived(packet):
+        moved_pose_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
         if silent > LONGEST_EXTRAPOLATION:
             velocity[:] = 0.0
 
@@ -304,11 +311,11 @@ def packet_delays(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
     """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive."""
-    return _all_delays(parameters(config, seed, direction, period), steps)
+    return _compute_delays(parameters(config, seed, direction, period), steps)
 
 
 @njit(cache=True)
-def _all_delays(p, steps):
+def _compute_delays(p, steps):
     delays, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
     for k in range(steps):
         bad, delays[k, 0], delays[k, 1] = _advance_chain(p, k, bad)
@@ -321,7 +328,7 @@ def newest_packets(
     """Return the number of the newest received packet at each step, (steps,); -1 for none."""
     p = parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT])
-    for travel in _all_delays(p, steps).T:
+    for travel in _compute_delays(p, steps).T:
         used = travel if config.redundant else np.maximum(travel, playout)
         seen = (travel >= 0) & (sent + used < steps)
         np.maximum.at(arrived, (sent + used)[seen], sent[seen])

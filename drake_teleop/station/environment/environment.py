@@ -114,7 +114,7 @@ def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
     return plant.AddModelInstance(free)
 
 
-def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) -> None:
+def AddFreeJoint(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) -> None:
     """Add a free joint for a body with the initial pose X_WBody, before Finalize."""
     name, world = f"{body.name()}_floats", plant.world_frame()
     joint = plant.AddJoint(QuaternionFloatingJoint(name, world, body.body_frame()))

@@ -71,11 +71,11 @@ def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Arra
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_row(plant, context, plant.get_joint(JointIndex(index)), row))
+        rows.append(_joint_row(plant, context, plant.get_joint(JointIndex(index)), row))
     return np.array(rows).reshape(len(rows), JOINT_WIDTH), order
 
 
-def _row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
+def _joint_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
@@ -148,7 +148,7 @@ def bodies_into(joints, state, out):
 
 
 @njit(cache=True)
-def _hermite(h, u, a, a_dot, b, b_dot):
+def _interpolate_hermite(h, u, a, a_dot, b, b_dot):
     d = b - a
     c2, c3 = 3.0 * d - h * (2.0 * a_dot + b_dot), h * (a_dot + b_dot) - 2.0 * d
     value = a + u * (h * a_dot + u * (c2 + u * c3))
@@ -169,18 +169,18 @@ def interpolate_bodies(joints, h, u, start, end, out):
     for k in range(joints.shape[0]):
         q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]
         if kind in (_REVOLUTE, _PRISMATIC):
-            out[q], out[v] = _hermite(h, u, start[q], start[v], end[q], end[v])
+            out[q], out[v] = _interpolate_hermite(h, u, start[q], start[v], end[q], end[v])
         elif kind == _FREE:
             for i in range(3):
-                out[q + 4 + i], out[v + 3 + i] = _hermite(
+                out[q + 4 + i], out[v + 3 + i] = _interpolate_hermite(
                     h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
                 )
             a, b = _quaternion(start, q), _quaternion(end, q)
             a_dot, b_dot = _quaternion_rate(three(start, v), a), _quaternion_rate(three(end, v), b)
-            w, w_dot = _hermite(h, u, a[0], a_dot[0], b[0], b_dot[0])
-            x, x_dot = _hermite(h, u, a[1], a_dot[1], b[1], b_dot[1])
-            y, y_dot = _hermite(h, u, a[2], a_dot[2], b[2], b_dot[2])
-            z, z_dot = _hermite(h, u, a[3], a_dot[3], b[3], b_dot[3])
+            w, w_dot = _interpolate_hermite(h, u, a[0], a_dot[0], b[0], b_dot[0])
+            x, x_dot = _interpolate_hermite(h, u, a[1], a_dot[1], b[1], b_dot[1])
+            y, y_dot = _interpolate_hermite(h, u, a[2], a_dot[2], b[2], b_dot[2])
+            z, z_dot = _interpolate_hermite(h, u, a[3], a_dot[3], b[3], b_dot[3])
             out[q], out[q + 1], out[q + 2], out[q + 3] = w, x, y, z
             spin = multiply((w_dot, x_dot, y_dot, z_dot), conjugate((w, x, y, z)))
             scale = 2.0 / (w * w + x * x + y * y + z * z)

@@ -99,7 +99,7 @@ def ContactPairs(
                     law = _contact_law(*map(inspector.GetProximityProperties, (own, other)))
                     half = np.array(edges.size()) / 2
                     place = [X_SShape.translation(), [sphere.radius()]]
-                    known.append(_row(place, X_Other, half, [direction, law, [slip, row]]))
+                    known.append(_pair_row(place, X_Other, half, [direction, law, [slip, row]]))
                 except DrakeTeleopError as beyond:
                     unknown = unknown or str(beyond)
                     own_box, box = _bounding_box(inspector, own), _bounding_box(inspector, other)
@@ -107,7 +107,7 @@ def ContactPairs(
                     place = [X_SBox.translation(), [0.0]]
                     turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
                     last = [direction, [0.0] * 4, [slip, row], *turned]
-                    watched.append(_row(place, X_Other, box.half_width(), last))
+                    watched.append(_pair_row(place, X_Other, box.half_width(), last))
     return Pairs(
         np.array(known).reshape(len(known), WIDTH),
         np.array(watched).reshape(len(watched), WATCHED_WIDTH),
@@ -115,7 +115,7 @@ def ContactPairs(
     )
 
 
-def _row(first: list[Any], X_Other: RigidTransform, half: Array, last: list[Any]) -> Array:
+def _pair_row(first: list[Any], X_Other: RigidTransform, half: Array, last: list[Any]) -> Array:
     return np.concatenate(
         [*first, X_Other.rotation().matrix().ravel(), X_Other.translation(), half, *last]
     )
@@ -249,7 +249,7 @@ def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: fl
 
 
 @njit(cache=True)
-def _friction(static: float, dynamic: float, slip: float) -> float:
+def _friction_coefficient(static: float, dynamic: float, slip: float) -> float:
     if slip < 1.0:
         return static * slip**3 * (10.0 + slip * (6.0 * slip - 15.0))
     if slip < 3.0:
@@ -272,6 +272,6 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
         force[i] = velocity[i] - out * normal[i]
         speed += force[i] * force[i]
     speed = np.sqrt(speed + _MIN_SLIP_SPEED * _MIN_SLIP_SPEED)
-    mu = _friction(pair[24], pair[25], speed / pair[26])
+    mu = _friction_coefficient(pair[24], pair[25], speed / pair[26])
     for i in range(3):
         force[i] = f_n * (normal[i] - mu * force[i] / speed)

@@ -13,11 +13,11 @@ from pydrake.multibody.tree import BodyIndex, SpatialInertia
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.environment.environment import (
+    AddFreeJoint,
     BodiesOfTool,
     ContactMaterial,
     Environment,
     ExcludeContact,
-    LetFloat,
     NewInstance,
     Stand,
 )
@@ -168,7 +168,7 @@ class Block(Surface):
         x, y, foot = self.position
         turned = RollPitchYaw(0.0, 0.0, self.yaw)
         X_WBlock = RigidTransform(turned, [x, y, foot + self.size[2] / 2])
-        LetFloat(plant, body, X_WBlock)
+        AddFreeJoint(plant, body, X_WBlock)
         if not plant.geometry_source_is_registered():
             return
         here, box = RigidTransform(), BoxShape(*self.size)

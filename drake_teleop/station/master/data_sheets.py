@@ -91,7 +91,7 @@ class DeviceFigures:
     )
 
 
-_FREE_TURN, _NO_TURN = DeviceFigures().turn, [0.0, 0.0, 0.0]
+_FREE_ROTATION, _NO_ROTATION = DeviceFigures().turn, [0.0, 0.0, 0.0]
 _OMEGA_SIZE, _OMEGA_TURN = [0.11, 0.113, 0.113], np.radians([120.0, 70.0, 160.0]).tolist()
 _OMEGA_STEP = math.radians(0.09)
 
@@ -101,15 +101,15 @@ _OMEGA_STEP = math.radians(0.09)
 # mass and friction of the Touch, turns and steps of the omegas, position steps of Touch and Falcon,
 # rates but the Inverse3's, and the Virtuose's torque. The rest are estimates.
 # Only the Virtuose displays torque; omega.3 and Falcon do not rotate.
-_SHEETS: dict[str, tuple[Any, ...]] = {
+_DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
-    "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _FREE_TURN, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE, _NO_TURN, 1e-5, _OMEGA_STEP, 4000.0),
+    "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _FREE_ROTATION, 5.5e-5, 2e-3, 1000.0),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE, _NO_ROTATION, 1e-5, _OMEGA_STEP, 4000.0),
     "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE, _OMEGA_TURN, 1e-5, _OMEGA_STEP, 4000.0),
     "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE, _OMEGA_TURN, 1e-5, _OMEGA_STEP, 4000.0),
-    "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_TURN, 6.35e-5, 0.0, 1000.0),
-    "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _FREE_TURN, 2e-5, 2e-3, 4000.0),
-    "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _FREE_TURN, 2e-5, 2e-4, 1000.0),
+    "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_ROTATION, 6.35e-5, 0.0, 1000.0),
+    "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _FREE_ROTATION, 2e-5, 2e-3, 4000.0),
+    "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _FREE_ROTATION, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
 _COLUMNS = (
     *("apparent_mass", "friction", "peak_force", "size"),
@@ -120,7 +120,7 @@ FIGURES = Registry(
     "device",
     {
         name: DeviceFigures(**dict(zip(_COLUMNS, copy.deepcopy(row), strict=True)))
-        for name, row in _SHEETS.items()
+        for name, row in _DATA_SHEETS.items()
     },
 )
 FIGURES["virtuose_6d"] = dataclasses.replace(

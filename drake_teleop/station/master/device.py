@@ -20,7 +20,7 @@ _MAX_FRICTION_STEP = 2.0
 
 
 @njit(cache=True, borrows=True)
-def _advance(device, work, stages, state, pose, twist, display, hand_wrench, drive, period):
+def _advance_device(device, work, stages, state, pose, twist, display, hand_wrench, drive, period):
     put(display, 6, drive, 6, drive.shape[0] - 6)
     if sound(hand_wrench) and sound(drive[:6]):
         step(state, hand_wrench, drive[:6], device, period, work, stages)
@@ -74,7 +74,7 @@ class MasterDevice(DeviceBlock):
     def __init__(self, period: float, device: HapticDevice, q_initial: NDArray[np.float64]) -> None:
         check_period(device, q_initial, period)
         constants = device.numbers, np.zeros((2, 6, 6)), np.zeros((3, 12))
-        super().__init__(period, device, q_initial, _advance, constants)
+        super().__init__(period, device, q_initial, _advance_device, constants)
 
 
 def AddDevice(

@@ -47,9 +47,9 @@ class Encoders(LeafSystem):
         self._constants = q_start, steps, device.numbers
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self._state.ticket()}
-        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._read), inputs)
+        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._round_pose), inputs)
 
-    def _read(self, context: Context, output: BasicVector) -> None:
+    def _round_pose(self, context: Context, output: BasicVector) -> None:
         q = self._state.Eval(context)[:6]
         read_pose_into(q, *self._constants, output.get_mutable_value())
 

@@ -43,7 +43,9 @@ def _peak_wrench(numbers):
     return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
 
 
-def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def initial_display_state(
+    q: NDArray[np.float64], numbers: NDArray[np.float64]
+) -> NDArray[np.float64]:
     display = np.zeros(_WATCH.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
     display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
@@ -98,12 +100,12 @@ def display_into(wrench, device, numbers, period, J, drive):
     jacobian_into(q, numbers, J)
     limit_wrench_into(wrench, numbers, J, displayed)
     if fault != _NO_FAULT or device[_CHANGED] != 0.0:
-        _fade(device, numbers, period, drive)
+        _fade_after_fault(device, numbers, period, drive)
     motor_torque_into(displayed, q, numbers, J, drive[:6])
 
 
 @njit(cache=True)
-def _fade(device, numbers, period, drive):
+def _fade_after_fault(device, numbers, period, drive):
     displayed, last = drive[DISPLAYED], device[DISPLAYED]
     limits, full = np.empty(2), _peak_wrench(numbers)
     fault = drive[_FAULT] != _NO_FAULT
@@ -142,7 +144,7 @@ class DeviceBlock(LeafSystem):
         self._advance, self._constants, self._period = advance, constants, period
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         # A separate port for the display's memory would cost a further call.
-        display = initial_display(device.display_axes(q_initial), device.numbers)
+        display = initial_display_state(device.display_axes(q_initial), device.numbers)
         self._drive = self.DeclareVectorInputPort("drive", len(display))
         # Pose and twist are states because they are read more often than they change.
         for name, start in (
@@ -203,7 +205,7 @@ class ForceDisplay(LeafSystem):
         for name, size, calc in (
             ("force_to_master", 6, self._calc_force),
             ("fault_at_hand", 1, self._calc_fault),
-            ("displayed_and_fault", 7, self._calc_both),
+            ("displayed_and_fault", 7, self._calc_force_and_fault),
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
@@ -223,5 +225,5 @@ class ForceDisplay(LeafSystem):
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output[0] = self._drive.Eval(context)[_FAULT]
 
-    def _calc_both(self, context: Context, output: BasicVector) -> None:
+    def _calc_force_and_fault(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_AND_FAULT])

@@ -17,7 +17,7 @@ from drake_teleop.station.operator.minimum_jerk import (
     PLAN,
     PLAN_SIZE,
     STOP,
-    plan_at,
+    evaluate_plan,
     plan_move,
     plan_stop,
 )
@@ -104,7 +104,7 @@ def pack_task(task: Task) -> Array:
     return packed
 
 
-# Indices of `state` in `decide`.
+# Indices of `state` in `update_decision`.
 PHASE, DONE, FELT, LIMIT, TRUST, STATE = 0, 1, 2, 3, 4, 5
 """Indices of the signal task_state, and its size."""
 WAITING, MOVING, FEELING, STOPPING, PRESSING, SEEKING, OVER = range(7)
@@ -140,7 +140,7 @@ def initial_memory() -> Array:
 
 
 @njit(cache=True)
-def _to_hand(person, vector_W, out):
+def _convert_to_hand(person, vector_W, out):
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
@@ -153,7 +153,7 @@ def _random_number(person, step, draw):
 
 
 @njit(cache=True)
-def look_into(person, step, displacement_W, seen_W):
+def observe_tool_into(person, step, displacement_W, seen_W):
     """Write the seen displacement of the tool from its start (3,), in W [m], into `seen_W`.
 
     Its random error is constant for 50 steps, a fixation of the eyes.
@@ -164,9 +164,9 @@ def look_into(person, step, displacement_W, seen_W):
 
 
 @njit(cache=True)
-def _submovement(person, memory, step, time, error_W):
+def _plan_submovement(person, memory, step, time, error_W):
     change = np.empty(3)
-    _to_hand(person, error_W, change)
+    _convert_to_hand(person, error_W, change)
     length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
     # The peak acceleration of a minimum-jerk movement determines its shortest duration.
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person[_ACCELERATION])
@@ -178,7 +178,7 @@ def _submovement(person, memory, step, time, error_W):
 
 
 @njit(cache=True)
-def _pressed_force(task, person, felt):
+def _contact_force_along_axis(task, person, felt):
     """Return the contact force on the tool against the axis [N]."""
     along = 0.0
     for i in range(3):
@@ -199,7 +199,7 @@ def _is_met(memory, time, good, still_good):
 
 
 @njit(cache=True)
-def _finish(state, memory, time, outcome):
+def _finish_task(state, memory, time, outcome):
     state[PHASE], state[DONE] = OVER, outcome
     plan_stop(memory, time)
 
@@ -210,7 +210,7 @@ def _enter_phase(state, memory, phase, ready):
 
 
 @njit(cache=True)
-def decide(task, person, time, seen_W, felt, state, memory):
+def update_decision(task, person, time, seen_W, felt, state, memory):
     """Update the operator's decisions by one step of `PERIOD`.
 
     Args:
@@ -233,7 +233,7 @@ def decide(task, person, time, seen_W, felt, state, memory):
     if state[PHASE] in (WAITING, OVER):
         return
     if time - task[_T_START] > task[_TIMEOUT]:
-        _finish(state, memory, time, -1.0)
+        _finish_task(state, memory, time, -1.0)
     elif state[PHASE] == MOVING:
         _move_by_vision(task, person, step, time, seen_W, state, memory)
     elif state[PHASE] == FEELING:
@@ -242,7 +242,7 @@ def decide(task, person, time, seen_W, felt, state, memory):
         if task[_KIND] == PRESS:
             _enter_phase(state, memory, PRESSING, time)
         elif _is_met(memory, time, True, True) and time - memory[_MET_SINCE] >= task[_DWELL]:
-            _finish(state, memory, time, 1.0)
+            _finish_task(state, memory, time, 1.0)
     elif state[PHASE] == PRESSING:
         _control_force(task, person, step, time, felt, state, memory)
     elif state[PHASE] == SEEKING and time >= memory[_NEXT_TIME]:
@@ -279,13 +279,13 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
     met = _is_met(memory, time, off <= 0.8 * task[_TARGET_RADIUS], off <= task[_TARGET_RADIUS])
     if task[_KIND] == REACH:
         if met and time - memory[_MET_SINCE] >= task[_DWELL]:
-            _finish(state, memory, time, 1.0)
+            _finish_task(state, memory, time, 1.0)
             return
     elif met and time >= memory[_NEXT_TIME]:
         _enter_phase(state, memory, FEELING, time)
         return
     if not met and time >= memory[_NEXT_TIME]:
-        duration = _submovement(person, memory, step, time, error)
+        duration = _plan_submovement(person, memory, step, time, error)
         memory[_NEXT_TIME] = time + duration + person[_VISION_WAIT]
 
 
@@ -301,15 +301,15 @@ def _approach(task, person, time, seen_W, felt, state, memory):
         _enter_phase(state, memory, STOPPING, time + STOP + person[_FORCE_WAIT])
         return
     if _seen_depth(task, person, seen_W) > task[_DEPTH] + _MAX_PENETRATION_M:
-        _finish(state, memory, time, -1.0)
+        _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         for i in range(3):
             velocity_W[i] = state[TRUST] * person[_APPROACH_SPEED] * task[_AXIS + i]
-        _to_hand(person, velocity_W, speed)
+        _convert_to_hand(person, velocity_W, speed)
         plan = memory[PLAN : PLAN + PLAN_SIZE]
         for i in range(3):
-            change[i] = 0.5 * _APPROACH_UPDATE_S * (plan_at(plan, time, i)[1] + speed[i])
+            change[i] = 0.5 * _APPROACH_UPDATE_S * (evaluate_plan(plan, time, i)[1] + speed[i])
         plan_move(memory, time, _APPROACH_UPDATE_S, change, speed)
         memory[_NEXT_TIME] = time + _APPROACH_UPDATE_S
 
@@ -317,7 +317,7 @@ def _approach(task, person, time, seen_W, felt, state, memory):
 @njit(cache=True)
 def _perceived_force(task, person, felt, memory):
     error = person[_WEBER] * _random_number(person, int(memory[_NEXT_TIME] / PERIOD), 3)
-    return (1.0 + error) * _pressed_force(task, person, felt)
+    return (1.0 + error) * _contact_force_along_axis(task, person, felt)
 
 
 @njit(cache=True)
@@ -339,16 +339,16 @@ def _control_force(task, person, step, time, felt, state, memory):
     error = abs(task[_FORCE] - force)
     met = _is_met(memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE])
     if met and time - memory[_MET_SINCE] >= task[_DWELL]:
-        _finish(state, memory, time, 1.0)
+        _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_TIME]:
         move = _press_displacement(task, memory, force)
-        duration = _submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
+        duration = _plan_submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
         memory[_NEXT_TIME] = time + duration + person[_FORCE_WAIT]
 
 
 @njit(cache=True)
-def _sideways_into(task, person, felt, out):
-    along, size = _pressed_force(task, person, felt), 0.0
+def _lateral_force_into(task, person, felt, out):
+    along, size = _contact_force_along_axis(task, person, felt), 0.0
     for i in range(3):
         out[i] = along * task[_AXIS + i]
         for k in range(3):
@@ -361,8 +361,8 @@ def _sideways_into(task, person, felt, out):
 @njit(cache=True)
 def _is_stuck(task, person, felt):
     limit = _STUCK_SHARE * task[_FORCE]
-    sideways = _sideways_into(task, person, felt, np.empty(3))
-    return _pressed_force(task, person, felt) >= limit or sideways >= limit
+    sideways = _lateral_force_into(task, person, felt, np.empty(3))
+    return _contact_force_along_axis(task, person, felt) >= limit or sideways >= limit
 
 
 @njit(cache=True)
@@ -376,7 +376,7 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         _enter_phase(state, memory, STOPPING, time)
         return
     move, push = np.empty(3), _press_displacement(task, memory, force)
-    sideways = _sideways_into(task, person, felt, move)
+    sideways = _lateral_force_into(task, person, felt, move)
     if sideways >= state[LIMIT] / person[_FORCE_GAIN]:
         share = min(1.0 / _YIELD_STIFFNESS, _MAX_YIELD_M / sideways)
         for i in range(3):
@@ -392,5 +392,5 @@ def _search_slot(task, person, step, time, seen_W, felt, state, memory):
         move[2] = 0.0
     for i in range(3):
         move[i] += push * task[_AXIS + i]
-    duration = _submovement(person, memory, step, time, move)
+    duration = _plan_submovement(person, memory, step, time, move)
     memory[_NEXT_TIME] = time + duration + person[_FORCE_WAIT]

@@ -16,7 +16,7 @@ STOP = 0.15  # s, stopping time of the hand, estimate
 
 
 @njit(cache=True)
-def plan_at(plan, time, i):
+def evaluate_plan(plan, time, i):
     """Return position [m], speed and acceleration of axis `i` in a plan (20,) at `time` [s]."""
     h = plan[1]
     u = min((time - plan[0]) / h, 1.0)
@@ -35,7 +35,7 @@ def add_plan_into(memory, time, pose, twist):
     """Add the plan's displacement and velocity at `time` [s] to a pose (7,) and twist (6,)."""
     plan = memory[PLAN : PLAN + PLAN_SIZE]
     for i in range(3):
-        x, v, _ = plan_at(plan, time, i)
+        x, v, _ = evaluate_plan(plan, time, i)
         pose[4 + i] += x
         twist[i] += v
 
@@ -49,7 +49,7 @@ def plan_move(memory, time, length, change, end_speed):
     """
     plan, h = memory[PLAN : PLAN + PLAN_SIZE], length
     for i in range(3):
-        x, v, a = plan_at(plan, time, i)
+        x, v, a = evaluate_plan(plan, time, i)
         v, a, w, d = v * h, a * h * h, end_speed[i] * h, change[i]
         c = plan[2 + 6 * i : 8 + 6 * i]
         c[0], c[1], c[2] = x, v, 0.5 * a
@@ -64,5 +64,5 @@ def plan_stop(memory, time):
     """Plan a stop of the hand within `STOP` seconds."""
     plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
     for i in range(3):
-        change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]
+        change[i] = 0.5 * STOP * evaluate_plan(plan, time, i)[1]
     plan_move(memory, time, STOP, change, np.zeros(3))

@@ -237,7 +237,7 @@ def _perceive_and_decide(
         displacement[i] = p_WS[i] - tip[3 + i]
         for k in range(3):
             displacement[i] += R_WS[i, k] * tip[k]
-    decision.look_into(
+    decision.observe_tool_into(
         person, step, displacement, seen_displacements[step % seen_displacements.shape[0]]
     )
     # Before contact is expected, only the expectation is updated.
@@ -258,10 +258,10 @@ def _perceive_and_decide(
         seen_displacements[(step + 1) % seen_displacements.shape[0]],
         perceived_forces[(step + 1) % perceived_forces.shape[0]],
     )
-    decision.decide(task, person, time, seen, felt, task_state, memory)
+    decision.update_decision(task, person, time, seen, felt, task_state, memory)
 
 
-def _ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
+def _make_ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.tile(start, (round(delay / decision.PERIOD) + 1, 1))
 
 
@@ -334,10 +334,10 @@ class Operator(LeafSystem):
     ) -> DependencyTicket:
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
-        self._seen_displacements = _ring_buffer(
+        self._seen_displacements = _make_ring_buffer(
             senses.vision_delay + training.backward, np.zeros(3)
         )
-        self._perceived_forces = _ring_buffer(senses.reaction_time, nothing_felt)
+        self._perceived_forces = _make_ring_buffer(senses.reaction_time, nothing_felt)
         self._task_parameters = (
             decision.pack_task(task),
             decision.pack_person(training, senses, config.movement),

@@ -14,7 +14,7 @@ _RIDGE = 0.05
 
 
 @njit(cache=True)
-def update_fit(sums, force_change, displacement, speed_change, keep):
+def update_contact_fit(sums, force_change, displacement, speed_change, keep):
     """Add one displacement [m] to the fit; return stiffness [N/m] and damping [N s/m].
 
     `sums` (NUM_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
@@ -35,7 +35,7 @@ def update_fit(sums, force_change, displacement, speed_change, keep):
 
 
 @njit(cache=True)
-def smooth_slip(displayed, component, explained, share, max_slip):
+def remove_slip_steps(displayed, component, explained, share, max_slip):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
     `component` [N] is the measured force. Its changes that depth and speed explain (`explained`)
@@ -47,7 +47,7 @@ def smooth_slip(displayed, component, explained, share, max_slip):
 
 
 @njit(cache=True)
-def slip_change(force_change, largest_change, max_slip):
+def force_change_by_slip(force_change, largest_change, max_slip):
     """Return the part of a force change [N] that a slip may cause, at most `max_slip`.
 
     `largest_change` [N] is the change that the largest stiffness would cause.

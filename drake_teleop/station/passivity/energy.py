@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.passivity.memory import LEDGER, LOST, MEMORY, RECEIVED, SENT
-from drake_teleop.station.passivity.packet import difference_into, dot
+from drake_teleop.station.passivity.memory import LEDGER, LOST, MEMORY_SIZE, RECEIVED, SENT
+from drake_teleop.station.passivity.packet import dot, pose_difference_into
 
 Array = NDArray[np.float64]
 
@@ -49,14 +49,14 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
 def _work_into(wrench, pose, share, work):
     dx, f = np.zeros(6), np.zeros(6)
     for k in range(1, len(wrench)):
-        difference_into(pose[k], pose[k - 1], dx)
+        pose_difference_into(pose[k], pose[k - 1], dx)
         for i in range(6):
             f[i] = wrench[k - 1, i] + share * (wrench[k, i] - wrench[k - 1, i])
         for g in range(2):
             work[k, g] = work[k - 1, g] + dot(f, dx, g)
 
 
-def created(energy: Array) -> Array:
+def created_energy(energy: Array) -> Array:
     """Return the energy created up to each sample: the running maximum of max(0, -energy) [J].
 
     `energy` (N, ...) is the net energy that flowed into an element without initial energy [J].
@@ -65,7 +65,7 @@ def created(energy: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Ledger:
+class EnergyBalance:
     """Energy balance of a passivity method at one end of the channel, each (..., 2) [J].
 
     Attributes:
@@ -80,21 +80,21 @@ class Ledger:
     lost: Array
 
 
-def ledger(memory: Array) -> Ledger:
+def energy_balance(memory: Array) -> EnergyBalance:
     """Return the energy balance of one end's memory (..., MEMORY), 0 for methods without one.
 
     A wrong shape raises a DrakeTeleopError.
     """
-    if memory.shape[-1] != MEMORY:
+    if memory.shape[-1] != MEMORY_SIZE:
         raise DrakeTeleopError(
-            f"has the shape {memory.shape}", where="memory", remedy=f"give (..., {MEMORY})"
+            f"has the shape {memory.shape}", where="memory", remedy=f"give (..., {MEMORY_SIZE})"
         )
     stored, received, sent, lost = (
         memory[..., places].copy() for places in (LEDGER, RECEIVED, SENT, LOST)
     )
-    return Ledger(stored, received, sent, lost)
+    return EnergyBalance(stored, received, sent, lost)
 
 
-def in_flight(master: Ledger, slave: Ledger) -> Array:
+def energy_in_flight(master: EnergyBalance, slave: EnergyBalance) -> Array:
     """Return the energy (..., 2) that was sent and has not arrived, sum of both directions [J]."""
     return (master.sent - slave.received) + (slave.sent - master.received)

@@ -26,11 +26,11 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
-    arrived,
-    difference_into,
-    fill,
+    fill_packet,
+    has_arrived,
     limit,
-    moved_into,
+    moved_pose_into,
+    pose_difference_into,
 )
 
 # Parameters; pairs are for translation and rotation.
@@ -80,9 +80,9 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     """Compute the rendered wrench and the packet, which contains the hand's measured wrench."""
     difference = memory[_DIFFERENCE]
     difference[:] = 0.0
-    connected = arrived(received)
+    connected = has_arrived(received)
     if connected:
-        difference_into(received[POSE], pose, difference)
+        pose_difference_into(received[POSE], pose, difference)
     for i in range(6):
         g = i // 3
         wrench[i] = (1.0 + p[_HAND_FEEDBACK]) * received[WRENCH][i] + p[_HAND_FEEDBACK] * hand[i]
@@ -92,12 +92,12 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     for g in range(2):
         limit(wrench, g, limits[g])
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, hand, packet)
+    fill_packet(pose, twist, hand, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    if arrived(received):
+    if has_arrived(received):
         shift = memory[_DIFFERENCE]
         for i in range(6):
             g = i // 3
@@ -105,8 +105,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
                 i
             ]
             shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
-        moved_into(received[POSE], shift, memory[COMMAND_POSE])
+        moved_pose_into(received[POSE], shift, memory[COMMAND_POSE])
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)

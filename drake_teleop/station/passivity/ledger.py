@@ -20,28 +20,28 @@ from drake_teleop.station.passivity.ledger_slave import (
     CONTACT_STIFFNESS,
     CONTACT_THRESHOLD,
     DRAG,
-    ECHO,
     IN_CONTACT,
     INITIAL,
     LEDGER_LEVEL,
-    MARGIN,
     MASS_FACTOR,
     MASTER_RESERVE,
     MEAN_WRENCH,
     METRIC,
+    NEWEST_SLAVE_PACKET,
     NORMAL,
     OWN_VELOCITY,
+    RESERVE_MARGIN,
     ROUND_TRIP,
     SERVO_MODEL,
     SHARED_RESERVE,
     SLAVE_RESERVE,
     TORQUE_PER_FORCE,
-    component_along,
-    find_direction,
-    is_contact,
-    receive,
-    smooth_velocity,
+    filter_velocity,
+    is_in_contact,
+    receive_energy,
+    update_contact_direction,
     work_along,
+    wrench_component_along,
 )
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
@@ -55,16 +55,16 @@ from drake_teleop.station.passivity.packet import (
     ENERGY,
     LOAD,
     MAX_WRENCH_RATE,
+    PACKET_NUMBER,
     POSE,
-    SEQUENCE,
     VELOCITY,
     WRENCH,
-    arrived,
-    difference_into,
     dot,
-    fill,
+    fill_packet,
+    has_arrived,
     length,
     limit,
+    pose_difference_into,
     scale,
 )
 
@@ -78,20 +78,20 @@ _FRICTION_MEMORY_S = 1.0
 _FRICTION_LAG_S, _SLIP_SPEED = 0.1, 1e-3
 _TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS = 0.6, 30.0
 _TORQUE_STIFFNESS_FACTOR, _MAX_CONE = 4.0, 1.0
-_LEAST_METRIC = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
+_MIN_WRENCH_NORM_WEIGHT = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
 _MAX_PREDICTION_N = 3.0
 _MAX_REMEMBERED_N = 10.0
 _SAME_WALL_M, _SAME_WALL_COSINE = 5e-3, 0.7
 _REMOVED_DEPTH_M, _REMOVED_FORCE_N, _REMOVED_MIN_DEPTH_M = 3e-3, 1.0, 1e-3
-_UNMET_DEPTH_M, _UNMET_IMPULSE_NS = 0.3e-3, 0.03
+_NO_CONTACT_DEPTH_M, _NO_CONTACT_IMPULSE_NS = 0.3e-3, 0.03
 _FORWARD_LEVEL = 0.5  # of the master's reserve
-_LEAST_LEVEL = 0.05  # of the master's reserve
+_MIN_LEVEL = 0.05  # of the master's reserve
 _DRAIN_RATE = 50.0  # 1/s
 _RELEASE_M = 0.03
 _RECOVERY_S = 0.1
 _HAND_ACCELERATION = 5.0  # m/s^2
 _DRAG_SPEED = 0.02  # m/s
-_REST_S = 0.1
+_HAND_REST_S = 0.1
 _LOW_LEVEL, _FULL_LEVEL = 1.0 - SHARED_RESERVE, 1.0 - 1e-9  # of a reserve, the latter for rounding
 _BRAKE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
@@ -100,12 +100,12 @@ _places = own_memory()
 _places.vector(NORMAL.stop - OWN_VELOCITY.start)
 # Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
-_OFFSET, _INWARD = _places.vector(6), _places.vector(6)
-_WALL_STIFFNESS, _WALL_DEPTH, _UNMET_IMPULSE = _places.number(), _places.number(), _places.number()
+_OFFSET, _WALL_DIRECTION = _places.vector(6), _places.vector(6)
+_WALL_STIFFNESS, _WALL_DEPTH, _LOST_IMPULSE = _places.number(), _places.number(), _places.number()
 # Modelled friction at the motion of the hand and of the slave; measured minus modelled friction.
 _FRICTION_AT_HAND, _FRICTION_AT_SLAVE = _places.vector(6), _places.vector(6)
 _FRICTION_REST, _FRICTION_CONE = _places.vector(6), _places.vector(2)
-_RETREAT = _places.number()  # of the hand out of the wall since its last rest
+_RETREAT_DISTANCE = _places.number()  # of the hand out of the wall since its last rest
 _LAST_SLAVE_POSE, _SLAVE_STEP = _places.vector(7), _places.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
 _WORK_ON_HAND, _WITHHELD_SHARE = _places.vector(2), _places.vector(2)
@@ -160,50 +160,50 @@ def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
     memory[SERVO_MODEL] = memory[COMMAND_POSE]
 
 
-def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
+def max_slave_speed(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the largest speed (2,) of the slave that its energy reserve permits [m/s, rad/s].
 
     `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
-    left = (1.0 - MARGIN) * np.asarray(config.reserve)
+    left = (1.0 - RESERVE_MARGIN) * np.asarray(config.reserve)
     return np.sqrt(2.0 * left / (MASS_FACTOR * mass))
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     velocity, offset_to_slave = memory[OWN_VELOCITY], wrench  # overwritten below
-    smooth_velocity(twist, min(T / _VELOCITY_FILTER_S, 1.0), memory)
-    memory[_WALL_DEPTH] += work_along(memory[_INWARD], dx)
+    filter_velocity(twist, min(T / _VELOCITY_FILTER_S, 1.0), memory)
+    memory[_WALL_DEPTH] += work_along(memory[_WALL_DIRECTION], dx)
     inside = memory[_WALL_STIFFNESS] > 0.0 and memory[_WALL_DEPTH] > 0.0
     for g in range(2):
         _update_hand_ledger(g, dx, inside or memory[IN_CONTACT] > 0.0, p, memory)
-        receive(g, received, memory)
+        receive_energy(g, received, memory)
     offset_to_slave[:] = 0.0
-    if arrived(received):
-        difference_into(pose, received[POSE], offset_to_slave)
+    if has_arrived(received):
+        pose_difference_into(pose, received[POSE], offset_to_slave)
     _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench)
     for i in range(6):
         wrench[i] += received[LOAD][i]
-    newest = received[SEQUENCE]
+    newest = received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET] + 1.0:
         memory[_CROSS_FADING] = 1.0
     memory[_NEWEST_PACKET] = newest
     for g in range(2):
         _cross_fade(g, T, p, memory, wrench)
         limit(wrench, g, limits[g])
-        _limit_to_ledger(g, dx, T, p, memory, wrench)
+        _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
         level = p[MASTER_RESERVE][g]
         if memory[IN_CONTACT] > 0.0:
             level += SHARED_RESERVE * p[SLAVE_RESERVE][g]
         surplus = max(memory[LEDGER][g] - level, 0.0)
         memory[SENT][g] += surplus
         memory[LEDGER][g] -= surplus
-        _add_drag(g, received, dx, T, p, memory, wrench)
+        _add_drag_force(g, received, dx, T, p, memory, wrench)
         limit(wrench, g, limits[g])
         packet[ENERGY][g], packet[LEDGER_LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, velocity, wrench, packet)
-    packet[ECHO] = received[SEQUENCE]
+    fill_packet(pose, velocity, wrench, packet)
+    packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
 
 
 @njit(cache=True)
@@ -222,37 +222,37 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
-    contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
+    contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_WALL_DIRECTION]
     k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_STIFFNESS)
-    if not is_contact(contact_wrench, p):
+    if not is_in_contact(contact_wrench, p):
         if memory[IN_CONTACT] > 0.0:
             memory[_CROSS_FADING][:] = 1.0
         memory[IN_CONTACT] = 0.0
         removal_depth = _REMOVED_FORCE_N / max(memory[_WALL_STIFFNESS], 1.0)
         removal_depth = min(_REMOVED_DEPTH_M, max(removal_depth, _REMOVED_MIN_DEPTH_M))
         slave_depth = memory[_WALL_DEPTH] - work_along(inward, offset_to_slave)
-        memory[_UNMET_IMPULSE] += T * memory[_WALL_STIFFNESS] * (slave_depth - _UNMET_DEPTH_M)
-        if slave_depth <= _UNMET_DEPTH_M:
-            memory[_UNMET_IMPULSE] = 0.0
+        memory[_LOST_IMPULSE] += T * memory[_WALL_STIFFNESS] * (slave_depth - _NO_CONTACT_DEPTH_M)
+        if slave_depth <= _NO_CONTACT_DEPTH_M:
+            memory[_LOST_IMPULSE] = 0.0
         if memory[_WALL_STIFFNESS] > 0.0 and received[CONTACT_STIFFNESS] == 0.0:
             memory[_WALL_STIFFNESS] = 0.0
             memory[_CROSS_FADING][:] = memory[_WORK_ON_HAND][:] = 0.0
-        if slave_depth > removal_depth or memory[_UNMET_IMPULSE] > _UNMET_IMPULSE_NS:
+        if slave_depth > removal_depth or memory[_LOST_IMPULSE] > _NO_CONTACT_IMPULSE_NS:
             memory[_WALL_STIFFNESS] = 0.0
         inside = min(memory[_WALL_STIFFNESS] * max(memory[_WALL_DEPTH], 0.0), _MAX_REMEMBERED_N)
         for i in range(6):
             wrench[i] = -inside * inward[i]
         return
-    memory[_UNMET_IMPULSE] = 0.0
+    memory[_LOST_IMPULSE] = 0.0
     offset, onset = memory[_OFFSET], memory[IN_CONTACT] == 0.0
-    if onset or not component_along(contact_wrench, memory[MEAN_WRENCH], p) > 0.0:
+    if onset or not wrench_component_along(contact_wrench, memory[MEAN_WRENCH], p) > 0.0:
         memory[_CROSS_FADING][:] = 1.0
-    size = find_direction(contact_wrench, received[ROUND_TRIP], T, p, memory)
+    size = update_contact_direction(contact_wrench, received[ROUND_TRIP], T, p, memory)
     damper, speed = received[CONTACT_DAMPING], work_along(normal, received[VELOCITY])
     depth = max(size + damper * speed, 0.0) / max(k, _MIN_STIFFNESS)
     depth -= work_along(normal, offset_to_slave)
     if onset:
-        aligned = -component_along(normal, inward, p) > _SAME_WALL_COSINE
+        aligned = -wrench_component_along(normal, inward, p) > _SAME_WALL_COSINE
         same = memory[_WALL_STIFFNESS] > 0.0 and aligned
         near = abs(depth - memory[_WALL_DEPTH]) < _SAME_WALL_M
         if same and (near or memory[_WALL_DEPTH] < 0.0):
@@ -261,7 +261,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
             put(offset, 0, offset_to_slave, 0, 6)
         memory[IN_CONTACT] = 1.0
         memory[_FRICTION_CONE][:] = 0.0
-        memory[_RETREAT] = 0.0
+        memory[_RETREAT_DISTANCE] = 0.0
         for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
             memory[friction] = 0.0
         put(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
@@ -276,13 +276,13 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         change = k * penetration + damper * (hand_speed - speed)
         force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTION_N)
     # A hand that was let go moves out of a soft wall without end, so its force fades.
-    retreat = max(memory[_RETREAT] + work_along(normal, dx), 0.0)
+    retreat = max(memory[_RETREAT_DISTANCE] + work_along(normal, dx), 0.0)
     if abs(hand_speed) < _DRAG_SPEED:
-        retreat *= 1.0 - min(T / _REST_S, 1.0)
-    memory[_RETREAT] = retreat
+        retreat *= 1.0 - min(T / _HAND_REST_S, 1.0)
+    memory[_RETREAT_DISTANCE] = retreat
     force *= min(max(3.0 * (1.0 - retreat / _RELEASE_M), 0.0), 1.0)
     _find_slave_step(received, memory)
-    _add_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
+    _render_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
     if k > _MIN_STIFFNESS:
@@ -294,22 +294,25 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 @njit(cache=True)
 def _find_slave_step(received, memory):
     last = memory[_LAST_SLAVE_POSE]
-    difference_into(received[POSE], last, memory[_SLAVE_STEP])
+    pose_difference_into(received[POSE], last, memory[_SLAVE_STEP])
     put(last, 0, received, POSE.start, 7)
 
 
 @njit(cache=True)
-def _add_friction(T, size, force, received, dx, p, memory, wrench):
-    """Write the friction (6,) into `wrench`: model at the hand plus the model's error (T68)."""
+def _render_friction(T, size, force, received, dx, p, memory, wrench):
+    """Write the wall's friction, as rendered to the hand, into `wrench` (6,) (T68).
+
+    It is a model at the hand's motion, plus what the model misses at the slave, which arrives late.
+    """
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
     slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
     normal = memory[NORMAL]
     step, far_step = work_along(normal, dx), work_along(normal, slave_step)
     put(wrench, 0, received, WRENCH.start, 6)
-    _remove_normal(wrench, p, memory)
+    _remove_normal_component(wrench, p, memory)
     decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
     for g in range(2):
-        metric = max(p[METRIC][g], _LEAST_METRIC)
+        metric = max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_CONE / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length(wrench, g) / size, largest))
         lag = max(cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED), _FRICTION_LAG_S)
@@ -322,14 +325,14 @@ def _add_friction(T, size, force, received, dx, p, memory, wrench):
             near[i] -= spring * (dx[i] - step * inward) + share * near[i]
             rest[i] += share * (wrench[i] - far[i] - rest[i])
     for friction in (near, far, rest):
-        _remove_normal(friction, p, memory)
+        _remove_normal_component(friction, p, memory)
     for g in range(2):
         limit(far, g, cone[g] * size)
         limit(near, g, cone[g] * force)
         for i in range(3 * g, 3 * g + 3):
-            across = dx[i] - step * max(p[METRIC][g], _LEAST_METRIC) * normal[i]
+            across = dx[i] - step * max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT) * normal[i]
             wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
-    _remove_normal(wrench, p, memory)
+    _remove_normal_component(wrench, p, memory)
     for g in range(2):
         limit(wrench, g, cone[g] * force)
 
@@ -338,13 +341,13 @@ def _add_friction(T, size, force, received, dx, p, memory, wrench):
 def _friction_stiffness(g, p):
     """Return k_h of (T68) for translation [N/m] or rotation [N m/rad]."""
     factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
-    return factor * _MAX_STIFFNESS / max(p[METRIC][g], _LEAST_METRIC)
+    return factor * _MAX_STIFFNESS / max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
 
 
 @njit(cache=True)
-def _remove_normal(wrench, p, memory):
+def _remove_normal_component(wrench, p, memory):
     normal = memory[NORMAL]
-    component = component_along(wrench, normal, p)
+    component = wrench_component_along(wrench, normal, p)
     for i in range(6):
         wrench[i] -= component * normal[i]
 
@@ -365,7 +368,7 @@ def _cross_fade(g, T, p, memory, wrench):
 
 
 @njit(cache=True)
-def _limit_to_ledger(g, dx, T, p, memory, wrench):
+def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
     size, cost = length(wrench, g), 0.0
     if size > 0.0:
         displacement = dot(wrench, memory[OWN_VELOCITY], g) / size * T
@@ -373,21 +376,21 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
         if displacement >= 0.0:
             cost += size * _HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
     most = min(T * _DRAIN_RATE, 1.0) * max(
-        memory[LEDGER][g] - _LEAST_LEVEL * p[MASTER_RESERVE][g], 0.0
+        memory[LEDGER][g] - _MIN_LEVEL * p[MASTER_RESERVE][g], 0.0
     )
     share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _RECOVERY_S)
     if share * cost > most:
         share = most / cost
     memory[_WITHHELD_SHARE][g] = 1.0 - share
     if not cost > 0.0:
-        share *= _opposing_share(g, dx, T, p, memory)
+        share *= _permitted_opposing_share(g, dx, T, p, memory)
     scale(wrench, g, share)
 
 
 @njit(cache=True)
-def _opposing_share(g, dx, T, p, memory):
+def _permitted_opposing_share(g, dx, T, p, memory):
     """Return the share, 0 to 1, of a wrench against the motion that the master's energy permits."""
-    if memory[LEDGER][g] >= _LEAST_LEVEL * p[MASTER_RESERVE][g]:
+    if memory[LEDGER][g] >= _MIN_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]
     along, speed = dot(velocity, dx, g), length(velocity, g)
@@ -395,7 +398,7 @@ def _opposing_share(g, dx, T, p, memory):
 
 
 @njit(cache=True)
-def _add_drag(g, received, dx, T, p, memory, wrench):
+def _add_drag_force(g, received, dx, T, p, memory, wrench):
     velocity, drag, active = memory[OWN_VELOCITY], 0.0, memory[_DRAG_ACTIVE]
     speed, master_level = length(velocity, g), memory[LEDGER][g] / p[MASTER_RESERVE][g]
     # Sent energy counts as arrived: its confirmation takes a round trip.
@@ -408,14 +411,14 @@ def _add_drag(g, received, dx, T, p, memory, wrench):
     if active[g] > 0.0:
         drag = p[DRAG][g]
     if speed < _DRAG_SPEED * ANGLE_PER_LENGTH[g]:
-        memory[_WORK_ON_HAND][g] *= 1.0 - min(T / _REST_S, 1.0)
+        memory[_WORK_ON_HAND][g] *= 1.0 - min(T / _HAND_REST_S, 1.0)
     if memory[_WORK_ON_HAND][g] > 0.0:
         excess = speed / ANGLE_PER_LENGTH[g] - _NO_BRAKE_SPEED
         share = excess / (_FULL_BRAKE_SPEED - _NO_BRAKE_SPEED)
         drag = max(drag, _BRAKE_N * TORQUE_PER_FORCE[g] * min(share, 1.0))
-    drag *= _opposing_share(g, dx, T, p, memory)
+    drag *= _permitted_opposing_share(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= drag * velocity[i] / max(speed, _DRAG_SPEED * ANGLE_PER_LENGTH[g])
 
 
-slave_step, command_sent = ledger_slave.slave_step, ledger_slave.command_sent
+slave_step, record_command = ledger_slave.slave_step, ledger_slave.record_command

@@ -8,9 +8,9 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.contact_fit import (
     NUM_SUMS,
-    slip_change,
-    smooth_slip,
-    update_fit,
+    force_change_by_slip,
+    remove_slip_steps,
+    update_contact_fit,
 )
 from drake_teleop.station.passivity.memory import (
     COMMAND,
@@ -37,25 +37,25 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
-    arrived,
-    difference_into,
+    credit_new_energy,
     dot,
-    fill,
+    fill_packet,
+    has_arrived,
     length,
     limit,
-    moved_into,
-    new_energy,
+    moved_pose_into,
+    pose_difference_into,
     scale,
 )
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
 #: For translation and rotation: angle that equals a unit length, torque that equals a unit force.
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
-MARGIN = 0.03  #: share of the slave's reserve that is never used
+RESERVE_MARGIN = 0.03  #: share of the slave's reserve that is never used
 SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold in contact
 _MIN_KEPT_RESERVE = 0.05
 _STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
-_CAPACITY = 4.0  # over the reserve
+_ENERGY_CAPACITY = 4.0  # over the reserve
 _FILTER_S = 3e-3
 _REST_SPEED = 0.05  # m/s
 _REST_SEND_RATE, _SEND_RATE = 5.0, 50.0  # 1/s
@@ -73,7 +73,7 @@ _GAIN_RISE_S, _MIN_GAIN, _MAX_GAIN, _GAIN_FALL_S = 0.5, 0.1, 10.0, 1.0
 _COMMAND_FILTER_S, _MAX_ACCELERATION, _BRAKING_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
 _FEEDFORWARD_S = 0.02
 _SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
-_HORIZON_S = 4e-3
+_STOP_HORIZON_S = 4e-3
 _FREE_FORCE_N = 5.0
 _STANDSTILL_SPEED, _DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
@@ -81,7 +81,7 @@ _STANDSTILL_SPEED, _DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 # ledger. Of the master's packet: number of the newest packet from the slave.
 CONTACT_STIFFNESS, CONTACT_DAMPING, ROUND_TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
 LEDGER_LEVEL = OTHER_ENERGY
-ECHO = INTEGRAL.stop - 1
+NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
 _places = own_parameters()
@@ -111,7 +111,7 @@ _DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(
 
 
 @njit(cache=True)
-def smooth_velocity(twist, share, memory):
+def filter_velocity(twist, share, memory):
     """Low-pass the velocity in `memory`; `share` is the weight of the new `twist`."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
@@ -119,13 +119,13 @@ def smooth_velocity(twist, share, memory):
 
 
 @njit(cache=True)
-def is_contact(wrench, p):
+def is_in_contact(wrench, p):
     threshold = p[CONTACT_THRESHOLD]
     return length(wrench, 0) > threshold[0] or length(wrench, 1) > threshold[1]
 
 
 @njit(cache=True)
-def component_along(a, b, p):
+def wrench_component_along(a, b, p):
     """Return the component of the wrench `a` (6,) along the unit wrench `b` (6,) [N]."""
     return p[METRIC][0] * dot(a, b, 0) + p[METRIC][1] * dot(a, b, 1)
 
@@ -137,7 +137,7 @@ def work_along(wrench, displacement):
 
 
 @njit(cache=True)
-def find_direction(wrench, round_trip, T, p, memory):
+def update_contact_direction(wrench, round_trip, T, p, memory):
     """Update the contact's mean direction; return the component of `wrench` (6,) along it [N].
 
     The direction is a unit wrench. A much larger or opposite wrench replaces the mean at once.
@@ -146,23 +146,23 @@ def find_direction(wrench, round_trip, T, p, memory):
     rate = 1.0
     if memory[IN_CONTACT] > 0.0:
         # A wrench far above the mean, which may be noise, replaces it at once.
-        square = max(component_along(wrench, wrench, p), 1e-300)
-        jump = 1.0 - 3.0 * math.sqrt(component_along(mean, mean, p) / square)
+        square = max(wrench_component_along(wrench, wrench, p), 1e-300)
+        jump = 1.0 - 3.0 * math.sqrt(wrench_component_along(mean, mean, p) / square)
         rate = max(min(T / max(_DIRECTION_FILTER_S, 2.0 * round_trip), 1.0), jump)
-        if not component_along(wrench, mean, p) > 0.0:  # another contact
+        if not wrench_component_along(wrench, mean, p) > 0.0:  # another contact
             rate = 1.0
     for i in range(6):
         mean[i] += rate * (wrench[i] - mean[i])
-    size = max(math.sqrt(component_along(mean, mean, p)), 1e-12)
+    size = max(math.sqrt(wrench_component_along(mean, mean, p)), 1e-12)
     for i in range(6):
         normal[i] = mean[i] / size
-    return component_along(wrench, normal, p)
+    return wrench_component_along(wrench, normal, p)
 
 
 @njit(cache=True)
-def receive(g, received, memory):
+def receive_energy(g, received, memory):
     """Add newly received energy to this end's balance for group `g`; return it [J]."""
-    new = new_energy(g, received, memory)
+    new = credit_new_energy(g, received, memory)
     memory[LEDGER][g] += new
     return new
 
@@ -170,19 +170,19 @@ def receive(g, received, memory):
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
-    connected = arrived(received)
+    connected = has_arrived(received)
     memory[_PERIOD] = T
     memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
     silence = memory[_SILENCE] if connected else 0.0
     kept = 1.0 - T / _MAXIMUM_DECAY_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
-    trip = max((memory[STEPS] - received[ECHO]) * T, 0.0) if connected else 0.0
+    trip = max((memory[STEPS] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
-    smooth_velocity(twist, min(T / _FILTER_S, 1.0), memory)
+    filter_velocity(twist, min(T / _FILTER_S, 1.0), memory)
     contact, load, filtered_load = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_LOAD]
     for i in range(6):
         contact[i] = wrench[i] - load[i]
-    in_contact = is_contact(contact, p)
+    in_contact = is_in_contact(contact, p)
     delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)
     share = min(T / delay, 1.0) if memory[STEPS] > 0.0 else 1.0
     for i in range(6):
@@ -193,18 +193,18 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
-        difference_into(received[POSE], now, error)
-    difference_into(now, pose, memory[_MOTOR_WRENCH])
+        pose_difference_into(received[POSE], now, error)
+    pose_difference_into(now, pose, memory[_MOTOR_WRENCH])
     _generate_command(received, connected, T, p, memory, error)
     for i in range(6):
         error[i] = T * velocity[i]
-    moved_into(now, error, now)
+    moved_pose_into(now, error, now)
     _limit_motor_energy(now, pose, twist, p, memory)
     _step_servo_model(received, connected, T, p, memory, error)
     put(command, 0, memory, COMMAND.start, 13)
-    fill(memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST], contact, packet)
+    fill_packet(memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST], contact, packet)
     if memory[IN_CONTACT] > 0.0:
-        correction = memory[_DISPLAYED_FORCE] - component_along(contact, memory[NORMAL], p)
+        correction = memory[_DISPLAYED_FORCE] - wrench_component_along(contact, memory[NORMAL], p)
         for i in range(6):
             packet[WRENCH][i] += correction * memory[NORMAL][i]
     put(packet, LOAD.start, filtered_load, 0, 6)
@@ -223,7 +223,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot(wrench, dx, g), dot(memory[HELD_WRENCH], dx, g))
-    new = receive(g, received, memory)
+    new = receive_energy(g, received, memory)
     ledger, input_energy, reserve = memory[LEDGER], memory[_CONTACT_INPUT], p[SLAVE_RESERVE][g]
     ledger[g] += work
     input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
@@ -239,7 +239,7 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
         returned = min(free - _MIN_KEPT_RESERVE * reserve, missing)
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
-    lost = max(ledger[g] - returned - _CAPACITY * reserve, 0.0)
+    lost = max(ledger[g] - returned - _ENERGY_CAPACITY * reserve, 0.0)
     memory[SENT][g] += returned
     memory[LOST][g] += lost
     ledger[g] -= returned + lost
@@ -280,11 +280,11 @@ def _max_displayed_stiffness(received, T, p, memory):
 def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     normal, k, velocity = memory[NORMAL], memory[_CONTACT_STIFFNESS], memory[OWN_VELOCITY]
     if not in_contact:
-        if memory[IN_CONTACT] > 0.0 and _wall_is_removed(dx, memory):
+        if memory[IN_CONTACT] > 0.0 and _is_wall_removed(dx, memory):
             memory[_DISPLAYED_SHARE] = 0.0
         memory[IN_CONTACT] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION] = 0.0
         return
-    size = find_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
+    size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _max_displayed_stiffness(received, T, p, memory)
     max_slip = _max_slip_change(wrench, size, T, p, memory)
     inward, rate = -work_along(normal, dx), min(T / _FILTER_S, 1.0)
@@ -308,9 +308,11 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
         speed_change = speed - memory[_STRETCH_SPEED]
         stretch, damping = memory[_STRETCH_LENGTH], memory[_CONTACT_DAMPING]
         change = memory[_FILTERED_FORCE] - memory[_STRETCH_FORCE] - damping * speed_change
-        change -= slip_change(change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_slip)
+        change -= force_change_by_slip(
+            change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_slip
+        )
         change += damping * speed_change
-        k, damping = update_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
+        k, damping = update_contact_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
         memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
         memory[_STRETCH_LENGTH], memory[_STRETCH_FORCE] = 0.0, memory[_FILTERED_FORCE]
         memory[_STRETCH_SPEED] = speed
@@ -327,13 +329,13 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     explained = memory[_CONTACT_STIFFNESS] * inward
     explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_SPEED])
     rate = T / _SLIP_FADE_S + abs(inward) / _MIN_FIT_M
-    shown = smooth_slip(memory[_DISPLAYED_FORCE], size, explained, rate, max_slip)
+    shown = remove_slip_steps(memory[_DISPLAYED_FORCE], size, explained, rate, max_slip)
     memory[_DISPLAYED_FORCE] = shown
     memory[_LAST_SPEED] = speed
 
 
 @njit(cache=True)
-def _wall_is_removed(dx, memory):
+def _is_wall_removed(dx, memory):
     normal = memory[NORMAL]
     speed_change = work_along(normal, memory[OWN_VELOCITY]) + memory[_LAST_SPEED]
     explained = abs(memory[_CONTACT_STIFFNESS] * work_along(normal, dx))
@@ -344,8 +346,8 @@ def _wall_is_removed(dx, memory):
 @njit(cache=True)
 def _max_slip_change(wrench, size, T, p, memory):
     mean_wrench = memory[MEAN_WRENCH]
-    mean = max(math.sqrt(component_along(mean_wrench, mean_wrench, p)), 1e-12)
-    friction = math.sqrt(max(component_along(wrench, wrench, p) - size * size, 0.0))
+    mean = max(math.sqrt(wrench_component_along(mean_wrench, mean_wrench, p)), 1e-12)
+    friction = math.sqrt(max(wrench_component_along(wrench, wrench, p) - size * size, 0.0))
     largest = max(memory[_MAX_FRICTION] * (1.0 - min(T / _FRICTION_MEMORY_S, 1.0)), friction)
     memory[_MAX_FRICTION] = largest
     return largest * min(largest / mean, 1.0)
@@ -372,7 +374,7 @@ def _generate_command(received, connected, T, p, memory, error):
             error[i] *= rate
             if feeds_forward:
                 error[i] += feed[i] + compliance * inward_speed * p[METRIC][g] * normal[i]
-        available = max(memory[LEDGER][g] - MARGIN * p[SLAVE_RESERVE][g], 0.0)
+        available = max(memory[LEDGER][g] - RESERVE_MARGIN * p[SLAVE_RESERVE][g], 0.0)
         limit(error, g, math.sqrt(2.0 * available / (MASS_FACTOR * p[MASS][g])))
         for i in range(3 * g, 3 * g + 3):
             error[i] -= velocity[i]
@@ -385,7 +387,7 @@ def _generate_command(received, connected, T, p, memory, error):
 def _limit_motor_energy(command, pose, twist, p, memory):
     """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
-    difference_into(command, pose, motor_wrench)
+    pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
         K, D = _STIFFNESS_FACTOR * p[STIFFNESS][g], _DAMPING_FACTOR * p[DAMPING][g]
         for i in range(3 * g, 3 * g + 3):
@@ -399,7 +401,7 @@ def _limit_motor_energy(command, pose, twist, p, memory):
         for i in range(3 * g, 3 * g + 3):
             motor_wrench[i] = (motor_wrench[i] + D * twist[i]) / K
     if changed:
-        moved_into(pose, motor_wrench, command)
+        moved_pose_into(pose, motor_wrench, command)
     return changed
 
 
@@ -409,10 +411,10 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     contact = memory[_CONTACT_WRENCH]
     size, speed, mass = length(motor_wrench, g), length(twist, g), MASS_FACTOR * p[MASS][g]
     stands = length(velocity, g) < _STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
-    margin, balance, changed = MARGIN * p[SLAVE_RESERVE][g], memory[_BALANCE][g], False
+    margin, balance, changed = RESERVE_MARGIN * p[SLAVE_RESERVE][g], memory[_BALANCE][g], False
     pushes = dot(motor_wrench, twist, g) > 0.0 or dot(motor_wrench, velocity, g) > 0.0
     pressed, available, permitted = length(contact, g), balance, 0.0
-    if is_contact(contact, p) and dot(motor_wrench, contact, g) < 0.0:
+    if is_in_contact(contact, p) and dot(motor_wrench, contact, g) < 0.0:
         free, k = (
             _FREE_FORCE_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
             memory[_CONTACT_STIFFNESS],
@@ -423,8 +425,8 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
             # Delayed motors gain a little energy at standstill; with an empty balance they yield.
             permitted = pressed * min(max(balance / margin, 0.0), 1.0)
     if not pushes:
-        permitted += mass * speed / _HORIZON_S  # stops without a rebound
-    reach = _HORIZON_S * (speed + memory[_PERIOD] * size / mass)
+        permitted += mass * speed / _STOP_HORIZON_S  # stops without a rebound
+    reach = _STOP_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
         scale(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True
@@ -443,16 +445,16 @@ def _step_servo_model(received, connected, T, p, memory, error):
     model, velocity = memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST]
     error[:] = 0.0
     if connected:
-        difference_into(received[POSE], model, error)
+        pose_difference_into(received[POSE], model, error)
     for i in range(6):
         stiff, damped = p[STIFFNESS][i // 3] / p[MASS][i // 3], p[DAMPING][i // 3] / p[MASS][i // 3]
         velocity[i] = (velocity[i] + T * stiff * error[i]) / (1.0 + T * damped + T * T * stiff)
         error[i] = T * velocity[i]
-    moved_into(model, error, model)
+    moved_pose_into(model, error, model)
 
 
 @njit(cache=True)
-def command_sent(requested, command, pose, twist, p, memory):
+def record_command(requested, command, pose, twist, p, memory):
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_motor_energy(command, pose, twist, p, memory):

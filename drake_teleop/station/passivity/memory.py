@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-MEMORY = 180  #: length of the memory vector of one end
-PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` fills
+MEMORY_SIZE = 180  #: length of the memory vector of one end
+NUM_PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` fills
 
 
 class Slots:
@@ -26,7 +26,7 @@ class Slots:
         return self.vector(self._size - self._next)
 
 
-_memory = Slots(MEMORY)
+_memory = Slots(MEMORY_SIZE)
 STEPS = _memory.number()  #: number of steps so far; also the number of the next packet
 LEDGER = _memory.vector(2)  #: energy that this end may still release, by group [J]
 RECEIVED = _memory.vector(2)  #: energy from the other end that is credited here [J]
@@ -39,11 +39,11 @@ COMMAND = _memory.vector(13)  #: slave's command since the last step: pose X_WS,
 FILL_TIME = _memory.number()
 HAND_VELOCITY = _memory.vector(6)  #: filtered twist at the master, see `retreat`
 PACKET = _memory.vector(38)  #: last sent packet, see `packet`
-_OWN = _memory.rest()
+_METHOD_MEMORY = _memory.rest()
 _command = Slots(COMMAND.stop, COMMAND.start)
 COMMAND_POSE, COMMAND_TWIST = _command.vector(7), _command.rest()
 
-_parameters = Slots(PARAMETERS)
+_parameters = Slots(NUM_PARAMETERS)
 #: Largest force and torque at the hand, in the master's power units [N, N m].
 LIMIT = _parameters.vector(2)
 #: K of the slave's servo, in the master's power units [N/m, N m/rad].
@@ -56,14 +56,14 @@ MASS = _parameters.vector(2)
 MOTION_SCALE = _parameters.vector(2)
 #: Speed of the hand along the wrench at which the wrench starts to fade, scaled to slave motion
 #: [m/s, rad/s].
-RETREAT = _parameters.vector(2)
-_METHOD = _parameters.rest()
+MAX_RETREAT = _parameters.vector(2)
+_METHOD_PARAMETERS = _parameters.rest()
 
 
 def own_memory() -> Slots:
     """Return an allocator for a method's own part of the memory, which starts with zeros."""
-    return Slots(MEMORY, _OWN.start)
+    return Slots(MEMORY_SIZE, _METHOD_MEMORY.start)
 
 
 def own_parameters() -> Slots:
-    return Slots(PARAMETERS, _METHOD.start)
+    return Slots(NUM_PARAMETERS, _METHOD_PARAMETERS.start)

@@ -48,15 +48,21 @@ from drake_teleop.station.passivity.memory import (
     DAMPING,
     LIMIT,
     MASS,
-    MEMORY,
+    MAX_RETREAT,
+    MEMORY_SIZE,
     MOTION_SCALE,
+    NUM_PARAMETERS,
     PACKET,
-    PARAMETERS,
-    RETREAT,
     STEPS,
     STIFFNESS,
 )
-from drake_teleop.station.passivity.packet import HEALTHY, PACKET_SIZE, POSE, SEQUENCE, finite
+from drake_teleop.station.passivity.packet import (
+    INPUTS_FINITE,
+    PACKET_NUMBER,
+    PACKET_SIZE,
+    POSE,
+    finite,
+)
 from drake_teleop.station.passivity.pspm import PspmConfig
 from drake_teleop.station.passivity.safe_state import retreat
 from drake_teleop.station.passivity.tdpa import TdpaConfig, charged
@@ -65,15 +71,15 @@ from drake_teleop.station.passivity.wave import WaveConfig
 
 
 @njit(cache=True)
-def _ignore_command(requested, command, pose, twist, p, memory):
-    """Substitute for `command_sent` in methods without one."""
+def _record_nothing(requested, command, pose, twist, p, memory):
+    """Substitute for `record_command` in methods without one."""
 
 
 class PassivityMethod(NamedTuple):
     """Both ends of a passivity method, and what it needs from the station.
 
     Attributes:
-        master_step, slave_step, command_sent: compiled functions with the arguments of those of
+        master_step, slave_step, record_command: compiled functions with the arguments of those of
             this module except `steps`.
         initialize: `initialize(p, memory)` of one channel end before its first step.
         config: settings dataclass of a registered method with `pack_into(p)`, or None.
@@ -85,7 +91,7 @@ class PassivityMethod(NamedTuple):
 
     master_step: Any
     slave_step: Any
-    command_sent: Any = _ignore_command
+    record_command: Any = _record_nothing
     initialize: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
     config: type[Any] | None = None
     balance_at_motors: bool = False
@@ -94,7 +100,7 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, NDArray[np.float64]], NDArray[np.float64]] | None = None
 
 
-_TDPA = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.command_sent)
+_TDPA = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
 METHODS = Registry(
     "passivity method",
     {
@@ -105,26 +111,26 @@ METHODS = Registry(
         "two_layer": PassivityMethod(
             two_layer.master_step,
             two_layer.slave_step,
-            two_layer.command_sent,
+            two_layer.record_command,
             two_layer.initialize,
             balance_at_motors=True,
         ),
         "pspm": PassivityMethod(
             pspm.master_step,
             pspm.slave_step,
-            pspm.command_sent,
+            pspm.record_command,
             pspm.initialize,
             balance_at_motors=True,
         ),
         "ledger": PassivityMethod(
             ledger.master_step,
             ledger_slave.slave_step,
-            ledger_slave.command_sent,
+            ledger_slave.record_command,
             ledger.initialize,
             balance_at_motors=True,
             needs_arm_mass=True,
             needs_load_apart=True,
-            speed_limit=ledger.fastest,
+            speed_limit=ledger.max_slave_speed,
         ),
         "four_channel": PassivityMethod(four_channel.master_step, four_channel.slave_step),
         "force_limit": PassivityMethod(force_limit.master_step, force_limit.slave_step),
@@ -202,9 +208,9 @@ class PassivityConfig(Methods, _CommonConfig):
 
     def check(self, where: str) -> None:
         METHODS.check(self.method, f"{where}.method")
-        self.of_method(where)
+        self.method_config(where)
 
-    def of_method(self, where: str = "passivity") -> Any:
+    def method_config(self, where: str = "passivity") -> Any:
         """Return the parameters of the selected method; None if it has none."""
         schema = METHODS[self.method].config
         if schema is None:
@@ -235,14 +241,16 @@ def parameters(
             torque: force scale over kinematic scale.
         motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
     """
-    p = np.zeros(PARAMETERS)
+    p = np.zeros(NUM_PARAMETERS)
     p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
     p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING] = np.multiply(config.servo_damping, power_scale)
     p[MASS] = np.multiply(config.slave_mass or _SLAVE_MASS, power_scale)
     p[MOTION_SCALE] = motion_scale
-    p[RETREAT] = np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
-    own = config.of_method()
+    p[MAX_RETREAT] = (
+        np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
+    )
+    own = config.method_config()
     if own is not None:
         own.pack_into(p)
     return p
@@ -256,7 +264,7 @@ def initial_memory(
     `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives.
     """
     own = METHODS[METHODS.check(method, "passivity.method")]
-    memory = np.zeros(MEMORY)
+    memory = np.zeros(MEMORY_SIZE)
     memory[COMMAND_POSE] = pose
     memory[PACKET][POSE] = pose
     if own.initialize is not None:
@@ -264,37 +272,37 @@ def initial_memory(
     return memory
 
 
-_ROW = types.Array(types.float64, 1, "C")
-_MASTER_ARGUMENTS = (_ROW, types.boolean, *[_ROW] * 5, types.float64, *[_ROW] * 4)
-_SLAVE_ARGUMENTS = (_ROW, types.boolean, *[_ROW] * 4, types.float64, *[_ROW] * 4)
-_SENT_ARGUMENTS = (_ROW,) * 6
-_master_step, _slave_step, _command_sent = map(
-    call_at, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _SENT_ARGUMENTS)
+_VECTOR = types.Array(types.float64, 1, "C")
+_MASTER_ARGUMENTS = (_VECTOR, types.boolean, *[_VECTOR] * 5, types.float64, *[_VECTOR] * 4)
+_SLAVE_ARGUMENTS = (_VECTOR, types.boolean, *[_VECTOR] * 4, types.float64, *[_VECTOR] * 4)
+_RECORD_ARGUMENTS = (_VECTOR,) * 6
+_master_step, _slave_step, _record_command = map(
+    call_at, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS)
 )
 
 
 def steps_of(method: str) -> tuple[int, int, int]:
-    return _addresses(*METHODS[method][:3])
+    return _addresses_of_functions(*METHODS[method][:3])
 
 
 @cache
-def _addresses(*steps: Any) -> tuple[int, int, int]:
+def _addresses_of_functions(*steps: Any) -> tuple[int, int, int]:
     master, slave, sent = zip(
-        steps, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _SENT_ARGUMENTS), strict=True
+        steps, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS), strict=True
     )
     return address_of(*master), address_of(*slave), address_of(*sent)
 
 
 @njit(cache=True)
-def _number_packet(healthy, memory, packet):
+def _write_packet_number(healthy, memory, packet):
     """Write the packet's number; repeat the last good packet if the inputs are not finite."""
     if healthy:
-        packet[HEALTHY] = 1.0
+        packet[INPUTS_FINITE] = 1.0
         put(memory, PACKET.start, packet, 0, PACKET_SIZE)
     else:
         put(packet, 0, memory, PACKET.start, PACKET_SIZE)
-        packet[HEALTHY] = 0.0
-    packet[SEQUENCE] = memory[STEPS]
+        packet[INPUTS_FINITE] = 0.0
+    packet[PACKET_NUMBER] = memory[STEPS]
     memory[STEPS] += 1.0
 
 
@@ -326,7 +334,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         retreat(twist, T, p, memory, wrench)
-    _number_packet(healthy, memory, packet)
+    _write_packet_number(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -350,14 +358,14 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _slave_step(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _number_packet(healthy, memory, packet)
+    _write_packet_number(healthy, memory, packet)
 
 
 @njit(cache=True)
-def command_sent(steps, requested, command, pose, twist, p, memory):
+def record_command(steps, requested, command, pose, twist, p, memory):
     """Update the method's memory if the safe state changed the method's command.
 
     `requested` (7,) is the command X_WS of the method, `command` (7,) that of the safe state, which
     the method may change.
     """
-    _command_sent(steps[2], requested, command, pose, twist, p, memory)
+    _record_command(steps[2], requested, command, pose, twist, p, memory)

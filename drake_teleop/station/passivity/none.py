@@ -5,7 +5,14 @@ from __future__ import annotations
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, HELD_WRENCH
-from drake_teleop.station.passivity.packet import POSE, VELOCITY, WRENCH, arrived, fill, limit
+from drake_teleop.station.passivity.packet import (
+    POSE,
+    VELOCITY,
+    WRENCH,
+    fill_packet,
+    has_arrived,
+    limit,
+)
 
 
 @njit(cache=True)
@@ -16,14 +23,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     for g in range(2):
         limit(wrench, g, limits[g])
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    if arrived(received):
+    if has_arrived(received):
         put(memory, COMMAND_POSE.start, received, POSE.start, 7)
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)

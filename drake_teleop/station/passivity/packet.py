@@ -14,9 +14,9 @@ from drake_teleop.station.passivity.memory import RECEIVED, Slots
 PACKET_SIZE = 38
 _places = Slots(PACKET_SIZE)
 #: Number of the packet, counted by its sender.
-SEQUENCE = _places.number()
+PACKET_NUMBER = _places.number()
 #: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
-HEALTHY = _places.number()
+INPUTS_FINITE = _places.number()
 #: X_WS [qw qx qy qz px py pz] of the sender.
 POSE = _places.vector(7)
 #: Twist of the sender [v; omega], in W.
@@ -30,7 +30,7 @@ ENERGY = _places.vector(2)
 #: Second energy counter, by group [J].
 OTHER_ENERGY = _places.vector(2)
 #: 1 while the slave's detector reports contact.
-CONTACT = _places.number()
+CONTACT_FLAG = _places.number()
 #: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
 #: field, because only `ledger` uses it; with other methods it is not transmitted.
 LOAD = _places.vector(6)
@@ -40,14 +40,14 @@ MAX_WRENCH_RATE = (450.0, 4.5)
 
 
 @njit(cache=True)
-def arrived(received):
+def has_arrived(received):
     """Return whether a packet has arrived: before the first, `received` contains zeros."""
     pose = received[POSE]
     return pose[0] != 0.0 or pose[1] != 0.0 or pose[2] != 0.0 or pose[3] != 0.0
 
 
 @njit(cache=True)
-def new_energy(g, received, memory):
+def credit_new_energy(g, received, memory):
     """Return the energy of group `g` received since the last call [J]; credit it in `memory`."""
     new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
     memory[RECEIVED][g] += new
@@ -55,7 +55,7 @@ def new_energy(g, received, memory):
 
 
 @njit(cache=True)
-def fill(pose, twist, wrench, packet):
+def fill_packet(pose, twist, wrench, packet):
     now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
     for i in range(7):
         now[i] = pose[i]
@@ -98,7 +98,7 @@ def finite(a):
 
 
 @njit(cache=True)
-def difference_into(a, b, e):
+def pose_difference_into(a, b, e):
     """Write the difference of two poses (7,), [p_a - p_b; log(R_a R_b^T)] in W, into `e` (6,)."""
     turn = logarithm(multiply((a[0], a[1], a[2], a[3]), conjugate((b[0], b[1], b[2], b[3]))))
     for i in range(3):
@@ -107,7 +107,7 @@ def difference_into(a, b, e):
 
 
 @njit(cache=True)
-def moved_into(pose, e, out):
+def moved_pose_into(pose, e, out):
     """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,)."""
     turn = exponential((e[3], e[4], e[5]))
     q = normalized(multiply(turn, (pose[0], pose[1], pose[2], pose[3])))

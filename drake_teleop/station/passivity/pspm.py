@@ -31,18 +31,18 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
-    arrived,
-    difference_into,
+    credit_new_energy,
     dot,
-    fill,
+    fill_packet,
+    has_arrived,
     limit,
-    moved_into,
-    new_energy,
+    moved_pose_into,
+    pose_difference_into,
 )
 
 # Parameters, for translation and rotation.
 _places = own_parameters()
-_INITIAL, _CEILING = _places.vector(2), _places.vector(2)
+_INITIAL_ENERGY, _MAX_ENERGY = _places.vector(2), _places.vector(2)
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
 # Memory: set position minus actual position; requested value of this offset.
 _places = own_memory()
@@ -70,30 +70,30 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
+        p[_INITIAL_ENERGY], p[_MAX_ENERGY] = self.initial, self.ceiling
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    memory[LEDGER] = p[_INITIAL]
+    memory[LEDGER] = p[_INITIAL_ENERGY]
 
 
 @njit(cache=True)
-def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
+def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memory, packet):
     """Move the set position of group `g` as near to the requested one as the energy permits."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     stored, required = dot(offset, offset, g), dot(requested, requested, g)
     damped = -dot(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
     ledger = memory[LEDGER]
     energy = ledger[g] + damped
-    energy += new_energy(g, received, memory)
+    energy += credit_new_energy(g, received, memory)
     available = stored + 2.0 * energy / stiffness
     share = 1.0 if required <= max(available, 0.0) else math.sqrt(max(available, 0.0) / required)
     for i in range(3 * g, 3 * g + 3):
         offset[i] = share * requested[i]
     energy -= 0.5 * stiffness * (dot(offset, offset, g) - stored)
-    surplus = max(energy - p[_CEILING][g], 0.0)
+    surplus = max(energy - p[_MAX_ENERGY][g], 0.0)
     if shuffle:
         memory[SENT][g] += surplus
     else:
@@ -114,12 +114,12 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         limit(wrench, g, limits[g])
         for i in range(3 * g, 3 * g + 3):
             requested[i] = wrench[i] / K[g]
-        _modulate(received, g, K[g], dx, before, True, p, memory, packet)
+        _modulate_set_position(received, g, K[g], dx, before, True, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         limit(wrench, g, limits[g])
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
@@ -127,26 +127,26 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
-    difference_into(now, pose, offset)
+    pose_difference_into(now, pose, offset)
     put(requested, 0, offset, 0, 6)
-    if arrived(received):
-        difference_into(received[POSE], pose, requested)
+    if has_arrived(received):
+        pose_difference_into(received[POSE], pose, requested)
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     for g in range(2):
-        _modulate(received, g, K[g], dx, before[g], False, p, memory, packet)
+        _modulate_set_position(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             held[i] = K[g] * offset[i] - D[g] * twist[i]
-    moved_into(pose, offset, now)
+    moved_pose_into(pose, offset, now)
     put(command, 0, memory, COMMAND.start, 13)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
-def command_sent(requested, command, pose, twist, p, memory):
+def record_command(requested, command, pose, twist, p, memory):
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
     K, D = p[STIFFNESS], p[DAMPING]
-    difference_into(command, pose, offset)
-    difference_into(requested, pose, other)
+    pose_difference_into(command, pose, offset)
+    pose_difference_into(requested, pose, other)
     for i in range(6):
         held[i] = K[i // 3] * offset[i] - D[i // 3] * twist[i]
     put(memory, COMMAND_POSE.start, command, 0, 7)

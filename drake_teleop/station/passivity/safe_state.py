@@ -11,8 +11,20 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity.memory import HAND_VELOCITY, HELD_WRENCH, MASS, RETREAT, Slots
-from drake_teleop.station.passivity.packet import difference_into, dot, length, moved_into, scale
+from drake_teleop.station.passivity.memory import (
+    HAND_VELOCITY,
+    HELD_WRENCH,
+    MASS,
+    MAX_RETREAT,
+    Slots,
+)
+from drake_teleop.station.passivity.packet import (
+    dot,
+    length,
+    moved_pose_into,
+    pose_difference_into,
+    scale,
+)
 
 STOP_TIME = 0.05  #: time in which a silent end comes to rest [s]
 RESUME_TIME = 0.5  #: time of the transition to normal operation [s]
@@ -21,12 +33,12 @@ _RETREAT_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_WATCH, SLAVE_WATCH = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
 _places = Slots(MASTER_WATCH)
-SILENT = _places.number()  #: time without packets [s], also at the slave
-_LIMIT = _places.vector(2)  # present limits
-_FALL_RATE = _places.vector(2)  # their decrease per second
+SILENCE_S = _places.number()  #: time without packets [s], also at the slave
+_PRESENT_LIMITS = _places.vector(2)  # present limits
+_LIMIT_FALL_RATE = _places.vector(2)  # their decrease per second
 _CONNECTED_TIME = _places.number()  # time since the last silence
 # Monitor state of the slave.
-_places = Slots(SLAVE_WATCH, SILENT + 1)
+_places = Slots(SLAVE_WATCH, SILENCE_S + 1)
 _STOPPING_TIME = _places.number()  # time since it began to stop
 _RESUMING_TIME = _places.number()  # time since it began to resume
 _STOP_POSE = _places.vector(7)  # command when it began to stop
@@ -44,16 +56,16 @@ def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.
     """
     watch = np.zeros(MASTER_WATCH)
     if full is None:
-        watch[SILENT] = np.inf
+        watch[SILENCE_S] = np.inf
     else:
-        watch[_LIMIT], watch[_CONNECTED_TIME] = full, RESUME_TIME
+        watch[_PRESENT_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME
     return watch
 
 
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the silence monitor (SLAVE_WATCH,) of the slave; `pose` (7,) is its first command."""
     watch = np.zeros(SLAVE_WATCH)
-    watch[SILENT] = np.inf
+    watch[SILENCE_S] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
         watch[part] = pose
     return watch
@@ -62,9 +74,9 @@ def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 @njit(cache=True)
 def _update_silence(alive, fault, T, watch):
     if fault:
-        watch[SILENT] = np.inf
+        watch[SILENCE_S] = np.inf
     else:
-        watch[SILENT] = 0.0 if alive else watch[SILENT] + T
+        watch[SILENCE_S] = 0.0 if alive else watch[SILENCE_S] + T
 
 
 @njit(cache=True)
@@ -77,9 +89,9 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
     updated.
     """
     _update_silence(alive, fault, T, watch)
-    connected = watch[SILENT] <= timeout
+    connected = watch[SILENCE_S] <= timeout
     watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME) if connected else 0.0
-    present, fall = watch[_LIMIT], watch[_FALL_RATE]
+    present, fall = watch[_PRESENT_LIMITS], watch[_LIMIT_FALL_RATE]
     for g in range(2):
         size, limit = length(held, g), present[g]
         if connected:
@@ -105,10 +117,10 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]
     start, velocity = watch[_STOP_POSE], watch[_STOP_VELOCITY]
     step = np.empty(6)
-    if watch[SILENT] <= timeout:
+    if watch[SILENCE_S] <= timeout:
         watch[_RESUMING_TIME] = min(watch[_RESUMING_TIME] + T, RESUME_TIME)
     elif watch[_RESUMING_TIME] > 0.0:
-        difference_into(last, before, velocity)
+        pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         put(start, 0, last, 0, 7)
@@ -122,13 +134,13 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
         u = min(watch[_STOPPING_TIME] / STOP_TIME, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
             step[i] = velocity[i] * STOP_TIME * u * (1.0 - u * u * (1.0 - 0.5 * u))
-        moved_into(start, step, command)
+        moved_pose_into(start, step, command)
         u = watch[_RESUMING_TIME] / RESUME_TIME
         if u > 0.0:
-            difference_into(requested, command, step)
+            pose_difference_into(requested, command, step)
             for i in range(6):
                 step[i] *= u * u * u * (10.0 + u * (6.0 * u - 15.0))
-            moved_into(command, step, command)
+            moved_pose_into(command, step, command)
     put(before, 0, last, 0, 7)
     put(last, 0, command, 0, 7)
 
@@ -137,7 +149,7 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 def retreat(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released hand stays slow.
 
-    It falls to 0 for hand speeds along the wrench between `RETREAT` and twice this.
+    It falls to 0 for hand speeds along the wrench between `MAX_RETREAT` and twice this.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)
     for i in range(6):
@@ -147,6 +159,6 @@ def retreat(twist, T, p, memory, wrench):
         if size > 0.0:
             along = dot(wrench, velocity, g) / size
             slowing = (along - dot(wrench, twist, g) / size) / _RETREAT_FILTER_S
-            share = max(2.0 - along / p[RETREAT][g], p[MASS][g] * slowing / size, 0.0)
+            share = max(2.0 - along / p[MAX_RETREAT][g], p[MASS][g] * slowing / size, 0.0)
             scale(wrench, g, min(share, 1.0))
     put(memory, HELD_WRENCH.start, wrench, 0, 6)

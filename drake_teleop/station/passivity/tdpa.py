@@ -35,22 +35,22 @@ from drake_teleop.station.passivity.packet import (
     INTEGRAL,
     MAX_WRENCH_RATE,
     OTHER_ENERGY,
+    PACKET_NUMBER,
     POSE,
-    SEQUENCE,
     WRENCH,
-    arrived,
-    difference_into,
+    credit_new_energy,
     dot,
-    fill,
+    fill_packet,
+    has_arrived,
     length,
     limit,
-    moved_into,
-    new_energy,
+    moved_pose_into,
+    pose_difference_into,
     scale,
 )
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
-_KEPT_SHARE = 0.5
+_RESERVED_INPUT_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
 _ONSET_S = 0.1
 _END_SHARE = 0.1  # a wrench below this share of the filtered one ends
@@ -61,7 +61,7 @@ _STIFFNESS_TRAVEL = (1e-3, 1e-2)
 _DRAG_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_ECHO, _SLAVE_LEDGER = INTEGRAL.start, OTHER_ENERGY
+_NEWEST_MASTER_PACKET, _SLAVE_LEDGER = INTEGRAL.start, OTHER_ENERGY
 
 # Parameters.
 _places = own_parameters()
@@ -71,7 +71,7 @@ _RESERVE, _DRAG, _HAND_STIFFNESS = (
     _places.vector(2),
     _places.vector(2),
 )  # in power units
-_SPEED = _places.vector(2)
+_MAX_SPEED = _places.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
 _places = own_memory()
 _WITHHELD_SHARE, _RESERVED_ENERGY = _places.vector(2), _places.vector(2)
@@ -80,7 +80,7 @@ _WITHHELD_SHARE, _RESERVED_ENERGY = _places.vector(2), _places.vector(2)
 _places = own_memory()
 _INPUT, _OUTPUT = _places.vector(2), _places.vector(2)
 _COMMAND_INPUT, _COMMAND_OUTPUT = _places.vector(2), _places.vector(2)
-_WITHHELD, _FILTERED = _places.vector(6), _places.vector(6)
+_WITHHELD_COMMAND, _FILTERED_WRENCH = _places.vector(6), _places.vector(6)
 _STIFFNESS_ESTIMATE, _ONSET_PACKET = _places.vector(2), _places.vector(2)
 _LAST_COMMAND = _places.vector(7)  # the command of the last step
 
@@ -132,7 +132,7 @@ class TdpaConfig:
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
-        p[_SPEED] = self.speed
+        p[_MAX_SPEED] = self.speed
 
 
 def charged() -> TdpaConfig:
@@ -143,7 +143,7 @@ def charged() -> TdpaConfig:
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     for g in range(2):
-        memory[LEDGER][g] += new_energy(g, received, memory)
+        memory[LEDGER][g] += credit_new_energy(g, received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
     requested = received[WRENCH]
     for i in range(6):
@@ -161,14 +161,14 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         withheld[g] = 1.0 - share
         memory[LOST][g] += (1.0 - share) * drained
         scale(wrench, g, share)
-        _add_drag(g, received[_SLAVE_LEDGER][g], dx, limits, T, p, memory, wrench)
-        _account_for_work(g, dot(wrench, dx, g), p, memory)
+        _add_drag_force(g, received[_SLAVE_LEDGER][g], dx, limits, T, p, memory, wrench)
+        _balance_hand_work(g, dot(wrench, dx, g), p, memory)
         if p[_DRAG][g] > 0.0:
             _send_surplus(g, p, memory)
         packet[ENERGY][g] = memory[SENT][g]
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
-    packet[_ECHO] = received[SEQUENCE]
+    fill_packet(pose, twist, wrench, packet)
+    packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
 
 
 @njit(cache=True)
@@ -180,7 +180,7 @@ def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
 
 
 @njit(cache=True)
-def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
+def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
     drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
         damping = drag / max(length(dx, g), _DRAG_SPEED[g] * T)
@@ -199,13 +199,13 @@ def _send_surplus(g, p, memory):
 
 
 @njit(cache=True)
-def _account_for_work(g, drained, p, memory):
+def _balance_hand_work(g, drained, p, memory):
     ledger, kept = memory[LEDGER], memory[_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
         ledger[g] = max(ledger[g] - drained, 0.0)
     else:
-        more = min(-_KEPT_SHARE * drained, max(p[_RESERVE][g] - kept[g], 0.0))
+        more = min(-_RESERVED_INPUT_SHARE * drained, max(p[_RESERVE][g] - kept[g], 0.0))
         memory[SENT][g] -= drained + more
     kept[g] = max(kept[g] + more, 0.0)
 
@@ -213,14 +213,14 @@ def _account_for_work(g, drained, p, memory):
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     for g in range(2):
-        memory[LEDGER][g] += new_energy(g, received, memory)
+        memory[LEDGER][g] += credit_new_energy(g, received, memory)
     put(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
         work = dot(wrench, dx, g)
         memory[_INPUT][g] += max(work, 0.0)
         memory[_OUTPUT][g] += max(-work, 0.0)
-    if arrived(received):
-        _move_command(received, wrench, T, p, memory)
+    if has_arrived(received):
+        _advance_command(received, wrench, T, p, memory)
     for g in range(2):
         available = _available_energy(memory, g)
         credit = min(memory[_INPUT][g], memory[_COMMAND_INPUT][g]) + min(available, 0.0)
@@ -229,20 +229,20 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         memory[LEDGER][g] = available
         packet[ENERGY][g] = memory[SENT][g]
         packet[_SLAVE_LEDGER][g] = memory[LEDGER][g]
-        _filter(g, received, dx, wrench, T, p, memory)
+        _filter_wrench(g, received, dx, wrench, T, p, memory)
     put(command, 0, memory, COMMAND.start, 13)
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, memory[_FILTERED], packet)
+    fill_packet(pose, twist, memory[_FILTERED_WRENCH], packet)
 
 
 @njit(cache=True)
-def _filter(g, received, dx, wrench, T, p, memory):
-    filtered, hand = memory[_FILTERED], p[_HAND_STIFFNESS][g]
+def _filter_wrench(g, received, dx, wrench, T, p, memory):
+    filtered, hand = memory[_FILTERED_WRENCH], p[_HAND_STIFFNESS][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
-        gain = max(_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
+        gain = max(_estimate_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
         # The servo's lag counts as delay.
-        round_trip = max(memory[STEPS] - received[_ECHO], 1.0) * T
+        round_trip = max(memory[STEPS] - received[_NEWEST_MASTER_PACKET], 1.0) * T
         lag = round_trip + p[DAMPING][g] / p[STIFFNESS][g]
         size, filtered_size = length(wrench, g), length(filtered, g)
         onset_rate = min(T / _ONSET_S, 1.0)
@@ -253,7 +253,7 @@ def _filter(g, received, dx, wrench, T, p, memory):
             if filtered_size * (1.0 + gain) < _ONSET_COMPLETE * size:
                 onset = onset_rate
                 memory[_ONSET_PACKET][g] = memory[STEPS]
-            if lag > _ONSET_S and received[_ECHO] < memory[_ONSET_PACKET][g]:
+            if lag > _ONSET_S and received[_NEWEST_MASTER_PACKET] < memory[_ONSET_PACKET][g]:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]
@@ -261,7 +261,7 @@ def _filter(g, received, dx, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _contact_stiffness(g, dx, wrench, T, memory):
+def _estimate_contact_stiffness(g, dx, wrench, T, memory):
     size, stiffness = length(dx, g), memory[_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_TRAVEL[g] * T:
         change = dot(wrench, dx, g) - dot(memory[HELD_WRENCH], dx, g)
@@ -276,15 +276,15 @@ def _available_energy(memory, g):
 
 
 @njit(cache=True)
-def _move_command(received, wrench, T, p, memory):
-    now, withheld = memory[COMMAND_POSE], memory[_WITHHELD]
+def _advance_command(received, wrench, T, p, memory):
+    now, withheld = memory[COMMAND_POSE], memory[_WITHHELD_COMMAND]
     step = memory[COMMAND_TWIST]
     remaining_share = 1.0 - min(T * p[_DRIFT_RATE], 1.0)
-    difference_into(received[POSE], now, step)
+    pose_difference_into(received[POSE], now, step)
     for i in range(6):
         step[i] -= remaining_share * withheld[i]
     for g in range(2):
-        limit(step, g, p[_SPEED][g] * T)
+        limit(step, g, p[_MAX_SPEED][g] * T)
         pressing, available = -dot(wrench, step, g), max(_available_energy(memory, g), 0.0)
         if pressing > available:
             scale(step, g, available / pressing)
@@ -292,16 +292,16 @@ def _move_command(received, wrench, T, p, memory):
             pressing = available
         memory[_COMMAND_OUTPUT][g] += max(pressing, 0.0)
         memory[_COMMAND_INPUT][g] += max(-pressing, 0.0)
-    moved_into(now, step, now)
-    difference_into(received[POSE], now, withheld)
+    moved_pose_into(now, step, now)
+    pose_difference_into(received[POSE], now, withheld)
     for i in range(6):
         step[i] /= T
 
 
 @njit(cache=True)
-def _account_command(command, sign, memory):
+def _add_command_work(command, sign, memory):
     step = np.empty(6)
-    difference_into(command, memory[_LAST_COMMAND], step)
+    pose_difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
         work = sign * dot(memory[HELD_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0
@@ -310,10 +310,10 @@ def _account_command(command, sign, memory):
 
 
 @njit(cache=True)
-def command_sent(requested, command, pose, twist, p, memory):
+def record_command(requested, command, pose, twist, p, memory):
     for i in range(7):
         if command[i] != requested[i]:
-            _account_command(requested, -1.0, memory)
-            _account_command(command, 1.0, memory)
+            _add_command_work(requested, -1.0, memory)
+            _add_command_work(command, 1.0, memory)
             put(memory, COMMAND_POSE.start, command, 0, 7)
             return

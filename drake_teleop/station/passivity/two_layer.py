@@ -31,22 +31,22 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
-    arrived,
-    difference_into,
+    credit_new_energy,
     dot,
-    fill,
+    fill_packet,
+    has_arrived,
     length,
     limit,
-    moved_into,
-    new_energy,
+    moved_pose_into,
+    pose_difference_into,
     scale,
 )
 
 # Parameters; pairs are for translation and rotation.
 _places = own_parameters()
-_SEND, _DRAIN = _places.number(), _places.number()
-_INITIAL, _LEVEL, _CAPACITY = _places.vector(2), _places.vector(2), _places.vector(2)
-_DAMPER, ACCELERATION = _places.vector(2), _places.vector(2)
+_SEND_RATE, _DRAIN_RATE = _places.number(), _places.number()
+_INITIAL_ENERGY, _FILL_LEVEL, _CAPACITY = _places.vector(2), _places.vector(2), _places.vector(2)
+_DAMPER, MAX_ACCELERATION = _places.vector(2), _places.vector(2)
 _RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
 _places = own_memory()
@@ -81,24 +81,24 @@ class TwoLayerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_SEND], p[_DRAIN] = self.send_rate, self.drain_rate
-        p[_INITIAL], p[_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
-        p[_DAMPER], p[ACCELERATION] = self.damper, self.acceleration
+        p[_SEND_RATE], p[_DRAIN_RATE] = self.send_rate, self.drain_rate
+        p[_INITIAL_ENERGY], p[_FILL_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
+        p[_DAMPER], p[MAX_ACCELERATION] = self.damper, self.acceleration
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    memory[LEDGER] = p[_INITIAL]
+    memory[LEDGER] = p[_INITIAL_ENERGY]
 
 
 @njit(cache=True)
-def _exchange(received, dx, T, p, memory, packet):
+def _exchange_energy(received, dx, T, p, memory, packet):
     ledger, sent_so_far = memory[LEDGER], memory[SENT]
     held, capacity = memory[HELD_WRENCH], p[_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot(held, dx, g)
-        level += new_energy(g, received, memory)
-        sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE_SHARE * capacity[g], 0.0)
+        level += credit_new_energy(g, received, memory)
+        sent = min(T * p[_SEND_RATE], 1.0) * max(level - _RESERVE_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
@@ -108,44 +108,44 @@ def _exchange(received, dx, T, p, memory, packet):
 
 
 @njit(cache=True)
-def _cost(f, dx, g, acceleration, T):
+def _max_energy_use(f, dx, g, acceleration, T):
     """Return the largest energy that the wrench `f` can use until the next step [J]."""
     return dot(f, dx, g) + length(f, g) * acceleration * T * T
 
 
 @njit(cache=True)
 def _limit_to_tank(f, dx, g, acceleration, T, memory):
-    cost, level = _cost(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
+    cost, level = _max_energy_use(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
     if cost > level:
         scale(f, g, level / cost)
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    _exchange(received, dx, T, p, memory, packet)
+    _exchange_energy(received, dx, T, p, memory, packet)
     ledger, requested = memory[LEDGER], received[WRENCH]
     for g in range(2):
-        damping = p[_DAMPER][g] * max(p[_LEVEL][g] - ledger[g], 0.0)
+        damping = p[_DAMPER][g] * max(p[_FILL_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = requested[i] - damping * twist[i]
         limit(wrench, g, limits[g])
         drained = dot(wrench, dx, g)
-        drainable = min(T * p[_DRAIN], 1.0) * max(ledger[g], 0.0)
+        drainable = min(T * p[_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
         if drained > drainable:
             scale(wrench, g, drainable / drained)
-        _limit_to_tank(wrench, dx, g, p[ACCELERATION][g], T, memory)
+        _limit_to_tank(wrench, dx, g, p[MAX_ACCELERATION][g], T, memory)
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     spring, brake = memory[_SPRING_WRENCH], memory[_BRAKE_WRENCH]
-    _exchange(received, dx, T, p, memory, packet)
+    _exchange_energy(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
-    if arrived(received):
+    if has_arrived(received):
         target = received[POSE]
-    difference_into(target, pose, spring)
+    pose_difference_into(target, pose, spring)
     motor_wrench, K, D = memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
@@ -154,28 +154,28 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             motor_wrench[i] = spring[i] + brake[i]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
         available = max(memory[LEDGER][g] - _RESERVE_SHARE * p[_CAPACITY][g], 0.0)
-        acceleration = p[ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
-        if _cost(motor_wrench, dx, g, acceleration, T) > available:
-            acceleration = p[ACCELERATION][g] + length(brake, g) / p[MASS][g]
-            available -= _cost(brake, dx, g, acceleration, T)
-            acceleration = p[ACCELERATION][g] + length(spring, g) / p[MASS][g]
-            cost = _cost(spring, dx, g, acceleration, T)
+        acceleration = p[MAX_ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
+        if _max_energy_use(motor_wrench, dx, g, acceleration, T) > available:
+            acceleration = p[MAX_ACCELERATION][g] + length(brake, g) / p[MASS][g]
+            available -= _max_energy_use(brake, dx, g, acceleration, T)
+            acceleration = p[MAX_ACCELERATION][g] + length(spring, g) / p[MASS][g]
+            cost = _max_energy_use(spring, dx, g, acceleration, T)
             share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = share * spring[i] + brake[i]
-            acceleration = p[ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
+            acceleration = p[MAX_ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
             _limit_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
-    moved_into(pose, spring, memory[COMMAND_POSE])
+    moved_pose_into(pose, spring, memory[COMMAND_POSE])
     put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
-def command_sent(requested, command, pose, twist, p, memory):
+def record_command(requested, command, pose, twist, p, memory):
     spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
-    difference_into(command, pose, spring)
+    pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

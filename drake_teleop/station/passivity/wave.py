@@ -32,22 +32,22 @@ from drake_teleop.station.passivity.packet import (
     ENERGY,
     INTEGRAL,
     MAX_WRENCH_RATE,
+    PACKET_NUMBER,
     POSE,
-    SEQUENCE,
-    arrived,
-    difference_into,
+    credit_new_energy,
     dot,
-    fill,
+    fill_packet,
+    has_arrived,
     limit,
-    moved_into,
-    new_energy,
+    moved_pose_into,
+    pose_difference_into,
 )
 
 # Parameters.
 _places = own_parameters()
 IMPEDANCE = _places.vector(2)
-_FILTER, _MATCHING = _places.number(), _places.number()
-_PATIENCE, _DRIFT_RATE = _places.number(), _places.number()
+_FILTER_TIME, _DAMPER_SHARE = _places.number(), _places.number()
+_MAX_SILENCE, _DRIFT_RATE = _places.number(), _places.number()
 # Memory: integrals of the output wave and of the sent wave; wave of this step; silence [s].
 _places = own_memory()
 _PLAYED_INTEGRAL, _SENT_INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
@@ -86,21 +86,21 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
-        p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
+        p[IMPEDANCE], p[_FILTER_TIME], p[_DAMPER_SHARE] = self.impedance, self.filter, self.matching
+        p[_MAX_SILENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 
 
 @njit(cache=True)
-def _play(received, T, p, memory, wave):
+def _output_wave(received, T, p, memory, wave):
     """Write the wave (6,) of this step, the filtered rate of the received wave integral (T34)."""
     ledger, played = memory[LEDGER], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
-        ledger[g] += new_energy(g, received, memory)
+        ledger[g] += credit_new_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
             wave[i] = integral[i] - played[i]
         left, store = dot(wave, wave, g), 2.0 * T * ledger[g]
-        share = T / (T + p[_FILTER])
+        share = T / (T + p[_FILTER_TIME])
         if share * left > (2.0 - share) * store:
             share = 2.0 * store / (left + store)
         for i in range(3 * g, 3 * g + 3):
@@ -112,8 +112,8 @@ def _play(received, T, p, memory, wave):
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
-    _play(received, T, p, memory, wave)
-    catching_up, newest = memory[_CATCHING_UP], received[SEQUENCE]
+    _output_wave(received, T, p, memory, wave)
+    catching_up, newest = memory[_CATCHING_UP], received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET] + 1.0:
         catching_up = 1.0
     memory[_CATCHING_UP], memory[_NEWEST_PACKET] = 0.0 if fresh else 1.0, newest
@@ -128,7 +128,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         energy = 0.5 * T * dot(wave, wave, g)
         if catching_up > 0.0:
             most = MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
-            if _limit_change(g, energy, dx, most, memory[HELD_WRENCH], wrench):
+            if _limit_wrench_change(g, energy, dx, most, memory[HELD_WRENCH], wrench):
                 memory[_CATCHING_UP] = 1.0
             limit(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
@@ -136,11 +136,11 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         memory[SENT][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT][g]
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
-def _limit_change(g, energy, dx, most, held, wrench):
+def _limit_wrench_change(g, energy, dx, most, held, wrench):
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
         size += (wrench[i] - held[i]) ** 2
@@ -162,30 +162,30 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     if memory[FILL_TIME] > 0.0:
         memory[FILL_TIME] -= T
         step[:] = 0.0
-        _fill_line(received, wrench, T, p, memory)
-    elif memory[_SILENCE] <= p[_PATIENCE]:
-        _reflect(received, wrench, T, p, memory)
-        if arrived(received):
+        _reflect_while_filling(received, wrench, T, p, memory)
+    elif memory[_SILENCE] <= p[_MAX_SILENCE]:
+        _reflect_wave(received, wrench, T, p, memory)
+        if has_arrived(received):
             _correct_drift(received, wrench, T, p, memory)
-        moved_into(now, step, now)
+        moved_pose_into(now, step, now)
         for i in range(6):
             step[i] /= T
     else:
         step[:] = 0.0
-        _play_rest(wrench, T, p, memory)
+        _output_wave_at_rest(wrench, T, p, memory)
     put(packet, INTEGRAL.start, memory, _SENT_INTEGRAL.start, 6)
     put(packet, ENERGY.start, memory, SENT.start, 2)
     put(command, 0, memory, COMMAND.start, 13)
     put(memory, HELD_WRENCH.start, wrench, 0, 6)
-    fill(pose, twist, wrench, packet)
+    fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
-def _reflect(received, wrench, T, p, memory):
+def _reflect_wave(received, wrench, T, p, memory):
     wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_SENT_INTEGRAL]
-    _play(received, T, p, memory, wave)
+    _output_wave(received, T, p, memory, wave)
     for g in range(2):
-        b, damper = p[IMPEDANCE][g], p[_MATCHING] * p[IMPEDANCE][g]
+        b, damper = p[IMPEDANCE][g], p[_DAMPER_SHARE] * p[IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             step[i] = T * (math.sqrt(2.0 * b) * wave[i] + wrench[i]) / (b + damper)
             integral[i] += T * wave[i] + math.sqrt(2.0 / b) * (T * wrench[i] - damper * step[i])
@@ -196,7 +196,7 @@ def _reflect(received, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _play_rest(wrench, T, p, memory):
+def _output_wave_at_rest(wrench, T, p, memory):
     wave, ledger = memory[_WAVE], memory[LEDGER]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
@@ -212,7 +212,7 @@ def _play_rest(wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _fill_line(received, wrench, T, p, memory):
+def _reflect_while_filling(received, wrench, T, p, memory):
     """Reflect as a rigid wall while a new channel fills, and prepare the steady state."""
     wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
@@ -221,15 +221,15 @@ def _fill_line(received, wrench, T, p, memory):
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
             integral[i] -= T * wave[i]
-            played[i] = received[INTEGRAL][i] - p[_FILTER] * wave[i]
+            played[i] = received[INTEGRAL][i] - p[_FILTER_TIME] * wave[i]
         memory[SENT][g] += 0.5 * T * dot(wave, wave, g)
-        ledger[g] = 0.5 * (T + p[_FILTER]) * dot(wave, wave, g)
+        ledger[g] = 0.5 * (T + p[_FILTER_TIME]) * dot(wave, wave, g)
 
 
 @njit(cache=True)
 def _correct_drift(received, wrench, T, p, memory):
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
-    difference_into(received[POSE], memory[COMMAND_POSE], drift)
+    pose_difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):
         if dot(wrench, drift, g) >= 0.0:
             for i in range(3 * g, 3 * g + 3):

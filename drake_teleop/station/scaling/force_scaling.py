@@ -164,7 +164,7 @@ def _scaled_into(sample, estimate, gripper, arm, scales, out):
 
 
 @njit(cache=True)
-def fault_of(sample, estimate, time, valid_range):
+def find_fault(sample, estimate, time, valid_range):
     """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
     `valid_range` (7,) contains the largest wrench [N, N m] and age [s].
@@ -192,12 +192,12 @@ def _scaled_now_into(sample, estimate, gripper, change, time, arm, out):
 def _log_row_into(sample, estimate, gripper, change, time, arm, elimination, valid_range, out):
     _scaled_now_into(sample, estimate, gripper, change, time, arm, out[:6])
     _scaled_into(sample, estimate, gripper, arm, elimination, out[6:12])
-    out[12] = fault_of(sample, estimate, time, valid_range)
+    out[12] = find_fault(sample, estimate, time, valid_range)
 
 
 @njit(cache=True)
 def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out):
-    if fault_of(sample, estimate, time, valid_range) != _NONE:
+    if find_fault(sample, estimate, time, valid_range) != _NONE:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(3)
@@ -314,7 +314,7 @@ class ForceScaling(LeafSystem):
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         sample, estimate, _, _, time = self._inputs(context)
-        output[0] = fault_of(sample, estimate, time, self._valid_range)
+        output[0] = find_fault(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
         constants = self._arm, _ELIMINATION

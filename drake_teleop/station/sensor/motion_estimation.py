@@ -41,8 +41,8 @@ from drake_teleop.station.sensor.sensor_chain import (
     WristSensorConfig,
     butterworth_sections,
     low_pass,
-    settle,
-    shift,
+    settle_low_pass,
+    shift_delay_line,
 )
 from drake_teleop.station.slave.arm import MOTION_SIZE, sensor_motion
 
@@ -310,7 +310,7 @@ def _align_paths(constants, memory, n, reading, sample):
     filtered = memory[_JOINTS:][: _PER_JOINT * n][5 * n :]
     put(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
-        settle(sections, filtered, angles)
+        settle_low_pass(sections, filtered, angles)
     low_pass(sections, filtered, angles)
     _delay_paths(constants, memory, n, reading, sample)
 
@@ -320,7 +320,7 @@ def _delay_paths(constants, memory, n, reading, sample):
     angles, width = sample[JOINT_POSITION], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
     rows = line.shape[0] // width
-    shift(line, width)
+    shift_delay_line(line, width)
     for i in range(12):
         line[i] = reading[i]
     for i in range(n):

@@ -172,9 +172,9 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
     ) -> None:
         super().__init__()
         S, joint = _sensor_frame(plant, joint_or_frame)
-        self._weld = _weld(plant, S, joint)
+        self._weld = _weld_properties(plant, S, joint)
         step = plant.time_step() or None
-        self._step_s, self._steps_per_sample = _steps(step, period)
+        self._step_s, self._steps_per_sample = _event_period_and_count(step, period)
         self._pairs_steps = step is not None and plant.has_sampled_output_ports()
         config.check(_WHERE, 1 / self.period)
 
@@ -206,7 +206,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
         self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update)
         if self._pairs_steps:
-            self.DeclareInitializationDiscreteUpdateEvent(self._hold)
+            self.DeclareInitializationDiscreteUpdateEvent(self._hold_configuration)
         first = 0
         for name, size in {**sample_parts(n), "sample_time": 1}.items():
             self._declare_output("status" if name == "saturated" else name, first, size)
@@ -232,7 +232,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
-    def _hold(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _hold_configuration(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.get_mutable_value(0)[self._held] = self._configuration(context)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -240,7 +240,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         held = discrete_state.value(0)[self._held].copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
-            self._hold(context, discrete_state)
+            self._hold_configuration(context, discrete_state)
         if step % self._steps_per_sample == 0:
             configuration = held if self._pairs_steps else self._configuration(context)
             memory = discrete_state.get_mutable_value(0)
@@ -320,7 +320,7 @@ def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
         )
 
 
-def _steps(step: float | None, period: float | None) -> tuple[float, int]:
+def _event_period_and_count(step: float | None, period: float | None) -> tuple[float, int]:
     """Return the period of events [s], and the number of events per sample."""
     if period is not None and not 0.0 < period < np.inf:
         raise DrakeTeleopError(
@@ -348,7 +348,7 @@ def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple
             where=f"{_WHERE}: joint_or_frame",
             remedy="pass a joint or frame of this plant",
         )
-    welds = [joint for joint in _joints(plant) if isinstance(joint, WeldJoint)]
+    welds = [joint for joint in _all_joints(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):
         S = joint_or_frame
         body = S.body().index()
@@ -374,26 +374,28 @@ def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple
     return parent if on_parent else joint_or_frame.frame_on_child(), joint_or_frame
 
 
-def _joints(plant: MultibodyPlant) -> list[Joint]:
+def _all_joints(plant: MultibodyPlant) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices()]
 
 
 def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
     """Return the arm's body at the weld, and all bodies on the other side, the load."""
     neighbours: dict[BodyIndex, list[BodyIndex]] = {}
-    for joint in _joints(plant):
+    for joint in _all_joints(plant):
         if joint.index() != weld.index():
             parent, child = joint.parent_body().index(), joint.child_body().index()
             neighbours.setdefault(parent, []).append(child)
             neighbours.setdefault(child, []).append(parent)
     parent, child = weld.parent_body().index(), weld.child_body().index()
-    load = _reached(neighbours, child)
+    load = _connected_bodies(neighbours, child)
     if plant.world_body().index() in load:
-        return child, _reached(neighbours, parent)
+        return child, _connected_bodies(neighbours, parent)
     return parent, load
 
 
-def _reached(neighbours: dict[BodyIndex, list[BodyIndex]], start: BodyIndex) -> set[BodyIndex]:
+def _connected_bodies(
+    neighbours: dict[BodyIndex, list[BodyIndex]], start: BodyIndex
+) -> set[BodyIndex]:
     found, ahead = {start}, [start]
     while ahead:
         new = set(neighbours.get(ahead.pop(), ())) - found
@@ -402,7 +404,7 @@ def _reached(neighbours: dict[BodyIndex, list[BodyIndex]], start: BodyIndex) -> 
     return found
 
 
-def _weld(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Weld:
+def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Weld:
     arm, load = _arm_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
         raise DrakeTeleopError(

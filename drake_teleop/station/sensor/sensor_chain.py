@@ -240,7 +240,7 @@ PARTS: dict[str, dict[str, Any]] = {
 }
 
 
-def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
+def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
     """Return a copy of the configuration without some parts of the sensor (keys of `PARTS`).
 
     >>> without(WristSensorConfig(), "noise", "offset").force_noise 0.0
@@ -282,12 +282,12 @@ def calibration_matrices(
     wrench = config.cross_talk * talk * ranges[:, None] / ranges
     np.fill_diagonal(wrench, 1 + config.gain_error * gains)
     scales = 1 + config.acceleration_gain_error * acceleration_gains
-    turned = _rotation(acceleration_axis, config.acceleration_misalignment)
-    both = np.kron(np.eye(2), _rotation(axis, config.misalignment))
+    turned = _rotation_matrix(acceleration_axis, config.acceleration_misalignment)
+    both = np.kron(np.eye(2), _rotation_matrix(axis, config.misalignment))
     return wrench @ both, scales[:3, None] * turned, scales[3:, None] * turned
 
 
-def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+def _rotation_matrix(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
     K = cross_matrix(axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
@@ -395,7 +395,7 @@ def read_into(constants, memory, noise, truth, reading):
     count = int(memory[0])
     width = _ROW + angles.shape[0]
     rows = (memory.shape[0] - _LINE) // width
-    shift(memory[_LINE:], width)
+    shift_delay_line(memory[_LINE:], width)
     row = memory[_LINE:][:width]
     channels = row[:_CHANNELS]
     walks, filtered = memory[_WALKS:FILTERED], memory[FILTERED:_LINE]
@@ -404,20 +404,20 @@ def read_into(constants, memory, noise, truth, reading):
         for i in range(_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_CHANNELS * NOISE_BLOCK + i]
 
-    _calibrate(constants, truth, channels)
+    _apply_calibration_errors(constants, truth, channels)
     if place == _BEFORE_NOISE:
         if count == 0:
-            settle(sections, filtered, channels)
+            settle_low_pass(sections, filtered, channels)
         low_pass(sections, filtered, channels)
     for i in range(_CHANNELS):
         channels[i] += constants[i] + count * constants[_DRIFT + i]
     if place == _AFTER_CONVERTER and count == 0:
-        settle(sections, filtered, channels)
+        settle_low_pass(sections, filtered, channels)
     first = _CHANNELS * (count % NOISE_BLOCK)
     for i in range(_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
-    row[_CHANNELS] = _convert(constants, 0, 6, channels)
-    row[_CHANNELS + 1] = _convert(constants, 6, 12, channels)
+    row[_CHANNELS] = _quantize(constants, 0, 6, channels)
+    row[_CHANNELS + 1] = _quantize(constants, 6, 12, channels)
     if place == _AFTER_CONVERTER:
         low_pass(sections, filtered, channels)
     quantum = constants[_ENCODER]
@@ -443,14 +443,14 @@ def read_into(constants, memory, noise, truth, reading):
 
 
 @njit(cache=True)
-def shift(line, width):
+def shift_delay_line(line, width):
     """Shift the delay line by one row of `width` values; the newest row is first."""
     for i in range(line.shape[0] - 1, width - 1, -1):
         line[i] = line[i - width]
 
 
 @njit(cache=True)
-def _calibrate(constants, truth, out):
+def _apply_calibration_errors(constants, truth, out):
     wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
     omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
     for i in range(6):
@@ -465,7 +465,7 @@ def _calibrate(constants, truth, out):
 
 
 @njit(cache=True)
-def _convert(constants, first, end, channels):
+def _quantize(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
         quantum, limit, value = constants[_QUANTA + i], constants[_LIMITS + i], channels[i]
@@ -497,7 +497,7 @@ def low_pass(sections, memory, values):
 
 
 @njit(cache=True)
-def settle(sections, memory, values):
+def settle_low_pass(sections, memory, values):
     """Set the memory of the filter `low_pass` to its steady state at `values` (n,)."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):

@@ -19,7 +19,7 @@ from pydrake.multibody.tree import BodyIndex
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
-from drake_teleop.station.environment.environment import Environment, LetFloat, ToolShapes
+from drake_teleop.station.environment.environment import AddFreeJoint, Environment, ToolShapes
 from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose
 
@@ -97,7 +97,7 @@ class Scene(Environment):
             if self.fixed:
                 plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBase)
             else:
-                LetFloat(plant, body, X_WBase)
+                AddFreeJoint(plant, body, X_WBase)
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
