@@ -370,8 +370,6 @@ def test_control_object_has_the_names_of_ports():
 def test_unknown_port_raises():
     said = r"'pose\.x' is no port or component of this model; name one of"
     with pytest.raises(DrakeTeleopError, match=said):
-        DrakeTeleopError, match=r"'pose\.x' is no port or component of this model; name one of"
-    ):
         small_system().close("pose", "wrench")
 
 
