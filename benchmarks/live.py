@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.common.progress import silent
+from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.inputs import NETWORKS, SLICE_MS
 from drake_teleop.live.live import FRAME, Live
@@ -147,7 +147,7 @@ def main() -> None:
             figures = driven(options.seconds, Path(folder) / "drive")
         drive = read_drive(Path(folder) / "drive")
         cpu = time.process_time()
-        drive.repeat(silent(""), Path(folder) / "again")
+        drive.repeat(show_no_progress(""), Path(folder) / "again")
         seconds = drive.scenario.simulation.duration
         figures["core_share_of_repeat"] = (time.process_time() - cpu) / seconds
         parts = sorted((Path(folder) / "drive" / "log.parquet").iterdir())

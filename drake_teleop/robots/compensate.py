@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.files import set_aside
+from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED, handled_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
@@ -149,7 +149,7 @@ def compensate_command(
         print(text, file=sys.stderr, flush=True)
 
     file = [Path(sink)] if readings.live and is_file(sink) else []
-    if earlier := set_aside(*file):
+    if earlier := move_earlier_recordings(*file):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)
     control_port = None if control is None else Control(control)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.files import write_text
-from drake_teleop.common.html import embedded, render
+from drake_teleop.common.html import png_data_url, render_page
 
 # Parameters of Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETERS = (
@@ -210,14 +210,14 @@ def write_report(
     replay: str | None = None,
 ) -> None:
     """Write the HTML page with embedded figures; equal runs give equal pages."""
-    page = render(
+    page = render_page(
         "drake_teleop.lab.reproduction",
         "report.html.j2",
         setup=dict(setup),
         versions=versions(),
         tiles=_tiles(summary),
         comparisons=compare_with_paper(summary),
-        figures=[(item, embedded(item.png)) for item in figures],
+        figures=[(item, png_data_url(item.png)) for item in figures],
         parameters=parameters,
         summary=summary,
         replay=replay,

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.store import Store
 
@@ -152,7 +152,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
         from distributed import Client
     except ImportError:
         raise DrakeTeleopError(
-            "Dask is not installed", where="--cluster", remedy=install_extra("cluster")
+            "Dask is not installed", where="--cluster", remedy=remedy_to_install_extra("cluster")
         ) from None
     local = {
         "n_workers": jobs if jobs > 0 else None,

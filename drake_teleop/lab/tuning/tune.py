@@ -17,7 +17,7 @@ from drake_teleop.common.files import (
     write_picture,
     write_text,
 )
-from drake_teleop.common.html import embedded, render
+from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
@@ -88,11 +88,11 @@ def tune(
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
         write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
-        page = render(
+        page = render_page(
             "drake_teleop.lab.tuning",
             "report.html.j2",
             summary=summary,
-            picture=embedded(out / "trade_off.png"),
+            picture=png_data_url(out / "trade_off.png"),
         )
         write_text(out / "report.html", page)
         write_json(out / "summary.json", summary)
