@@ -87,6 +87,8 @@ def run(name: str) -> Any:
 
 def keep(name: str, figures: Any, beside: str) -> None:
     """Writes a record of today and of the package's newest commit."""
+    if isinstance(figures, dict):
+        figures = {name: value for name, value in figures.items() if name != "records"}
     commit = _git("log", "-1", "--format=%h", "--", "drake_teleop") or "unknown"
     changed = _git("status", "--porcelain", "--", "drake_teleop")
     record = {

@@ -86,7 +86,7 @@ def check_identified(name: str, phi: Array) -> Array:
 
 
 def positive_array(name: str, value: ArrayLike, *shape: int) -> Array:
-    """Return an array as `checked`; raise DrakeTeleopError unless all values are positive."""
+    """Return an array as `finite_array`; raise DrakeTeleopError unless all values are positive."""
     array = finite_array(name, value, *shape)
     if not (array > 0.0).all():
         raise DrakeTeleopError(

@@ -27,7 +27,7 @@ from drake_teleop.live.station_swap import copy_state
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import LOG, SIGNALS, signal_of
-from drake_teleop.station.simulation import MakeSimulator, advance, columns, read_log
+from drake_teleop.station.simulation import MakeSimulator, advance, log_columns, read_log
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 #: Rows in a part of a log on disk, two seconds. Copying a longer part would delay a slice; each
@@ -110,7 +110,7 @@ class _Station:
             take_short_steps_in_contact(self.simulator, _MIN_STEP_S)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG).FindMutableLog(self.context)
-        self.columns = columns(self.station)
+        self.columns = log_columns(self.station)
 
     def block(self, name: str) -> tuple[Any, Context]:
         inner_side = self.station.GetSubsystemByName("master_side").GetSubsystemByName("inner_side")
@@ -220,8 +220,8 @@ class Session:
         if wait_s:
             self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:
-            self._on_disk.take()
-            self._on_disk.follow(station.simulator)
+            self._on_disk.write_and_clear()
+            self._on_disk.continue_with(station.simulator)
         else:
             self._earlier_rows.append(self._rows())
         station.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
@@ -239,8 +239,8 @@ class Session:
             self._advance_to(self._filled_at_ms)
             self._station.open(bool(self.inputs.clutch))
         self._advance_to(end)
-        if self._on_disk is not None and self._on_disk.waiting() >= _PART_ROWS:
-            self._on_disk.take()
+        if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _PART_ROWS:
+            self._on_disk.write_and_clear()
             self._rows_read = 0
 
     def _advance_to(self, ms: int) -> None:
@@ -288,7 +288,7 @@ class Session:
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
-            self._on_disk.keep()
+            self._on_disk.write_and_keep()
             self._on_disk.finish()
 
     def _rows(self) -> SimulationResult:

@@ -245,7 +245,7 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
     return np.where(unknown[0] | unknown[1:], np.inf, np.sqrt(np.maximum(squares, 0.0)))
 
 
-def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
+def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
     return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
@@ -341,7 +341,7 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
             where="gripper",
             remedy="give the gripper alone as gripper, and the record with the object as the load",
         )
-    identifiable = worth_stating(deviations, phi) & ~undetermined
+    identifiable = is_precise_enough(deviations, phi) & ~undetermined
     identifiable[6:] &= total.identifiable[6:]
     return replace(
         total,

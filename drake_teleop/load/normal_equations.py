@@ -8,7 +8,7 @@ from scipy.special import fdtrc
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, positive_array, to_float
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
     Moments,
     coefficients,
@@ -65,7 +65,7 @@ class NormalEquations(Moments):
             phi=theta[6:],
             offsets=theta[:6],
             covariance=covariance,
-            identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
+            identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
             delay_s=to_float("delay_s", delay_s),
             residual_rms=np.sqrt(self.residual_squares(theta) / self.samples),

@@ -21,7 +21,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     motion_of_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
-from drake_teleop.logs.read.alignment import delay_of, ends, low_pass, undelayed
+from drake_teleop.logs.read.alignment import delay_of, low_pass, near_ends, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
@@ -31,24 +31,17 @@ _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
 def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
-    """Return motion and load of a log with poses, and the source of its delay.
-
-    `delay` is that of the motion behind the wrench [s], or "auto".
-    """
+    """Return motion and load of a log with poses, and the source of the delay."""
     return _with_delay(log, delay, lambda late: _estimate(log, late), 0.0, "undetermined")
 
 
 def motion_of_known_load(
     log: Log, delay: str | float, load: Array, usual_s: float
 ) -> tuple[PoseMotion, str] | None:
-    """Return the motion with which an identified load fits best, and the source of its delay.
+    """Return the motion from poses that fits an identified load best, and the source of the delay.
 
-    None without positions, for a short record, and if an IMU disagrees with the poses.
-
-    Args:
-        delay: of the motion behind the wrench [s], or "auto".
-        load: (6, 16) from `drake_teleop.logs.pose_motion.rigid.load_coefficients`.
-        usual_s: delay for a record that does not determine it [s].
+    The delay is `usual_s` [s] for a record that does not determine it. Return None without poses,
+    for a short record, and if the IMU disagrees with the poses.
     """
     posed = log.posed
     if posed is None or log.static:
@@ -93,10 +86,7 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log with spline motion and without delay, and flags (N,).
-
-    Flags are True near ends and gaps of the poses, where the acceleration is noisy.
-    """
+    """Return the log with spline motion and without delay, and (N,) True near ends and gaps."""
     assert log.posed is not None
     moved, splines = undelayed(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
@@ -124,7 +114,7 @@ def clock_note(found: PoseMotion) -> list[str]:
     side = "faster" if found.clock_rate > 0.0 else "slower"
     return [
         f"the clock of the pose runs {1e6 * abs(found.clock_rate):.0f} millionths {side} than"
-        " that of the wrench, which is taken out; to say so, multiply pose.time.scale (1 by"
+        " that of the wrench, which is corrected; to state it, multiply pose.time.scale (1 by"
         f" default) by {1.0 / (1.0 + found.clock_rate):.6f}"
     ]
 
@@ -159,13 +149,9 @@ def aligned_log(
 ) -> AlignedLog:
     """Read a log and remove the delay between motion and wrench.
 
-    The motion is from splines of the poses, or from an IMU if the load then fits better.
-
-    Args:
-        path, cutoff_hz, delay: as in `eliminate_log`.
-        phi: (10,) identified load.
-        usual_s: delay for a record that does not determine it [s].
-        weight_removed: True if the wrench does not contain the weight of the load.
+    The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
+    `delay` and its default `usual_s` are in [s]. `weight_removed` is True if the wrench does not
+    contain the weight of the load.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.free
@@ -179,27 +165,26 @@ def aligned_log(
         moved = replace(moved, notes=(*moved.notes, *clock_note(motion)))
         plain = undelayed(log, motion.delay_s) if differentiate else None
         if weight_removed:
-            moved = accelerated(moved)
-            plain = None if plain is None else accelerated(plain)
-        edge = one_sided | ends(moved, 0.0, cutoff_hz)
+            moved = replace_force_by_acceleration(moved)
+            plain = None if plain is None else replace_force_by_acceleration(plain)
+        edge = one_sided | near_ends(moved, 0.0, cutoff_hz)
         smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
         if log.posed is None or log.posed.imu is None:
             return smooth
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
-    log = accelerated(log) if weight_removed else log
+    log = replace_force_by_acceleration(log) if weight_removed else log
     delay_s, source = delay_of(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = usual_s, "load"
     log = undelayed(log, delay_s)
-    other = AlignedLog(log, delay_s, source, log, ends(log, log.one_sided_s, cutoff_hz))
+    other = AlignedLog(log, delay_s, source, log, near_ends(log, log.one_sided_s, cutoff_hz))
     if smooth is None or _spread(other, phi, cutoff_hz) < _spread(smooth, phi, cutoff_hz):
         return other
     return smooth
 
 
-def without_orientation(where: str) -> DrakeTeleopError:
-    """Return the error for a log with removed weight and without orientation."""
+def missing_orientation_error(where: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         "the robot has removed the weight of the load from the wrench, and without an orientation"
         " gravity cannot be subtracted from the measured acceleration",
@@ -208,10 +193,10 @@ def without_orientation(where: str) -> DrakeTeleopError:
     )
 
 
-def accelerated(log: Log) -> Log:
-    """Return the log with the acceleration in place of the specific force."""
+def replace_force_by_acceleration(log: Log) -> Log:
+    """Return the log with acceleration in place of specific force."""
     if log.gravity is None:
-        raise without_orientation(log.source)
+        raise missing_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 

@@ -20,10 +20,10 @@ class CausalWrench:
     """Contact and scaled wrenches of N samples, each computed from past samples only.
 
     Attributes:
-        mode: "delayed" or "predicted" (extrapolated over the lag).
+        mode: "delayed", or "predicted" (extrapolated over the lag).
         lag_s: delay of a slow contact without prediction [s].
         contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma V phi [N, N m].
-        offsets: (6,) sensor offsets that were subtracted [N, N m].
+        offsets: (6,) subtracted sensor offsets [N, N m].
     """
 
     mode: str
@@ -34,12 +34,9 @@ class CausalWrench:
 
 
 def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
-    """Filter samples x (N, ...) by a second-order Butterworth low-pass, Eq. (T11).
+    """Filter samples x (N, ...) by a causal second-order Butterworth low-pass, Eq. (T11).
 
-    Args:
-        dt: sample time [s].
-        cutoff_hz: frequency of half the amplitude; no filter for None or above the Nyquist rate.
-        ahead_s: time over which the output is extrapolated by its slope [s].
+    Extrapolate the output over `ahead_s` [s] by its slope. Do not filter for a cut-off of None.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -65,12 +62,7 @@ def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> 
 
 @njit(cache=True)
 def design_low_pass(dt, tangent, ahead_s, low_pass):
-    """Write the coefficients b, a_1, a_2 and the steady-state memory at input 1 to low_pass (7,).
-
-    Args:
-        tangent: tan(pi cutoff dt), for the bilinear transform.
-        ahead_s: see `causal_low_pass`.
-    """
+    """Write the low-pass for `tangent` = tan(pi cutoff dt) to the coefficients `low_pass` (7,)."""
     k = 2.0 / dt
     w = k * tangent / _ROOT_4_OF_3
     square, damping = w * w, _ROOT_OF_2 * w * k
@@ -96,12 +88,8 @@ def causal_wrenches(
 ) -> CausalWrench:
     """Return the filtered wrenches that a control loop has at each instant.
 
-    Args:
-        contact, scaled: (N, 6) unfiltered wrenches, with the motion of the same instants.
-        dt: sample time [s].
-        cutoff_hz: cut-off of the low-pass; None: no filter.
-        delay_s: delay of the motion behind the wrench [s], rounded up to a full sample.
-        mode: "delayed" keeps the lag, "predicted" extrapolates over it.
+    The delay of the motion behind the wrench, `delay_s`, is rounded up to full samples. The mode
+    "delayed" keeps the lag of the wrenches (N, 6), "predicted" extrapolates over it.
     """
     if mode not in MODES:
         raise DrakeTeleopError(

@@ -1,9 +1,4 @@
-"""Contact detection in a log, for the commands `detect` and `eliminate`.
-
-Contact begins where a statistic of the contact wrench clearly exceeds its maximum in free motion.
-Without a log of free motion, calm parts of the record itself are used (docs/theory.md, "On a
-record").
-"""
+"""Contact detection in a log (docs/detection.md), for the commands `detect` and `eliminate`."""
 
 from __future__ import annotations
 
@@ -52,11 +47,10 @@ class Detection:
     Attributes:
         floor: noise floor of the free motion.
         statistic, threshold: name of the used statistic, and its threshold.
-        statistics: (N, 3) all statistics; 0 at the unjudged ends.
+        statistics: (N, 3) all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
         free_s: duration of the free motion [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
-        notes: doubts about the result.
     """
 
     floor: NoiseFloor
@@ -70,12 +64,11 @@ class Detection:
 
     @property
     def above(self) -> NDArray[np.bool_]:
-        """Booleans (N,): True where the statistic reaches the threshold."""
+        """Booleans (N,): True where the statistic reaches the threshold, without hysteresis."""
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
-def samples_of(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
-    """Return the detector's input from a log and its low-passed contact wrench (N, 6)."""
+def detector_samples(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
     s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
@@ -97,15 +90,9 @@ def detect_contact(
 ) -> Detection | None:
     """Find contact in a log; return None for fewer than 100 judged samples.
 
-    Args:
-        rows: samples of the whole log.
-        dt: sample time [s].
-        cutoff_hz: cut-off of the low-pass; one of its periods at both ends is not judged.
-        covariance: (16, 16) of [offsets; phi], from `finite_covariance`.
-        usual: (6,) RMS residual of the identification [N, N m].
-        edge: (N,) True for further samples that are not judged.
-        free: samples of a log of free motion, and its sample time [s].
-        statistic: "level", "cusum" or "glr".
+    Samples with `edge` True, or within a period of the low-pass from the ends, are not judged.
+    `covariance` (16, 16) is that of [offsets; phi], `usual` (6,) the RMS residual of the
+    identification [N, N m]. `free` is a log of free motion, and its sample time [s].
     """
     period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
     inner = _judged_samples(rows, dt, period, edge)
@@ -236,10 +223,7 @@ def _detection_notes(
 
 
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if most of a record seems to be contact, else ().
-
-    `shift` (6,) is the difference of its offsets from those of the free motion [N, N m].
-    """
+    """Return a note if most of a record seems to be contact, which shifts its offsets, else ()."""
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _CONTACT_SHARE_OF_SHIFT:
         return ()

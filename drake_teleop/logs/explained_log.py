@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import yaml_data
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
-from drake_teleop.logs.causes.intervals import attenuation
+from drake_teleop.logs.causes.intervals import attenuation_bias
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
+from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_share
 from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.auto_frames import log_instants
 from drake_teleop.logs.read.canonical import Log
@@ -48,11 +48,8 @@ _OTHER_REMEDIES = {
 }
 
 
-def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
-    """Return the causes; their messages now end in the description lines that correct them.
-
-    `by_pose` is True if the acceleration is from poses, not from an IMU.
-    """
+def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
+    """Add the corrected lines of the log description to the messages of causes."""
     _, texts, corrected = _correct_fields(causes, log, by_pose)
     return tuple(
         replace(cause, message=f"{cause.message}; {text}", fields=fields) if text else cause
@@ -61,7 +58,7 @@ def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cau
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Return a message with the units to correct if a mass [kg] is above 1000 kg, or None."""
+    """Return which units to correct for a mass above 1000 kg, or None for a smaller one."""
     if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
@@ -219,10 +216,7 @@ _BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
-    """Search for causes why a rigid load does not explain the wrench; None for a short log.
-
-    `delay_s` is the delay of the motion behind the wrench [s], `found` the motion by splines.
-    """
+    """Search for causes why a rigid load does not explain the wrench; None for a short log."""
 
     def with_delay(more: float) -> Instants:
         late = delay_s + more
@@ -236,7 +230,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
     why = explain(data, with_delay, log.free)
     if log.described is None:
         return why
-    causes = with_lines(why.causes, log, by_pose=found is not None)
+    causes = add_description_lines(why.causes, log, by_pose=found is not None)
     return replace(why, causes=causes)
 
 
@@ -262,7 +256,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 def _acceleration_noise(splines: PoseSplines) -> float:
     f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
-    share = passed(f, splines.spacing)
+    share = passed_noise_share(f, splines.spacing)
     if splines.imu_rows is not None:
         share = share * splines.imu_rows.share(f)[0]
     power = 2.0 * splines.noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
@@ -274,11 +268,11 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
     load = _explained_load(load, why)
     if why.state.data.gravity_W is not None:
         return load
-    extra = attenuation(why.state)
+    extra = attenuation_bias(why.state)
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
     covariance = load.covariance + np.diag(extra**2)
-    known = load.identifiable & worth_stating(np.sqrt(np.diag(covariance)), load.phi)
+    known = load.identifiable & is_precise_enough(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)
 
 
@@ -292,10 +286,10 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
         if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MAX_DEVIATION_RATIO:
             return load
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
-        known = load.identifiable & worth_stating(np.sqrt(np.diag(wide)), load.phi)
+        known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)
         return replace(load, covariance=wide, identifiable=known)
     deviations = np.sqrt(np.diag(why.covariance))
-    identifiable = worth_stating(deviations, why.theta[6:])
+    identifiable = is_precise_enough(deviations, why.theta[6:])
     if why.causes and why.causes[0].name == "no load":
         identifiable = np.repeat([True, False], [6, 10])
     if why.several_gains:
@@ -315,19 +309,15 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
     )
 
 
-def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
-    """Return the causes, with `finding` instead of "pose frame" and "sensor rotation".
-
-    Only if these are the only extensions of the model.
-    """
+def replace_frame_causes(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
+    """Replace "pose frame" and "sensor rotation" by `finding` if no other causes are modelled."""
     if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (Cause(finding.name, finding.message), *kept)
     return why.causes
 
 
-def removed_note(why: Explanation) -> str:
-    """Return a note about the weight that the robot removes (`wrench.weight: removed`), or ""."""
+def removed_weight_note(why: Explanation) -> str:
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]

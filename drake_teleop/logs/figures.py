@@ -26,7 +26,6 @@ from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 def common_figures(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
-    """Return the fields with which the summaries of `identify` and `eliminate` begin."""
     log = found.log
     findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {
@@ -43,7 +42,6 @@ def common_figures(
 
 
 def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
-    """Return the numbers of the load in one part of a record for a summary [SI]."""
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -59,7 +57,6 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 
 def load_figures(load: Identification) -> dict[str, Any]:
-    """Return the numbers of a load for a summary: values and uncertainties [SI]."""
     deviations = load.standard_deviations
     ends = intervals(load)
     return {
@@ -79,7 +76,6 @@ def load_figures(load: Identification) -> dict[str, Any]:
 
 
 def object_figures(alone: Identification) -> dict[str, Any]:
-    """Return the numbers of an object without its gripper for a summary [SI]."""
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -88,21 +84,21 @@ def object_figures(alone: Identification) -> dict[str, Any]:
 
 
 def object_notes(alone: Identification) -> list[str]:
-    """Return warnings for an object with a doubtful mass or impossible parameters."""
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
-            f"no object: the gripper's mass is exceeded by {alone.mass:.4g} ± {deviation:.2g} kg"
+            f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
+            f" ± {deviation:.2g} kg"
         ]
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
     if margin < -SIGNIFICANT * deviation:
         return [
-            "no body can have the object's parameters: were gripper and total identified about the"
-            " same sensor frame, with the same gripper?"
+            "the object's parameters are physically impossible; check that gripper and total were"
+            " identified in the same sensor frame, with the same gripper"
         ]
-    return ["the object's parameters are those of a possible body within their uncertainty only"]
+    return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
 def _named(result: Identification, identifiable: bool) -> list[str]:
@@ -129,7 +125,6 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
 
 
 def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
-    """Return noise floor, contacts and causal wrenches for a summary."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,
@@ -162,7 +157,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
 
 
 def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return the share of samples with |F| > `threshold` [N], for raw and corrected wrenches."""
+    """Return the shares of samples with |F| > `threshold` [N], of raw and corrected wrenches."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,

@@ -21,7 +21,7 @@ from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import seconds, shortest_gap
+from drake_teleop.logs.read.clocks import shortest_gap, time_stamps_s
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -44,16 +44,10 @@ _QUANTITIES = (
 def inspect_command(
     log: Path, out: Path, *, others: Sequence[Path] = (), quiet: bool = False
 ) -> dict[str, Any]:
-    """Inspect a canonical log, a log description, any table or a bag.
+    """Inspect a canonical log, a log description, any table or a bag; return the summary.
 
-    Write summary.json into the folder `out`, and draft.yaml for unknown tables and bags: a
-    description of all of them, in which signs, axes and units are those that fit the data.
-
-    Args:
-        others: further tables or bags of the same recording.
-
-    Returns:
-        the summary.
+    Write summary.json into the folder `out`. For unknown tables and bags also write draft.yaml: a
+    description of `log` and `others` (files of the same recording) that fits the data.
     """
     summary: dict[str, Any] = {"log": str(log), "kind": "description", "topics": {}, "streams": {}}
     summary |= {"findings": [], "fit": None, "mounting": None, "delay_s": None, "draft": None}
@@ -132,9 +126,9 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
 
 
 def _fitted_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
-    """Return the draft description corrected by its data, and inspect it.
+    """Inspect a draft description, and return it corrected by its data.
 
-    Each round applies the first finding that names the right values of fields.
+    Each round applies the first finding with corrected fields.
     """
     tables: dict[Path, Table] = {}
     for _ in range(_MAX_CORRECTIONS):
@@ -273,7 +267,7 @@ def _clock(
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return [], np.ones(rows, bool)
-    stamps, figures["episodes"] = seconds(time, table, at)
+    stamps, figures["episodes"] = time_stamps_s(time, table, at)
     highest = np.fmax.accumulate(stamps)
     usable = np.isfinite(stamps)
     usable[1:] &= stamps[1:] > highest[:-1]
@@ -346,7 +340,6 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
 
 
 def _without(table: Table, rows: NDArray[np.intp]) -> Table:
-    """Return the table without some rows."""
     if not len(rows):
         return table
     kept = np.setdiff1d(np.arange(table.rows), rows)

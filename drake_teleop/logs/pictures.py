@@ -68,7 +68,7 @@ def draw_knowledge(found: IdentifiedLog) -> Figure:
 
 
 def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
-    """Write two PNG files of equal width as one PNG `page`."""
+    """Write the image of two PNG files of equal width, one above the other, to `page`."""
     from matplotlib.image import imread, imsave
 
     with whole_file(page) as unfinished:
@@ -76,10 +76,9 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
 
 
 def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
-    """Return frequencies (m,) [Hz] without 0, and one-sided amplitude spectral densities (m, k).
+    """Return frequencies (m,) [Hz] and one-sided amplitude spectral densities (m, k) of x (N, k).
 
-    Welch's method; x (N, k) are samples with sample time `dt` [s], densities in unit of x /
-    sqrt(Hz).
+    Welch's method. The densities are in unit of x / sqrt(Hz). Frequency 0 is omitted.
     """
     from scipy.signal import welch
 

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import clock_note, motion_and_load, use_spline_motion
 from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.pose_checks import pose_finding, usable
+from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, widened
+from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_passed, widened
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import NO_YAML
 from drake_teleop.logs.read.table_files import FORMATS
@@ -33,11 +33,10 @@ _CHUNK, _NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for 
 
 @dataclass(frozen=True)
 class PosedFit:
-    """Load identified from a log with poses.
+    """Load identified from a log with poses, after removal of the delay `delay_s` [s].
 
     Attributes:
         log: used samples with the motion of splines, low-passed.
-        delay_s: removed delay of the motion behind the wrench [s].
         source: of the delay: "given", "estimated", or "undetermined" (0 was used).
     """
 
@@ -55,13 +54,8 @@ def fit_posed(
 
     The load is None for a method without splines, a log without usable poses, or an IMU that
     contradicts the poses.
-
-    Args:
-        method: "robust" or "consistent" use splines.
-        cutoff_hz: cut-off of the low-pass on samples and residual.
-        delay: delay of the motion behind the wrench [s], or "auto".
     """
-    if log.posed is None or method not in ROBUST or not usable(log):
+    if log.posed is None or method not in ROBUST or not has_usable_poses(log):
         return None, ()
     found, source = motion_and_load(log, delay)
     finding = None if log.free else pose_finding(found, log)
@@ -71,7 +65,7 @@ def fit_posed(
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
-    shown = low_passed(moved, cutoff_hz).only(measured(moved, cutoff_hz) & ~one_sided)
+    shown = low_passed(moved, cutoff_hz).only(far_from_gaps(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _fit(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
@@ -122,7 +116,7 @@ def _fit(
         phi=theta[6:],
         offsets=theta[:6],
         covariance=covariance,
-        identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
         residual_rms=noise,
         method=METHODS[method].name,
     )

@@ -41,20 +41,26 @@ from drake_teleop.logs.contact import (
     MIN_SAMPLES,
     Detection,
     detect_contact,
+    detector_samples,
     noise_floor,
     offset_shift_note,
     robust_offsets,
-    samples_of,
 )
 from drake_teleop.logs.explained_log import (
     explain_log,
     explained_load,
     implausible_mass_message,
-    named_frame,
-    removed_note,
+    removed_weight_note,
+    replace_frame_causes,
 )
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
-from drake_teleop.logs.read.alignment import delay_of, low_pass, low_passed, measured, undelayed
+from drake_teleop.logs.read.alignment import (
+    delay_of,
+    far_from_gaps,
+    low_pass,
+    low_passed,
+    undelayed,
+)
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
@@ -107,7 +113,7 @@ class EliminatedLog:
     Attributes:
         log: without delay and gaps; not low-passed.
         phi: (10,) removed load, gripper and object.
-        point_mass: undetermined inertias, set to those of a point mass.
+        point_mass: names of undetermined inertias, replaced by those of a point mass.
         offsets: (6,) sensor offsets of this record [N, N m].
         tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
         delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
@@ -194,7 +200,7 @@ def _identified(
     else:
         delay_s, source = delay_of(log, cutoff_hz, delay)
         log = undelayed(log, delay_s)
-        log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
+        log = low_passed(log, cutoff_hz).only(far_from_gaps(log, cutoff_hz))
         fit = identify_batch(
             log.wrench,
             *log.motion,
@@ -219,10 +225,10 @@ def _identified(
         result = replace(result, identifiable=known)
     if why is not None:
         result = explained_load(result, why)
-        causes = named_frame(why, other[0]) if other else why.causes
+        causes = replace_frame_causes(why, other[0]) if other else why.causes
     note = fit.note if not causes or (why is not None and why.several_gains) else ""
     if raw.free and why is not None:
-        note = removed_note(why)
+        note = removed_weight_note(why)
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
@@ -266,12 +272,7 @@ def _can_be_explained(log: Log, by_splines: bool) -> bool:
 
 
 def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
-    """Check a log and its description, including causes that identification finds.
-
-    Args:
-        path: canonical table or log description.
-        checks: result of `check_file` for this log, if known.
-    """
+    """Check a log and its description, including causes that identification finds."""
     checks = check_file(path) if checks is None else checks
     try:
         identified = identify_log(path, checks=checks)
@@ -382,10 +383,10 @@ def eliminate_log(
         )
     if found.log.static:
         return found
-    samples = samples_of(found.log, found.contact, cutoff_hz)
+    samples = detector_samples(found.log, found.contact, cutoff_hz)
     reference = None
     if free_motion is not None:
-        free_samples = samples_of(free_motion.log, free_motion.contact, cutoff_hz)
+        free_samples = detector_samples(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.at(~free_motion.edge), free_motion.log.dt
     covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
     options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
@@ -432,7 +433,7 @@ def _eliminated(
         raise DrakeTeleopError(
             "poses at rest have no order in time", where="causal", remedy="leave it out"
         )
-    known = measured(log, cutoff_hz)
+    known = far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
     def smooth(wrench: Array) -> Array:
@@ -527,10 +528,7 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return phi (10,) with undetermined inertias set to a point mass's, and their names.
-
-    Weakly identified inertias are kept: they are nearer to the truth.
-    """
+    """Return phi (10,) with undetermined inertias set to those of a point mass, and their names."""
     phi = identification.phi.copy()
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
@@ -550,8 +548,7 @@ def _suspected_errors(
     return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
-def removed_weight(where: str) -> DrakeTeleopError:
-    """Return the error for different scales of weight and inertia of a removed weight."""
+def weight_scale_error(where: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         "the robot has removed the weight, so that sigma_weight has no effect",
         where=where,
@@ -565,7 +562,7 @@ def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
     if weights == inertias:
         return
     if removed:
-        raise removed_weight(log.source)
+        raise weight_scale_error(log.source)
     if log.gravity is None:
         raise unknown_gravity(
             f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
@@ -601,7 +598,7 @@ def _scales(
         raise DrakeTeleopError(
             "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
             where="eta",
-            remedy="leave all scales but eta out",
+            remedy="remove all scales except eta",
         )
     sigma_gripper, kept, gamma = scales_from_eta(eta)
     return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}
@@ -628,10 +625,8 @@ def detect_log(
     Args:
         path: canonical table or log description.
         load: identification.json or its content; None: load identified from the log itself.
-        free: log of equally fast free motion with the same load; None: calm parts of the log
-            itself.
+        free: log of equally fast free motion with the same load; None: calm parts of the log.
         statistic: "level", "cusum" or "glr".
-        cutoff_hz: cut-off of the low-pass.
         delay: delay of the motion behind the wrench [s], or "auto".
     """
     if load is None:

@@ -70,20 +70,17 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Write the HTML report of an identification, with embedded pictures.
+    """Write the HTML report of an identification, with fit.png and knowledge.png of its folder.
 
-    Args:
-        path: HTML file; fit.png and knowledge.png are beside it.
-        summary: summary of `identify_command`.
-        alone: identification of the object alone, if the gripper is known.
+    `alone` is the load of the object alone, if the gripper is known.
     """
     log, result = found.log, found.identification
     tables = [
         (
             "The load and the sensor's offsets",
-            "About the origin of the sensor frame S, in its axes. The intervals hold the truth in"
-            " 95 of 100 records, as far as the residual is noise. Nothing is printed where the"
-            " record says nothing.",
+            "About the origin of the sensor frame S, in its axes. The intervals contain the true"
+            " value in 95 of 100 records, if the residual is noise. Parameters that the record"
+            " does not determine have no value.",
             parameter_rows(result),
         )
     ]
@@ -91,7 +88,7 @@ def write_report(
         tables.append(
             (
                 "The object alone",
-                "The load less the gripper of the file that was given; uncertainties of both add.",
+                "The load minus the given gripper; the uncertainties of both are combined.",
                 parameter_rows(alone)[6:],
             )
         )
@@ -118,14 +115,14 @@ def write_report(
             (
                 "Fit",
                 png_data_url(path.parent / "fit.png"),
-                "Measured wrench and V φ without the offsets, and what is left between them.",
+                "Measured wrench and V φ, both without offsets, and their difference.",
             ),
             (
                 "Residual, intervals and identifiability",
                 png_data_url(path.parent / "knowledge.png"),
                 f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
-                "its standard deviation, as shares of what is natural for a load of this mass and "
-                "size: up to 5 % it is identified, up to 50 % weakly, beyond that not.",
+                "its standard deviation, relative to a typical value for a load of this mass and "
+                "size: identified up to 5 %, weakly identified up to 50 %, else not identified.",
             ),
         ],
         summary=dict(summary),

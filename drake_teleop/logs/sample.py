@@ -69,7 +69,7 @@ class Touch:
     push_W: tuple[float, float, float]
 
     def force(self, t: Array) -> Array:
-        """Return the force (N, 3) on the gripper, in the world [N], at times t (N,) [s]."""
+        """Return the force (N, 3) on the gripper in the world [N]."""
         share = np.clip((t - self.start_s) / (self.stop_s - self.start_s), 0, 1)
         return np.outer(np.sin(np.pi * share), self.push_W)
 
@@ -190,11 +190,7 @@ def _motion(number: int) -> _Motion:
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link S.
-
-    Args:
-        q, qd, qdd: (N, 6) joint angles and their derivatives [rad, s].
-    """
+    """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link S."""
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
     s = p + np.array([0.0, 0.0, STANDARD_GRAVITY])
@@ -287,9 +283,7 @@ def sample_episode(
 ) -> SampleEpisode:
     """Return an episode whose motion, contacts and noise follow from its number and the seed.
 
-    Args:
-        phi: (10,) load.
-        lag_frames: delay of the poses behind the wrench [frames].
+    `lag_frames` is the delay of the poses behind the wrench, in frames.
     """
     from scipy.spatial.transform import Rotation
 

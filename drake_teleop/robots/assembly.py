@@ -16,7 +16,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import quaternions_of, rotation_matrices
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.logs.aligned_log import without_orientation
+from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, skew_parts, smoother
 from drake_teleop.robots.compensator import CLOCK_DRIFT, JUMP_S, MAX_OFFSET_DRIFT, STALE_S
@@ -323,7 +323,7 @@ class Assembly:
         weight_removed: bool = False,
     ) -> None:
         if weight_removed and parts.motion_stream == IMU:
-            raise without_orientation("the source")
+            raise missing_orientation_error("the source")
         self._parts, self._delay, self.dt = parts, delay_s, parts.dt
         self._tracker = None
         if track is not None:
@@ -341,6 +341,7 @@ class Assembly:
         return self._delay if self._tracker is None else self._tracker.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
+        """Return the readings completed within `timeout_s` [s]; None after the last wrench."""
         arrived = self._parts.read(timeout_s)
         if arrived is None:
             return None

@@ -72,12 +72,12 @@ def run(
                 report(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    def timeout_s() -> float:
+    def longest_wait_s() -> float:
         left = compensator.time_to_stale(time.monotonic())
         return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
 
     with suppress(KeyboardInterrupt), handled_sigint():
-        while not INTERRUPTED.is_set() and (readings := source.read(timeout_s())) is not None:
+        while not INTERRUPTED.is_set() and (readings := source.read(longest_wait_s())) is not None:
             if (
                 source.live
                 and (stale := compensator.stale_output(time.monotonic()))

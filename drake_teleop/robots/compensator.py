@@ -15,7 +15,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.compensation import unknown_gravity
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
-from drake_teleop.logs.processing import removed_weight, usable_phi
+from drake_teleop.logs.processing import usable_phi, weight_scale_error
 from drake_teleop.robots.compensation_step import (
     AT_RANGE,
     MAX_FORCE_DRIFT,
@@ -173,7 +173,7 @@ class Compensator:
         weight = sigma if sigma_weight is None else sigma_weight
         inertia = sigma if sigma_inertia is None else sigma_inertia
         if weight != inertia and self._weight_removed:
-            raise removed_weight("load")
+            raise weight_scale_error("load")
         scales_into(float(weight), float(inertia), float(gamma), self._scales)
 
     def step(self, reading: Reading, now: float) -> Compensated:

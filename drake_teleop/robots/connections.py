@@ -11,7 +11,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.aligned_log import without_orientation
+from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.robots.assembly import (
     IDENTITY_POSE,
     Assembly,
@@ -80,7 +80,7 @@ def open_source(
         remedy = f"give {_forms(SOURCES, PART_SOURCES)}, or replay:LOG"
         raise DrakeTeleopError("is not a source", where=address, remedy=remedy)
     if load is not None and load.weight_removed:
-        raise without_orientation(address)
+        raise missing_orientation_error(address)
     return SOURCES[kind](address, _period(rate_hz, address))
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.aligned_log import accelerated
+from drake_teleop.logs.aligned_log import replace_force_by_acceleration
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.logs.read.alignment import delay_of, measured, undelayed
+from drake_teleop.logs.read.alignment import delay_of, far_from_gaps, undelayed
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 
@@ -43,7 +43,7 @@ class LogSource(Source[Reading]):
             )
         delay_s = 0.0
         if load is not None:
-            log = accelerated(log) if load.weight_removed else log
+            log = replace_force_by_acceleration(log) if load.weight_removed else log
             delay_s, source = delay_of(log, cutoff_hz, delay, usable_phi(load)[0])
             if source == "undetermined":
                 delay_s = load.delay_s
@@ -52,7 +52,7 @@ class LogSource(Source[Reading]):
         self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
         self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])
         self._gravity = log.gravity
-        self._flags = np.where(measured(log, cutoff_hz), 0, int(ReadingFlag.GAP))
+        self._flags = np.where(far_from_gaps(log, cutoff_hz), 0, int(ReadingFlag.GAP))
         self._at, self._chunk, self._start = 0, chunk, math.nan
 
     def read(self, timeout_s: float) -> list[Reading] | None:

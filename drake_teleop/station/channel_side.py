@@ -22,9 +22,7 @@ Array = NDArray[np.float64]
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
-    """Build the channel of a scenario.
-
-    An ideal network without a method consists of wires only; "network" below means all other cases.
+    """Build the channel of a scenario: wires only for an ideal network without a method.
 
     .. pydrake_system::
 
@@ -33,16 +31,16 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         - pose_command: (7,) X_WS, from the master side
         - wrench_B: (6,) F_E_B, wrench to render, from the slave side [N, N m]
         - contact: (1,) flag of the slave's detector (with contact detection)
-        - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m] (network)
-        - pose_slave: (7,) actual X_WS of the slave (network)
-        - saturated: (1,) 1 while the wrench is invalid (network)
-        - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; read by methods
-          that need it apart; may stay unconnected (network)
+        - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m] (not for wires)
+        - pose_slave: (7,) actual X_WS of the slave (not for wires)
+        - saturated: (1,) 1 while the wrench is invalid (not for wires)
+        - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; may stay
+          unconnected (not for wires)
         output_ports:
         - pose_to_slave: (7,) X_WS, setpoint of the slave
         - wrench_to_master: (6,) F_E_B, wrench to render [N, N m]
         - contact_at_hand: signal for the log (with contact detection)
-        - pose_received, ports: signals for the log (network)
+        - pose_received, ports: signals for the log (not for wires)
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
@@ -99,8 +97,7 @@ def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> Passivit
 def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     """Return the scenario's passivity method, with mass and servo of the arm if it needs them.
 
-    Raises:
-        DrakeTeleopError: if the arm has fewer than six joints (unbounded mass in a direction).
+    A DrakeTeleopError is raised if the arm has fewer than six joints (unbounded mass).
     """
     passivity = scenario.passivity
     if not METHODS[passivity.method].needs_arm_mass or passivity.slave_mass is not None:
@@ -122,16 +119,12 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 
 
 def power_scale(scenario: Scenario) -> Array:
-    """Return the master's power over the slave's (2,), for translation and rotation.
-
-    It is the contact's scale over motion scale, where a motion scale of 0 counts as 1.
-    """
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
 def _contact_scale(scenario: Scenario) -> float:
-    """Return force scale times gamma; a gamma of 0, which displays no contact, counts as 1."""
+    """Return force scale times gamma, where a gamma of 0 (no displayed contact) counts as 1."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

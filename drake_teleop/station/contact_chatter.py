@@ -35,10 +35,9 @@ class Chatter(NamedTuple):
 
 
 def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
-    """Return each series of touches that the command does not explain.
+    """Return each series of touches that no reversal of the command explains.
 
-    A series has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
-    A reversal of the command explains one touch within 0.1 s.
+    It has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
 
     Args:
         t: (N,) evenly spaced times [s].
@@ -59,7 +58,6 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
 
 
 def _find_touches(t: Array, force: Array) -> Array:
-    """Return the start times of touches [s]."""
     if len(t) < 2:
         return np.empty(0)
     rows = 2 * round(_AROUND_S / (t[1] - t[0])) + 1

@@ -1,4 +1,4 @@
-"""3D replay: one HTML file with Meshcat and a player, which works offline in any browser."""
+"""3D replay: one HTML file with Meshcat and a player, for any browser without network."""
 
 from __future__ import annotations
 
@@ -61,7 +61,6 @@ class Reading:
     """Number displayed beside the replay.
 
     Args:
-        name, unit: label.
         values: (F,) one value per frame; NaN where the number does not exist.
         colour: colour of the curve, "#rrggbb"; "" for no curve. All curves share one scale.
         arrow: True if arrows of this colour represent the number.
@@ -74,7 +73,6 @@ class Reading:
     arrow: bool = False
 
     def for_page(self) -> dict[str, object]:
-        """Return label and values as the JSON data that the player reads."""
         largest = float(np.nanmax(np.abs(self.values), initial=0.0))
         return {
             "name": self.name,
@@ -95,8 +93,7 @@ class Film:
         slow_motion: initial speed: seconds of replay per second of `times`.
         readings: numbers beside the replay.
         shaded: intervals of `times` that the curves mark.
-        clock: label of the times.
-        curves: label of the curves; "{top}" is replaced by the largest value.
+        clock, curves: labels; in that of the curves "{top}" is replaced by the largest value.
     """
 
     title: str
@@ -166,14 +163,9 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times of the replay's frames (F,) [s], and the slow motion.
+    """Return the times (F,) of a replay's frames [s], and its slow motion (replay per real second).
 
-    There are 50 frames per second of replay, at most 2001.
-
-    Args:
-        start, stop: displayed interval [s].
-        slow_motion: seconds of replay per second; default: the lowest for which the replay lasts 6
-            s.
+    By default the replay lasts at least 6 s.
     """
     span = stop - start
     if slow_motion is None:
@@ -186,7 +178,6 @@ def frame_times(start: float, stop: float, slow_motion: float | None = None) -> 
 
 
 def set_plain_background(meshcat: Meshcat) -> None:
-    """Set a light Meshcat background without grid and axes."""
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", [0.97, 0.98, 1.0])
@@ -210,7 +201,6 @@ def add_shapes(
 
 
 def rgba(colour: str) -> Rgba:
-    """Convert the colour "#rrggbb" to Drake's `Rgba`."""
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
 
 
@@ -227,7 +217,7 @@ class Arrow:
         meshcat.SetObject(f"{self._path}/head/scaled", head, rgba(colour))
 
     def show(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
-        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W; `film_time` in s."""
+        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `film_time` [s]."""
         length = _ARROW_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _HEAD_LENGTH_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
@@ -245,7 +235,6 @@ class Arrow:
 
 @contextmanager
 def quiet_drake() -> Iterator[None]:
-    """Suppress log messages of Drake, such as the address of Meshcat."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

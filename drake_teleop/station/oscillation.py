@@ -42,14 +42,12 @@ def oscillates(
 ) -> Flags:
     """Return (N,) booleans: True while the actual motion oscillates and the command does not.
 
-    An oscillation has at least four reversals, each within 0.5 s of the previous one. A reversal
-    of the command explains one reversal of the motion within the time `near`.
+    An oscillation has at least four reversals larger than `swing`, each within 0.5 s of the
+    previous one. A reversal of the command explains one of the motion within `near` [s].
 
     Args:
         t: (N,) times [s].
-        command, actual: (N, k) commanded and actual motion in one unit.
-        swing: smallest amplitude, in that unit.
-        near: largest time between the two reversals [s].
+        command, actual: (N, k) commanded and actual motion in the unit of `swing`.
     """
     commanded = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
@@ -62,7 +60,7 @@ def oscillates(
 
 
 def pose_oscillates(t: Array, command: Array, actual: Array, near: float) -> Flags:
-    """Return `oscillates` of position or orientation, for poses (N, 7)."""
+    """Return (N,) booleans as `oscillates`, of position or orientation, for poses (N, 7)."""
     turned, wanted = (rotation_near(pose, command) for pose in (actual, command))
     swaying = oscillates(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
     return swaying | oscillates(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
@@ -76,16 +74,16 @@ def pose_reversals(t: Array, pose: Array) -> Array:
 
 
 def rotation_near(pose: Array, reference: Array) -> Array:
-    """Return (N, 4) twice the quaternions of poses: small changes equal the rotation [rad].
+    """Return (N, 4) twice the quaternions of poses (N, 7): small changes equal the rotation [rad].
 
-    The quaternions take the sign of the first pose of `reference`.
+    The quaternions take the sign of the first one of `reference`.
     """
     q: Array = pose[:, :4]
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
 def remove_explained(times: Array, causes: Array, near: float) -> Array:
-    """Return the times without one time for each cause: the nearest within `near` [s]."""
+    """Return event times [s] without the nearest one to each cause within `near` [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
         if len(times) and distances.min() < near:
@@ -94,14 +92,11 @@ def remove_explained(times: Array, causes: Array, near: float) -> Array:
 
 
 def split_at_gaps(times: Array, longest: float) -> list[Array]:
-    """Return series of times in which none is more than `longest` [s] after the previous one."""
+    """Split sorted times [s] where two are more than `longest` [s] apart."""
     return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
 
 
 def fast_part(t: Array, signal: Array) -> Array:
-    """Return the part of `signal` (N, k) above 5 Hz: the signal minus its mean over 0.2 s.
-
-    `t` (N,) are evenly spaced times [s].
-    """
+    """Return the part of `signal` (N, k) above 5 Hz, for evenly spaced times `t` (N,) [s]."""
     rows = max(round(0.2 / (t[1] - t[0])), 1) if len(t) > 1 else 1
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")

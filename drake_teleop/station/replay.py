@@ -1,7 +1,4 @@
-"""3D replay of a simulation: `replay.html` of a run and the command `drake-teleop replay`.
-
-Arrows are forces, 3 mm per newton: blue measured by the wrist sensor, orange calculated contact.
-"""
+"""3D replay of a simulation: `replay.html` of a run and the command `drake-teleop replay`."""
 
 from __future__ import annotations
 
@@ -78,11 +75,7 @@ def replay_command(
     Args:
         run: folder written by `run` or `reproduce`, or a log in it.
         out: output folder: replay.html, or one file per log for several logs.
-        scenario: shipped scenario or YAML file; by default `scenario.yaml` beside the log, or the
-            YAML file with the log's name.
-
-    Raises:
-        DrakeTeleopError: if there is no log or no scenario.
+        scenario: shipped scenario or YAML file; by default the YAML file beside the log.
     """
     logs = _find_logs(run)
     films = []
@@ -104,14 +97,11 @@ def write_replay(
 ) -> None:
     """Write the replay of a run to an HTML file.
 
-    Args:
-        result: signals slave_state, measured_wrench_S, load_estimate; optionally master_state,
-            contact_wrench_S, force_to_master and sheet_state.
-        slow_motion: initial speed: seconds of replay per second of the run; by default the replay
-            lasts at least 6 s.
+    `slow_motion` is the initial speed in seconds of replay per second of the run; by default the
+    replay lasts at least 6 s.
 
     Raises:
-        DrakeTeleopError: if required signals are missing.
+        DrakeTeleopError: if slave_state, measured_wrench_S or load_estimate is missing.
     """
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
@@ -204,9 +194,7 @@ def _find_scenario(log: Path) -> Path:
 class ReplayScene:
     """Meshcat scene of a replay, which shows one sample at a time.
 
-    Attributes:
-        plant: slave, surroundings and haptic device, for shapes and kinematics only.
-        canvas: receiver of poses and sizes; Meshcat by default.
+    `plant` contains slave, surroundings and haptic device, for shapes and kinematics only.
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
@@ -278,7 +266,7 @@ class ReplayScene:
             arrow.show(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
-        """Set the pose (7,) of a moving body; its parents must have theirs."""
+        """Set the pose (7,) of a moving body, after those of its parents."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
@@ -308,10 +296,10 @@ class ReplayScene:
         return places
 
 
-class _Device(NamedTuple):
+class _ReplayDevice(NamedTuple):
     """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    `positions` converts joint positions to those of the plant. `folder` keeps meshes in use.
+    `positions` converts joint positions to those of the plant.
     """
 
     instance: ModelInstanceIndex
@@ -321,7 +309,7 @@ class _Device(NamedTuple):
     folder: object = None
 
 
-def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
+def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if scenario.master.leader is not None:
         return _add_leader(plant, scenario.master.leader)
     is_phantom = scenario.master.model == PHANTOM
@@ -330,10 +318,10 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
-    return _Device(master, plant.GetFrameByName("stylus", master), _P_EGRIP_E, positions)
+    return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _P_EGRIP_E, positions)
 
 
-def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
+def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
     parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
 
@@ -342,7 +330,9 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
         ordered[order] = q
         return ordered
 
-    return _Device(parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder)
+    return _ReplayDevice(
+        parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder
+    )
 
 
 def _add_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:

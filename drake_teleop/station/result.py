@@ -51,9 +51,6 @@ class Signal:
         name: name of the signal's port, such as "measured_wrench_S".
         components: name of each of the k components ("f_x", ...).
         units: unit of each component, or one string for all ("1" for dimensionless).
-
-    Raises:
-        DrakeTeleopError: if the numbers of units and components differ.
     """
 
     name: str
@@ -105,7 +102,7 @@ class SimulationResult:
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             raise DrakeTeleopError(
-                f"names and specs differ in {', '.join(odd)}",
+                f"the names of signals and specs differ in {', '.join(odd)}",
                 where="signals",
                 remedy="give each signal one spec",
             )
@@ -228,7 +225,7 @@ class SimulationResult:
         missing = [name for name in _CANONICAL_COLUMNS if name not in self]
         if missing:
             raise DrakeTeleopError(
-                f"this result holds no {', '.join(missing)}",
+                f"the result contains no {', '.join(missing)}",
                 where="sensor log",
                 remedy="record the wrist sensor's signals",
             )
@@ -254,7 +251,7 @@ class SimulationResult:
     def write_part(self, folder: Path, first_row: int) -> None:
         """Write this result as one part of a longer log, in the format of `write_parquet`.
 
-        A part is complete or absent at any time. The same rows written again replace the part.
+        The same rows written again replace the part.
 
         Args:
             folder: folder of the log, prepared by `remove_log`.
@@ -277,7 +274,7 @@ class SimulationResult:
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log that may exceed the memory: each access to a signal reads it from the disk.
+        """Open a log larger than the memory: each access to a signal reads it from the disk.
 
         Args:
             path: file or folder of parts, from `write_parquet` or `simulate`.

@@ -1,23 +1,4 @@
-"""Warnings about a run from its recorded signals, and about overlaps of shapes at its start.
-
-============== ===================================================================================
-overlap        shapes of arm, tool or surroundings overlap at the start, see `posture_shapes`
-saturated      the wrist sensor is saturated
-fault          invalid numbers in the loop, see `drake_teleop.common.blocks`
-unreachable    the inverse kinematics have no solution
-clipped        a joint speed or motor torque, or the displayed force or torque, is at its limit
-leaf           the deflection of the leaf is outside the validity of its model
-safe state     an end of the channel receives no packets for longer than the channel's timeout
-behind         a pose or joint lags its command by more than delay and bandwidth explain
-reserve        the hand is faster than the energy reserve of `ledger` allows for the slave
-oscillation    hand, command or joint oscillates (limit cycle) while its command does not
-chatter        the tool loses and regains contact, see `drake_teleop.station.contact_chatter`
-fast force     over a network, the rendered force oscillates above 5 Hz while the hand rests
-============== ===================================================================================
-
-The first six are always reported, the others if they last longer than 0.2 s (`reserve`: in total;
-`chatter`: 0.3 s).
-"""
+"""Warnings about a run from its recorded signals, and about overlaps of shapes at its start."""
 
 from __future__ import annotations
 
@@ -80,12 +61,9 @@ _MAX_LISTED_TIMES = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """Return one sentence, with times, for each condition of the module's table that occurred.
+    """Return one sentence, with times, for each condition in docs/running.md that occurred.
 
-    Args:
-        result: result of a run; checks whose signals were not recorded are skipped.
-        scenario: scenario of the run.
-        arm: model of the slave's arm, with limits.
+    Checks whose signals were not recorded are skipped. `arm` is the slave's arm, with limits.
     """
     found = chain(
         _check_faults(result),
@@ -104,7 +82,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
 
 
 def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
-    """Return the time spans (start, stop) during which `happened` (N,) is true.
+    """Return the time spans (start, stop) [s] during which `happened` (N,) is true.
 
     Gaps below 50 ms are closed; then spans shorter than `least` [s] are dropped.
     """
@@ -119,13 +97,8 @@ def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
     """Return (N,) distance of the actual motion from the range of recent commands.
 
-    A delay reproduces earlier commands; a loop without overshoot returns a weighted mean of them.
-    Both stay inside the range of the commands in `window`.
-
-    Args:
-        t: (N,) evenly spaced times [s].
-        command, actual: (N, k) commanded and actual motion in one unit.
-        window: length of the range before each time [s].
+    A delay, or a loop without overshoot, stays inside this range. `t` (N,) are evenly spaced times
+    [s], `command` and `actual` are (N, k); the range covers the time `window` [s].
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _running_maximum(command, rows)
@@ -264,7 +237,7 @@ def _pose_parts(
 
 
 def _packet_ages(t: Array, scenario: Scenario) -> Array:
-    """Return (N,) age of the newest packet at the slave's end [s], from the run's network model."""
+    """Return (N,) age of the newest packet at the slave's end [s], from the network model."""
     period = 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     line, seed = scenario.channel.lines()[0], scenario.simulation.seed

@@ -1,7 +1,4 @@
-"""Scenarios: configuration of a station as dataclasses, read from YAML.
-
-Every field has a unit and a plausible range; an error names file and field.
-"""
+"""Scenarios: configuration of a station as dataclasses, read from YAML."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -128,7 +125,7 @@ class Scenario:
 
     @property
     def surroundings(self) -> Environment | None:
-        """All objects that the tool can touch as one `Environment`; None if there are none."""
+        """All objects that the tool can touch as one `Environment`, or None."""
         things = self._objects
         if not things:
             return None
@@ -136,7 +133,7 @@ class Scenario:
 
     @property
     def leaf(self) -> SheetSpring | None:
-        """Sheet spring from `sheet_spring` or `environment`; None if there is none."""
+        """Sheet spring from `sheet_spring` or `environment`, or None."""
         return next((thing for thing in self._objects if isinstance(thing, SheetSpring)), None)
 
     @property
@@ -170,7 +167,7 @@ class Scenario:
                 raise DrakeTeleopError(
                     f"there is more than one {name}",
                     where=f"{where}:environment",
-                    remedy="leave the others out",
+                    remedy="keep one",
                 )
         _check_task(self, where)
         _check_steps(self, where)
@@ -178,7 +175,6 @@ class Scenario:
 
 
 def check_scenario(scenario: Any) -> None:
-    """Raise a DrakeTeleopError for an invalid value, or an object that is not a Scenario."""
     remedy = "load one: LoadScenario(name)"
     if isinstance(scenario, (str, Path)):
         remedy = f"write LoadScenario({str(scenario)!r})"
@@ -212,11 +208,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
 
 
 def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
-    """Read a scenario file; return the unchecked data, and the file's name for messages.
-
-    Raises:
-        DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
-    """
+    """Read a scenario file; return the unchecked data, and the file's name for messages."""
     path = shipped_file("scenario", name_or_path, scenarios_dir())
     return read_yaml(path, tagged=True), str(path)
 
@@ -224,8 +216,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
 def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
-    Raises:
-        DrakeTeleopError: if neither is a file; `kind` is its name in the message.
+    `kind` is the file's name in the DrakeTeleopError if neither exists.
     """
     expect((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -237,11 +228,7 @@ def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
 
 
 def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | None = None) -> _T:
-    """Return settings from parsed YAML data; their ranges are not checked.
-
-    Raises:
-        DrakeTeleopError: for an unknown field, or a value of the wrong type.
-    """
+    """Return settings from parsed YAML data without checks of ranges; `where` is for messages."""
     check_structure(schema, data, where)
     data = dict(data)
     things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
@@ -255,10 +242,9 @@ def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | N
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
-    """Convert parsed YAML data to a checked scenario; `where` is the file's name for messages.
+    """Convert parsed YAML data to a checked scenario, or raise DrakeTeleopError.
 
-    Raises:
-        DrakeTeleopError: with the invalid field.
+    `where` is the file's name for messages.
     """
     check_structure(Scenario, data, where)  # before the presets are read
     defaults = Scenario(
@@ -277,8 +263,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5
 
-    Raises:
-        DrakeTeleopError: if there is no such block or field, or for an invalid value.
+    A DrakeTeleopError is raised for an invalid name or value.
     """
     expect(Scenario, scenario, "scenario")
     for name, value in changes.items():
@@ -305,7 +290,7 @@ def _check_task(scenario: Scenario, where: str) -> None:
     check_task(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
-            "a task needs a hand that moves the tool",
+            "the operator's task requires a scale above 0",
             where=f"{where}:kinematic_scaling.translation_scale",
             remedy="set it above 0, or operator.task: null",
         )
@@ -332,7 +317,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         timeout = scenario.channel.timeout or LONGEST_TIMEOUT
         if line.rate_hz is not None and timeout < 2 / line.rate_hz:
             raise DrakeTeleopError(
-                f"{timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
+                f"{timeout:g} s are shorter than two packet intervals at {line.rate_hz:g} Hz",
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )

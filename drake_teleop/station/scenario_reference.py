@@ -62,13 +62,9 @@ def _all_texts(value: Any) -> list[str]:
 
 
 def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) -> None:
-    """Write every field of a scenario to a YAML file, for `LoadScenario`.
+    """Write every field of a scenario to a YAML file, with the lines `heading` as comment.
 
-    `heading`: lines of a comment at the top.
-
-    Raises:
-        DrakeTeleopError: if reading the file would not give the same scenario, or the file cannot
-            be written.
+    A DrakeTeleopError is raised if reading the file would not give the same scenario.
     """
     text, where = "".join(f"# {line}\n" for line in heading) + commented(scenario), str(path)
     found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
@@ -93,7 +89,6 @@ def reference() -> str:
 
 
 def json_schema() -> str:
-    """Return the JSON schema of a scenario file as text."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scenario"}
     return json.dumps(schema | _object_schema(Scenario()), indent=1) + "\n"
 

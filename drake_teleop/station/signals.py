@@ -50,15 +50,15 @@ SIGNALS = {
             "saturated",
             "saturated",
             "1",
-            "1 if a channel of the sensor was, above that for a while if a reading was lost, at"
-            " sample_time",
+            "1 if a channel of the sensor was saturated at sample_time; above 1 for a while after"
+            " a lost reading",
         ),
-        _signal("joint_position", _JOINTS, "rad", "the slave's encoders' reading, at sample_time"),
+        _signal("joint_position", _JOINTS, "rad", "encoder readings of the slave, at sample_time"),
         _signal(
             "sample_time",
             "t",
             "s",
-            "when the wrist sensor took the sample of this row; slave_state is of t",
+            "time of the wrist sensor's sample in this row; other signals are of t",
         ),
         _signal(
             "load_estimate",
@@ -72,50 +72,51 @@ SIGNALS = {
             "load_state",
             "state",
             "1",
-            "learning, settled, disturbed, changed: load/online/watched.py",
+            "of the monitored load: 0 learning, 1 settled, 2 disturbed, 3 another load",
         ),
-        _signal("true_contact_wrench_W", *_WRENCH, "environment on the tool, about the origin"),
+        _signal(
+            "true_contact_wrench_W",
+            *_WRENCH,
+            "environment on the tool, about Wo, in W",
+        ),
         _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
-        _signal("intent", *_POSE, "where the operator wants the stylus, X_BE"),
+        _signal("intent", *_POSE, "intended pose of the stylus, X_BE"),
         _signal("hand_wrench_E", *_WRENCH, "hand on the stylus at Eo, in B"),
         _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),
         _signal("pose_master", *_POSE, "of the stylus, X_BE"),
         _signal("twist_master", *_TWIST, "of the stylus in the device's base"),
         _signal("pose_command", *_POSE, "setpoint of the slave, X_WS"),
         _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
-        _signal("ik_status", "status", "1", "of the inverse kinematics, 0 = fine"),
+        _signal("ik_status", "status", "1", "of the inverse kinematics (IkStatus), 0 = OK"),
         _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
         _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
-        _signal("fault", "fault", "1", "of sample or load estimate, 0 = none: fault.py"),
-        _signal("force_to_master", *_WRENCH, "what the device displays, within its limits"),
-        _signal("fault_at_hand", "fault", "1", "of what the device shall display: fault.py"),
+        _signal("fault", "fault", "1", "of sample or load estimate, 0 = none"),
+        _signal("force_to_master", *_WRENCH, "wrench that the device displays, within its limits"),
+        _signal("fault_at_hand", "fault", "1", "of the wrench command at the device, 0 = none"),
         _signal(
             "task_state",
             "phase outcome noticed threshold trust",
             "1,1,1,N,1",
-            "of the operator's task: phase, 1 done or -1 given up, 1 while contact is noticed, from"
-            " which felt force on it is, and trust: operator/task.py",
+            "of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
+            " smallest detected force at the hand; share of approach_speed (docs/operator.md)",
         ),
-        _signal("pose_received", *_POSE, "of the setpoint, what comes out of the channel, X_WS"),
+        _signal("pose_received", *_POSE, "setpoint X_WS of the slave after the channel"),
         _signal(
             "ports",
             "hand hand_rotation slave slave_rotation master_silent slave_silent"
             " command command_rotation",
             "J,J,J,J,s,s,J,J",
-            "energy put into the channel at its ends, in the master's power units; how long each"
-            " end has heard nothing; what the slave's wrench puts in along the command",
+            "energy into the channel at its ends, in the master's power units; time since the last"
+            " packet at each end; energy of the slave's wrench along the command",
         ),
-        _signal("contact", "contact", "1", "1 while the slave's detector notices a contact"),
-        _signal("contact_at_hand", "contact", "1", "the same as it has arrived at the hand"),
+        _signal("contact", "contact", "1", "1 while the slave's detector reports contact"),
+        _signal("contact_at_hand", "contact", "1", "contact flag after the channel, at the master"),
     )
 }
 
 
 def signal_of(name: str, size: int) -> Signal:
-    """Return the description of the signal `name` for a port with `size` components.
-
-    For prismatic joints, read m instead of rad and N instead of N m.
-    """
+    """Return the description of a signal for `size` components; SI units of revolute joints."""
     if name.startswith(POSE_OF):
         return _signal(name, *_POSE, f"where the body {name.removeprefix(POSE_OF)} is, in W, at t")
     signal = SIGNALS[name]

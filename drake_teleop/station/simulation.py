@@ -73,8 +73,8 @@ def simulate(
             advance(simulator, time)
             if stops:
                 rows = _stop_at_fault(simulator, simulation.settle, rows)
-            if on_disk is not None and on_disk.waiting() >= _PART_ROWS:
-                on_disk.take()
+            if on_disk is not None and on_disk.num_unwritten_rows() >= _PART_ROWS:
+                on_disk.write_and_clear()
                 rows = 0
             over = simulation.end_with_task and _task_is_over(simulator)
             progress(1.0 if over else time / end)
@@ -82,7 +82,7 @@ def simulate(
                 break
     finally:
         if on_disk is not None:
-            on_disk.take()
+            on_disk.write_and_clear()
     if log is not None:
         return SimulationResult.scan_parquet(log)
     return read_log(simulator, simulation.settle)
@@ -96,10 +96,10 @@ def _task_is_over(simulator: Simulator) -> bool:
 
 
 def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
-    """Raise a DrakeTeleopError for a fault in the log from row `rows` on; return its length."""
+    """Raise DrakeTeleopError for a fault in the log from row `rows` on; return its length."""
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG).FindLog(simulator.get_context())
-    for name, column in columns(station).items():
+    for name, column in log_columns(station).items():
         if name not in ("fault", "fault_at_hand"):
             continue
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
@@ -112,7 +112,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
     return int(log.num_samples())
 
 
-def columns(station: Diagram) -> dict[str, slice]:
+def log_columns(station: Diagram) -> dict[str, slice]:
     """Return for each signal, by name, the slice of its rows in the station's log."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
@@ -137,30 +137,25 @@ class LogOnDisk:
     ) -> None:
         remove_log(folder)
         self._folder, self._start, self._rows, self._form = folder, start, 0, form
-        self.follow(simulator)
+        self.continue_with(simulator)
 
-    def follow(self, simulator: Simulator) -> None:
-        """Continue with the log of another simulator; call `take` for the previous one before."""
+    def continue_with(self, simulator: Simulator) -> None:
         self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
 
-    def waiting(self) -> int:
-        """Return the number of rows that are in memory only."""
+    def num_unwritten_rows(self) -> int:
         return int(self._sink.num_samples())
 
-    def take(self) -> None:
-        """Write the rows in memory as the next part, and remove them from memory.
-
-        After an interrupt it may be called again: it rewrites the same part or writes nothing new.
-        """
+    def write_and_clear(self) -> None:
+        """Write the rows in memory as the next part and clear them; repeatable if interrupted."""
         part = self._read()
         self._write(part)
         self._sink.Clear()
         self._rows += len(part.t)
 
-    def keep(self) -> None:
-        """Write the rows in memory but keep them; the next `take` rewrites and extends the part."""
+    def write_and_keep(self) -> None:
+        """Write the rows in memory but keep them; a later part replaces them."""
         self._write(self._read())
 
     def _write(self, part: SimulationResult) -> None:
@@ -171,7 +166,6 @@ class LogOnDisk:
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
-    """Return a simulator at t = 0 with the scenario's integrator and seed."""
     context = diagram.CreateDefaultContext()
     diagram.SetRandomContext(context, RandomGenerator(simulation.seed))
     simulator = Simulator(diagram, context)
@@ -182,7 +176,7 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 
 def advance(simulator: Simulator, time: float) -> None:
-    """Advance the simulator to `time` [s] with garbage collection disabled, which saves time."""
+    """Advance the simulator to `time` [s] without garbage collection, which saves time."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -199,7 +193,7 @@ def read_log(simulator: Simulator, start: float) -> SimulationResult:
     t = log.sample_times() - start
     kept = t > -1e-9
     data = log.data().T[kept]
-    signals = {name: data[:, column] for name, column in columns(diagram).items()}
+    signals = {name: data[:, column] for name, column in log_columns(diagram).items()}
     if "sample_time" in signals:
         signals["sample_time"] -= start
     specs = [signal_of(name, values.shape[1]) for name, values in signals.items()]

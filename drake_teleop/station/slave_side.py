@@ -163,7 +163,7 @@ def MakeSlaveSide(
 
 
 def _gives_torques(controller: System | None, scenario: Scenario) -> bool:
-    """Return whether a custom controller replaces the joint control; check its ports."""
+    """Check a custom controller's ports; return whether it replaces the joint control."""
     if controller is None:
         return False
     expect(System, controller, "controller", "make a Drake system: docs/station.md")
@@ -200,7 +200,7 @@ def _add_inverse_kinematics(
 
 
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Build the slave side without master: its joints follow an excitation trajectory (section IV).
+    """Build the slave side without master: its joints follow an excitation trajectory.
 
     `trajectory` runs once after the settling time. Output ports are the signals of `MakeSlaveSide`
     that need neither command nor elimination.
@@ -323,7 +323,7 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Reject dry friction that stops a joint within one step [s] (numerical instability)."""
+    """Raise DrakeTeleopError for dry friction that stops a joint within one step [s]."""
     if not slave.friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
@@ -335,7 +335,7 @@ def _check_friction(slave: SlavePlant, step: float) -> None:
             f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
             f"{1e3 * step:g} ms",
             where="slave.friction",
-            remedy=f"choose less, or a simulation.max_step of {shorter:.2g} s",
+            remedy=f"reduce the friction, or set simulation.max_step: {shorter:.2g}",
         )
 
 
@@ -369,7 +369,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         raise DrakeTeleopError(
             f"expected 16 numbers, found {type(estimate).__name__}",
             where="load_estimate",
-            remedy="pass its .estimate",
+            remedy="pass the attribute .estimate of this object",
         )
     if estimate is not None:
         estimate = finite_array("load_estimate", estimate, 16)

@@ -1,10 +1,7 @@
 """Teleoperation system of the paper's Fig. 4 as one Drake Diagram.
 
-    operator, haptic device --- network, passivity --- arm, wrist sensor, elimination
-          master side        <->      channel       <->          slave side
-
-Either side may be custom: docs/station.md.
-"""
+operator, haptic device --- network, passivity --- arm, wrist sensor, elimination
+      master side        <->      channel       <->          slave side"""
 
 from __future__ import annotations
 

@@ -1,20 +1,4 @@
-"""Measures of a simulated operator's task, from the log of one run.
-
-============================ =====================================================================
-success                      1 if the operator finished and the task is achieved: tip in the target;
-                             tool in contact; force in its tolerance; tip within 2 mm of the floor
-task_time_s                  from the task's start until the operator finished
-contact_force_overshoot_N    largest contact force at the tool minus the required force
-effort_Ns                    integral of |force of the hand|
-task_work_J                  integral of |power of the hand|
-detection_time_s             from the first contact to the operator's reaction; nan without one
-false_notices                number of detected contacts before the first contact
-press_error_N                RMS error of the held force; nan if not held
-============================ =====================================================================
-
-The interval ends when the operator finishes or gives up, or with the log. For a failed task all but
-success, detection_time_s and false_notices are nan.
-"""
+"""Measures of a simulated operator's task, from the log of one run (docs/operator.md)."""
 
 from __future__ import annotations
 
@@ -54,13 +38,9 @@ _PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures of a task by name for one run; the module explains them.
+    """Return the measures of the operator's task, as in docs/operator.md, for one run.
 
-    Args:
-        result: result with the signal task_state.
-
-    Raises:
-        DrakeTeleopError: if the scenario has no task.
+    A DrakeTeleopError is raised if the scenario has no task.
     """
     task = scenario.operator.task
     if task is None:
@@ -100,10 +80,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
 
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
-    """Return the reason why the task failed (timeout, given up, not achieved); "" after success.
-
-    Times in the text are those of the log. The scenario must have a task.
-    """
+    """Return the reason why the task failed (timeout, given up, not achieved); "" after success."""
     task, state, ended = scenario.operator.task, result["task_state"], _end_sample(result)
     assert task is not None
     at, outcome = float(result.t[ended]), state[ended, DONE]
@@ -150,10 +127,7 @@ def contact_force(result: SimulationResult) -> Array:
 
 
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """Return the time from the first contact to its detection [s]; nan if either is missing.
-
-    All arguments are (N,): times [s], true contact, detected contact.
-    """
+    """Return the time from the first contact to its detection [s]; nan if either is missing."""
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))

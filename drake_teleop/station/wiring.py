@@ -29,8 +29,7 @@ def export(builder: DiagramBuilder, block: System, *names: str, **renamed: str) 
 def wire(builder: DiagramBuilder, source: System, name: str, target: System, entry: str) -> None:
     """Connect output port `name` of one side to input port `entry` of another.
 
-    Raises:
-        DrakeTeleopError: if a side lacks the port or the sizes differ.
+    A DrakeTeleopError is raised if a side lacks the port or the sizes differ.
     """
     output = source.HasOutputPort(name) and source.GetOutputPort(name)
     port = target.HasInputPort(entry) and target.GetInputPort(entry)
@@ -47,11 +46,7 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
 
 
 def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
-    """Export and record signals in the order of `SIGNALS`, then poses; build the diagram.
-
-    `log_hz` is the rate of the log. Signals that share one port of a side (`COMBINED_PORTS`) are
-    recorded from this port.
-    """
+    """Export and record the sides' signals at `log_hz`; build the diagram."""
     outputs = {
         port.get_name(): port
         for side in sides

@@ -37,7 +37,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     TOUCHING,
     WATCHED,
     environment_wrench,
-    nearness,
+    tool_proximity,
 )
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
@@ -265,7 +265,7 @@ def test_separation_of_tool_and_unmodelled_shapes():
         for row in rows:
             row[:, 15] += height
         nothing = np.zeros(2)
-        found.append(nearness(built.arm.table, *rows, joints, built.start, nothing, nothing))
+        found.append(tool_proximity(built.arm.table, *rows, joints, built.start, nothing, nothing))
     assert found == [FAR, TOUCHING, TOUCHING, WATCHED]  # from 0.45 - 0.1 - 0.002 - 0.02
 
 

@@ -17,7 +17,7 @@ from drake_teleop.logs.causes.changes import contact_spans, with_ramps
 from drake_teleop.logs.causes.explain import _remove_delay
 from drake_teleop.logs.causes.instants import instants
 from drake_teleop.logs.causes.model import DELAY, Model, Step
-from drake_teleop.logs.causes.state import State, gain_of
+from drake_teleop.logs.causes.state import State, likelihood_gain
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
 
@@ -132,10 +132,10 @@ def test_gain_of_smooth_signals_counts_independent_ones(scale):
     rng = np.random.default_rng(0)
     A, e = rng.normal(size=(30, 4)) * [1.0, scale, 1e-3, 2.0], rng.normal(size=30)
     for columns, rank in ((A, 4), (np.column_stack([A, A[:, 0] + A[:, 3], 0.0 * e]), 4)):
-        gain, found = gain_of(columns.T @ columns, columns.T @ e)
+        gain, found = likelihood_gain(columns.T @ columns, columns.T @ e)
         fitted = A @ np.linalg.lstsq(A, e, rcond=None)[0]
         assert found == rank and gain == pytest.approx(fitted @ fitted, rel=1e-5)
-    some = gain_of(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
+    some = likelihood_gain(A.T @ A, A.T @ e, np.array([0.0, 0.0, 1.0, 0.0]))
     assert some[1] == 3 and some[0] < gain
 
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
-from drake_teleop.logs.explained_log import with_lines
+from drake_teleop.logs.explained_log import add_description_lines
 from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
 from drake_teleop.logs.read.reading import read_log
 
@@ -274,7 +274,7 @@ def test_lines_of_axes_factor_and_gain_compose_with_what_is_described(
     scales = rng.choice([-2.0, 1e-4, 1.0], (2, 3))
     record.described(int(rng.choice([-1, 1])), frame, *scales)
     path = record.write(tmp_path)
-    follow(path, with_lines(causes, read_log(path), by_pose=True))
+    follow(path, add_description_lines(causes, read_log(path), by_pose=True))
     assert read_log(path).wrench == pytest.approx(right, rel=1e-5, abs=1e-4)
 
 
@@ -294,7 +294,7 @@ def test_a_weight_is_added_back_and_a_pose_frame_to_that_described(
     record.pose_lines = {"position_in_sensor": known.tolist()}
     causes = [Cause("pose frame", "r", values={"position_in_sensor": shift.tolist()})]
     path = record.write(tmp_path)
-    follow(path, with_lines(causes, read_log(path), by_pose=True))
+    follow(path, add_description_lines(causes, read_log(path), by_pose=True))
     log = read_log(path)
     assert log.posed is not None
     assert log.posed.poses.position == pytest.approx(place, abs=2e-5)
@@ -305,13 +305,13 @@ def test_a_canonical_table_and_base_axes_get_other_remedies(tmp_path: Path) -> N
     record = Record.of(seconds=1.0)
     cause = Cause("axes", "D", values={"matrix": PERMUTATIONS[14].tolist()})
     log = read_log(record.write(tmp_path))
-    [of_table] = with_lines([cause], replace(log, source="log.csv"), by_pose=True)
+    [of_table] = add_description_lines([cause], replace(log, source="log.csv"), by_pose=True)
     assert "in a log description of this table" in of_table.message
     record.wrench_lines = {"frame": "base"}
-    [of_base] = with_lines([cause], read_log(record.write(tmp_path)), by_pose=True)
+    [of_base] = add_description_lines([cause], read_log(record.write(tmp_path)), by_pose=True)
     assert of_base.message == "D; correct the columns of wrench.force and wrench.torque"
     inverted = Cause("axes", "D", values={"matrix": (-np.eye(3)).tolist()})
-    [of_sign] = with_lines([inverted], read_log(record.write(tmp_path)), by_pose=True)
+    [of_sign] = add_description_lines([inverted], read_log(record.write(tmp_path)), by_pose=True)
     assert of_sign.message == "D; set wrench.sign: -1"
 
 

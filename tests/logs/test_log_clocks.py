@@ -16,7 +16,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
-from drake_teleop.logs.read.clocks import Clock, gaps, read_clock, spread
+from drake_teleop.logs.read.clocks import Clock, find_gaps, read_clock, spread_shared_stamps
 from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.tables import Table
@@ -38,7 +38,7 @@ def test_valid_stamps_are_unchanged() -> None:
     clock = clock_of(t, offset=0.5)
     np.testing.assert_array_equal(clock.t, t + 0.5)
     np.testing.assert_array_equal(clock.rows, np.arange(50))
-    assert clock.notes == () and not len(gaps(clock.t, 30.0))
+    assert clock.notes == () and not len(find_gaps(clock.t, 30.0))
     scaled = clock_of(t, scale=1.001, offset=0.5).t
     np.testing.assert_allclose(scaled - t[0] - 0.5, 1.001 * (t - t[0]), atol=1e-6)
 
@@ -102,7 +102,7 @@ def test_spread_restores_times_of_bursts(
         first = burst * int(share * 300)
         kept[first : first + 5 * burst] = False
     stamps = start + true[burst - 1 :: burst].repeat(burst)[kept]
-    found = spread(stamps) - start
+    found = spread_shared_stamps(stamps) - start
     assert (np.diff(found) > 0).all()
     # Constant delay of half a burst; the remainder is one burst among 50 of a window.
     late = (burst - 1) / 2 / rate
@@ -111,7 +111,7 @@ def test_spread_restores_times_of_bursts(
 
 def test_burst_between_gaps_is_spread_about_its_stamp() -> None:
     stamps = np.concatenate([np.arange(20) * 0.1, [5.0], 8.0 + np.arange(20) * 0.1]).repeat(4)
-    found = spread(stamps)
+    found = spread_shared_stamps(stamps)
     np.testing.assert_allclose(found[80:84], 5.0 + 0.025 * np.array([-1.5, -0.5, 0.5, 1.5]))
     assert (np.diff(found) > 0).all()
 
@@ -132,7 +132,7 @@ def test_spread_restores_coarse_stamps(
     step = resolution / rate
     uneven = np.sort(true + rng.uniform(-jitter, jitter, len(true)) / rate)
     stamps = np.floor(uneven / step) * step
-    found = spread(stamps)
+    found = spread_shared_stamps(stamps)
     assert (np.diff(found) > 0).all()
     # Rounding down causes a constant delay; the remaining error is halved.
     error, raw = found - true, stamps - true

@@ -314,7 +314,7 @@ def test_a_unit_that_is_not_known_is_left_to_fill_in(tmp_path: Path) -> None:
         (
             ["qw", "qx", "qy", "qz"],
             {"pose"},
-            ["the draft has no wrench: add wrench, from whichever"],
+            ["the draft has no wrench: add wrench"],
         ),
         (["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], {"wrench"}, ["the draft has a wrench without kine"]),
         (["Fx", "Fy", "Fz", "wx"], {"wrench"}, ["not recognized: FILL IN", "without kinematics"]),

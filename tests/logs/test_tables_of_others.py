@@ -371,6 +371,43 @@ def test_the_order_of_euler_angles_is_that_of_the_data(
     assert ("Corrected by the data: the Euler angles" in text) == (axes != guessed)
 
 
+@pytest.mark.parametrize(
+    ("names", "order", "form"),
+    [
+        (("q1", "q2", "q3", "q4"), (0, 1, 2, 3), "quaternion_wxyz"),  # as ABB writes them
+        (("q1", "q2", "q3", "q4"), (1, 2, 3, 0), "quaternion_xyzw"),  # corrected by the data
+        (
+            ("tool_quat_0", "tool_quat_1", "tool_quat_2", "tool_quat_3"),
+            (0, 1, 2, 3),
+            "quaternion_wxyz",
+        ),
+    ],
+)
+def test_numbered_quaternions_are_drafted(
+    tmp_path: Path, names: tuple[str, ...], order: tuple[int, ...], form: str
+) -> None:
+    frame = table()
+    columns = {"t": "time", **dict(zip(POSITION, "xyz", strict=True))}
+    columns |= dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], strict=True))
+    columns |= dict(zip([QUATERNION[k] for k in order], names, strict=True))
+    written = renamed(frame, columns)
+    joints = {f"joint_{k}": 0.3 * k + frame["t"] for k in range(4)}  # no quaternion
+    written.with_columns(**joints).write_csv(tmp_path / "table.csv")
+    draft, left = drafted(tmp_path / "table.csv")
+    assert draft["pose"]["orientation"] == {"columns": list(names), "form": form}
+    assert draft["pose"]["position"]["columns"] == ["x", "y", "z"] and left == []
+
+
+def test_four_joint_angles_are_no_quaternion(tmp_path: Path) -> None:
+    frame = table()
+    columns = dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], strict=True))
+    written = renamed(frame, {"t": "time", **columns})
+    written = written.with_columns(**{f"q{k}": 0.3 * k + frame["t"] for k in range(1, 5)})
+    written.write_csv(tmp_path / "table.csv")
+    draft, _ = drafted(tmp_path / "table.csv")
+    assert list(draft) == ["wrench"]
+
+
 def test_a_robot_learning_table_is_drafted(tmp_path: Path) -> None:
     frame = table()
     pose = frame.select(*POSITION, "q1", "q2", "q3", "q0").to_numpy()

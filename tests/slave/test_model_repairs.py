@@ -199,7 +199,7 @@ def test_hold_frees_chain_from_coupled_joint_and_opens_gripper(tmp_path):
     [
         ({"torso": 0.1}, r"slave\.hold: no moving joint is named 'torso'; name one of j1, j2, j3"),
         ({"j3": 2.6}, r"slave\.hold: j3 at 2\.6 is outside -2\.5 to 2\.5"),
-        ({"j3": float("nan")}, r"slave\.hold\.j3: nan is no position"),
+        ({"j3": float("nan")}, r"slave\.hold\.j3: nan is not a finite position"),
     ],
 )
 def test_invalid_hold_is_one_error(tmp_path, hold, expected):

@@ -290,7 +290,7 @@ def _covering_study(stage: Stage) -> list[dict[str, Any]]:
                 "sigma": sigma,
                 "round_trip_s": round_trip,
                 "wall_N_per_m": wall,
-                "injected_J": max(0.0, -run.least(ACTUAL)),
+                "injected_J": max(0.0, -run.least_energy_sum(ACTUAL)),
                 "damping_Ns_per_m": covering_damping(model, round_trip),
             }
         )

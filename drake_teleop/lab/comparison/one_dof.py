@@ -118,7 +118,7 @@ class OneDofRun:
     accounts: NDArray[np.float64]  #: (N, 4) J
     start_energy: float  #: E_0 of the method's stores [J]
 
-    def least(self, place: int) -> float:
+    def least_energy_sum(self, place: int) -> float:
         """Return the least sum over time of start energy and `accounts` at HAND and `place` [J].
 
         A negative sum means that the station is active.

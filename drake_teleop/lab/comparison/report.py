@@ -68,14 +68,14 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
         "report.html.j2",
         networks=[(name, 2e3 * PRESETS[name].delay) for name in summary["networks"]],
         columns=[heading for _, heading, _, _ in COLUMNS],
-        station=[(row, cells(row)) for row in summary["station"]],
+        station=[(row, table_cells(row)) for row in summary["station"]],
         covering=summary["covering"],
         pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
     )
     write_text(out / "report.html", page)
 
 
-def cells(row: Mapping[str, Any]) -> list[str]:
+def table_cells(row: Mapping[str, Any]) -> list[str]:
     return [
         # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"

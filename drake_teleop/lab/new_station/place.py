@@ -283,7 +283,7 @@ def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Pla
     depths = dict.fromkeys(walls, 0.0)
     cost = max(region.plane - shapes.points(shapes.moving())[:, 2].min(initial=np.inf), 0.0)
     overlaps = False
-    for first, second, distance in shapes.near():
+    for first, second, distance in shapes.overlaps():
         pair = {first.index(), second.index()}
         if wall := pair & walls.keys():
             if not pair & shapes.tool_bodies:

@@ -134,12 +134,12 @@ def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return as text the rows whose values are outside the accepted range."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
-        for row in compare_with_paper(flat(summary))
+        for row in compare_with_paper(values_by_full_name(summary))
         if row.holds is False
     ]
 
 
-def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def values_by_full_name(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return all values by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
     return {
         f"{part}.{name}": math.nan if value is None else value

@@ -222,14 +222,14 @@ def _on_same_version(run: Run) -> Run:
     """Return `run` with a check of the version, for workers that join later."""
     version, expected = _version_reader(), __version__
 
-    def checked(chunk: Chunk) -> Chunk:
+    def run_on_same_version(chunk: Chunk) -> Chunk:
         from distributed import get_worker
 
         if (found := version()) != expected:
             raise _wrong_version(get_worker().address, found, expected)
         return run(chunk)
 
-    return checked
+    return run_on_same_version
 
 
 def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:

@@ -22,7 +22,7 @@ from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
-from drake_teleop.lab.tuning.search import Found, holds, search_settings, studies_in
+from drake_teleop.lab.tuning.search import Found, meets_requirements, search_settings, studies_in
 from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import commented, write_scenario
@@ -106,12 +106,12 @@ def _summary(
 ) -> dict[str, Any]:
     at_edge = [row for row in found.limits if row["wall"] <= stated.walls[1]]
     scale = tuned.force_scaling.force_scale
-    failed = [row for row in found.limits if not holds(row)]
+    failed = [row for row in found.limits if not meets_requirements(row)]
     worst_given = max(row["threshold_N"] for row in found.given)
     figures = {
         "share": min(row["share"] for row in [*found.inside, *at_edge]),
         "threshold_N": max(row["threshold_N"] for row in at_edge),
-        "given_threshold_N": worst_given if all(map(holds, found.given)) else None,
+        "given_threshold_N": worst_given if all(map(meets_requirements, found.given)) else None,
         "rest_force_N": max(row["rest_force_N"] for row in at_edge),
         "margin": stated.requirements.margin,
         "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}

@@ -27,7 +27,7 @@ from drake_teleop.load.batch.uncertainty import (
     white_covariance,
     with_prior,
 )
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
     CHUNK,
     Moments,
@@ -225,7 +225,7 @@ def identify_batch(
         phi=theta[6:],
         offsets=theta[:6],
         covariance=covariance,
-        identifiable=worth_stating(deviations, theta[6:]) & ~dominated,
+        identifiable=is_precise_enough(deviations, theta[6:]) & ~dominated,
         prior_dominated=dominated,
         residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
         method=METHODS[method].name,

@@ -19,7 +19,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
 from drake_teleop.common.vectors import cholesky, copy_into
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import (
@@ -371,7 +371,7 @@ def identified_load(memory: Array, known: Identification) -> Identification:
         phi=phi,
         offsets=memory[_KNOWN : _KNOWN + 6].copy(),
         covariance=covariance,
-        identifiable=worth_stating(np.sqrt(np.diag(covariance)), phi),
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), phi),
         residual_rms=np.sqrt(memory[_RESIDUAL:_SQUARES]),
         method="recursive least squares",
         samples=int(memory[_NEW_COUNT]),

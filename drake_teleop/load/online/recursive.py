@@ -13,7 +13,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
 from drake_teleop.load.batch.uncertainty import prior_dominated
-from drake_teleop.load.identification import WORTH_STATING, Identification, worth_stating
+from drake_teleop.load.identification import WORTH_STATING, Identification, is_precise_enough
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
@@ -215,7 +215,7 @@ class RecursiveEstimator(ABC):
 
     def _is_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
         certain = ~prior_dominated(deviations, np.sqrt(self._prior))
-        return certain & worth_stating(deviations * (WORTH_STATING / bound), theta[6:])
+        return certain & is_precise_enough(deviations * (WORTH_STATING / bound), theta[6:])
 
     def _condition_number(self) -> float:
         information = np.linalg.inv(self.covariance)

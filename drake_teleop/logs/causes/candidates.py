@@ -46,7 +46,7 @@ _DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
 class Candidate:
     """Fitted model with one more extension.
 
-    `score` is twice the gain in log likelihood minus a cost of the added parameters.
+    `score` is twice the gain in log likelihood, minus a cost of the added parameters.
     """
 
     name: str
@@ -120,12 +120,10 @@ def _fit_part(
 
 
 def has_negative_mass(state: State) -> bool:
-    """Return whether the mass is significantly negative."""
     return bool(state.x[6] < -4.0 * np.sqrt(state.fit.covariance[6, 6]))
 
 
 def has_negative_inertia(state: State) -> bool:
-    """Return whether mass or inertia is significantly negative."""
     if state.x[6] < _SIGNIFICANT * np.sqrt(state.fit.covariance[6, 6]):
         return has_negative_mass(state)
     i, j = np.triu_indices(3)
@@ -140,7 +138,7 @@ def has_negative_inertia(state: State) -> bool:
 
 
 def is_plausible(state: State) -> bool:
-    """Return whether the fitted parameters are possible in a laboratory."""
+    """Return whether all fitted parameters are physically plausible."""
     if has_negative_inertia(state):
         return False
     parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
@@ -173,7 +171,7 @@ def _is_tilt_significant(state: State) -> bool:
 
 
 def tilt_start(state: State) -> Array | None:
-    """Return start parameters to fit a large tilt of gravity, from the force alone, or None."""
+    """Return start parameters for a fit of a large tilt of gravity, from the force, or None."""
     y = state.data.only(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -250,7 +248,7 @@ def _factor(state: State) -> Iterator[Candidate]:
 
 
 def similar_factors(state: State) -> list[State]:
-    """Return fits with other known unit factors of the torque that the record does not exclude."""
+    """Return the fits with other torque units that explain the record nearly as well."""
     factor, found = state.model.factor, []
     for other in FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:

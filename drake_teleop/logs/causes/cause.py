@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.identification import worth_stating
+from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.candidates import similar_factors
 from drake_teleop.logs.causes.state import State
@@ -27,9 +27,7 @@ class Cause:
     """Reason why a rigid load with constant offsets does not explain a wrench.
 
     Attributes:
-        name: "axes", "gravity direction", "weight removed", "payload configured", "torque factor",
-            "zero change", "load change", "drift", "gain", "pose frame", "sensor rotation",
-            "contact", "cable" or "no load".
+        name: such as "axes", "gravity direction", "load change" or "cable".
         message: cause, value with its interval, and remedy.
         start_s, stop_s: time span since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.
@@ -55,12 +53,10 @@ class Stretch:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        """Booleans (16,): True for identified parameters of [offsets; phi]."""
-        return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
+        return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
-    """Return the causes in a fitted model, without its extensions `given`."""
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_axes(model.axes))
@@ -85,10 +81,7 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 
 
 def stretches(state: State, covariance: Array) -> list[Stretch]:
-    """Return the parts of a record between changes of the load; none without a change.
-
-    `covariance` (16, 16) is that of [offsets; phi] of the first part.
-    """
+    """Return the parts of a record between changes of the load; none without a change."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []

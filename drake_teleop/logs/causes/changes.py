@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import DELAY, Step
-from drake_teleop.logs.causes.state import Spans, State, gain_of, in_spans, regularized_inverse
+from drake_teleop.logs.causes.state import (
+    Spans,
+    State,
+    in_spans,
+    likelihood_gain,
+    regularized_inverse,
+)
 
 _MIN_GAIN = 60.0
 _REFINEMENTS, _REFINEMENT_STEPS = (1.0, 0.25), 2  # instants
@@ -24,9 +30,9 @@ _SIGNIFICANT, _NOISE_LEVELS, _MASS_SHARE, _SMALLEST_ARM_M = 5.0, 2.0, 0.01, 0.00
 
 
 def add_step(state: State, kind: str) -> State | None:
-    """Return the model with one more change of "offsets" or "load" (`kind`), or None.
+    """Return the model with one more change of "offsets" or "load" (`kind`), at its likeliest time.
 
-    It is at the most likely time; None if no change is significant.
+    Return None if no change is significant.
     """
     best: State | None = None
     for time in _likely_times(state, kind):
@@ -62,7 +68,7 @@ def _likely_times(state: State, kind: str) -> list[float]:
 
 
 class _StepScan:
-    """Gain in log likelihood (times 2) by a change at any instant, for white noise."""
+    """Gain of twice the log likelihood by a change at any instant, for white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
         power = np.maximum(state.rows.rms(state.fit.residual), 1e-12)
@@ -93,7 +99,7 @@ class _StepScan:
         mixed = gram[:, which]
         pull = right[which] - mixed.T @ (self._inverse @ self._right[0])
         schur = gram[which, which] - mixed.T @ self._inverse @ mixed
-        return gain_of(schur, pull, 1e-6 * np.diag(gram)[which])[0]
+        return likelihood_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
 def with_ramps(
@@ -103,10 +109,7 @@ def with_ramps(
     spans: Spans,
     widths: Sequence[float] | None = None,
 ) -> State:
-    """Fit gradual changes of `kinds` at `times` [s], without the rows within `widths` [s].
-
-    `spans` are other omitted time spans; `state` has the initial parameters.
-    """
+    """Fit gradual changes of `kinds` near `times` [s], without the rows within `widths` [s]."""
     widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [Step(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
@@ -200,7 +203,7 @@ _LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
 
 
 def contact_spans(state: State) -> Spans:
-    """Return time spans (start, stop) [s] with a residual far above noise and calm parts."""
+    """Return time spans (start, stop) [s] whose residual far exceeds that of calm parts."""
     blocks = _Blocks(state)
     contact_blocks = blocks.contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
@@ -212,7 +215,7 @@ def contact_spans(state: State) -> Spans:
 
 
 def replace_contacts_by_steps(larger: State) -> State | None:
-    """Explain long contacts by changed loads and offsets, or return None if impossible."""
+    """Explain long contacts by changes of load and offsets; return None if impossible."""
     blocks = _Blocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_LOADS):
@@ -269,7 +272,7 @@ class _Blocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return True for blocks with a residual far above the calmest; None for too few blocks."""
+        """Return True for blocks with a residual far above the calmest; None for few blocks."""
         found = self._fit_calmest(np.flatnonzero(among))
         if found is None:
             return None
@@ -309,7 +312,7 @@ class _Blocks:
     def _is_clear(
         self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
     ) -> bool:
-        """Return whether a fit to `kept` blocks predicts the `others`, and most of them differ."""
+        """Return whether most of the `others` differ from a fit to the `kept` blocks."""
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))
         share = np.einsum("bij,ji->b", self._gram[others], covariance)
         predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))
@@ -351,7 +354,7 @@ def _motion_error_level(
 
 
 def replace_steps_by_contact(state: State) -> State:
-    """Replace changes of the offsets by a contact if the residual requires it."""
+    """Replace changes of the offsets by a contact if that explains the residual better."""
     steps = sorted(enumerate(state.model.steps), key=lambda x: x[1].time)
     first, last = float(state.data.t[0]), float(state.data.t[-1])
     borders = [(-1, first), *((i, step.time) for i, step in steps), (-1, last)]

@@ -51,8 +51,7 @@ _FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"),
 """Causes with many columns, which resemble others; required margins of their scores."""
 
 
-def is_noise(state: State) -> bool:
-    """Return whether the residual of a fitted model is sensor noise."""
+def residual_is_noise(state: State) -> bool:
     if (
         has_negative_inertia(state)
         or state.residual_ratio > MAX_RESIDUAL_RATIO
@@ -76,8 +75,7 @@ def search(
 ) -> Found:
     """Return the model that explains a record, additional delay [s], and rejected candidates.
 
-    `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
-    model.
+    The model contains the extensions `given` from the start.
     """
     plain = Model(parts=given)
     found = _search(_initial_state(data, plain), 0.0, with_delay)
@@ -88,19 +86,21 @@ def search(
         is_wrench = opposite[0].model.factor > 0.0
         if is_wrench and opposite[0].residual_ratio < _FIFTH * found[0].residual_ratio:
             found = opposite
-    if with_delay is None or may_be_coloured_noise(found[0]) or is_noise(found[0]):
+    if with_delay is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
         return found
     delay_s = free_delay(data)
     if abs(delay_s - found[1]) < _SAME_DELAY_S:
         return found
     repeated = _search(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
-    better = is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
+    better = (
+        residual_is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
+    )
     better = better or (repeated[0].residual_ratio < _FIFTH * found[0].residual_ratio)
     return repeated if better else found
 
 
 def may_be_coloured_noise(state: State) -> bool:
-    """Return whether the residual may be coloured noise: smooth signals do not explain it."""
+    """Return whether the residual may be coloured noise, which smooth signals do not explain."""
     return (
         state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
     )
@@ -121,7 +121,7 @@ def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found
     state, delay_s = _remove_delay(state, delay_s, with_delay)
     rejected: list[Candidate] = []
     for number in range(ROUNDS):
-        if is_noise(state):
+        if residual_is_noise(state):
             return state, delay_s, []
         found = _without_attenuation(list(candidates(state, first=number == 0)))
         rejected = [x for x in found if is_plausible(x.state)]
@@ -148,7 +148,7 @@ def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found
 
 
 def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Remove "cable" if an attenuated inertia explains a third of its score."""
+    """Remove "cable" from the candidates if a reduced inertia explains a third of its score."""
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
@@ -235,12 +235,11 @@ _NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Causes why a rigid load does not explain a wrench, and the load when they are in the model.
+    """Causes why a rigid load does not explain a wrench, and the load of the model with causes.
 
     Attributes:
         explained: whether the residual is sensor noise.
-        theta: (16,) [offsets; phi] of the first part of the record [SI].
-        covariance: (16, 16) of theta.
+        theta, covariance: [offsets; phi] (16,) in the first part of the record [SI]; (16, 16).
         deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of a record whose load changes.
@@ -261,12 +260,11 @@ class Explanation:
 
     @property
     def misfit(self) -> bool:
-        """Whether the residual is clearly not noise, not even coloured noise."""
         return not self.explained and is_clear_misfit(self.state)
 
     @property
     def several_gains(self) -> bool:
-        """Whether gain errors of single channels stand for errors of the whole gain matrix."""
+        """Whether gain errors of single channels approximate those of a whole gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)
@@ -277,8 +275,8 @@ def explain(
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
-    model, such as "weight".
+    The model contains the extensions `given`, such as "weight", from the start. `with_delay`
+    returns the record with an additional delay [s].
     """
     with one_blas_thread():
         state, delay_s, rejected = search(data, with_delay, given)
@@ -286,7 +284,7 @@ def explain(
         gains = gain_covariance(state) + factor_covariance(state)
         covariance = covariance_of(state, rejected, blocks, gains)
         causes = causes_of(state, given)
-        only_noise = is_noise(state)
+        only_noise = residual_is_noise(state)
         if (
             not causes
             and (only_noise or may_be_coloured_noise(state))

@@ -47,15 +47,14 @@ Motion = Callable[[Array], tuple[Array, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Instants:
-    """Block means of a record (see module `instants`).
+    """Means of a record over blocks of about 20 ms.
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, WIDTH) signals; 0 in unused rows.
+        y: (M, WIDTH) signals of the module docstring; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
         white: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
-        positions: whether positions are known.
         acceleration_noise: in a block mean [m/s^2].
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
@@ -71,7 +70,7 @@ class Instants:
 
     @cached_property
     def accelerates_enough(self) -> bool:
-        """Whether accelerations are large enough to separate inertia from weight."""
+        """Whether the accelerations are large enough to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_NOISE_SHARE
         a = (self.y[:, S] + self.y[:, G])[self.used]
@@ -81,21 +80,19 @@ class Instants:
 
     @property
     def dt(self) -> float:
-        """Time between instants [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
     def block(self) -> int:
-        """Number of rows in one block, in which contacts and changes of the load are searched."""
+        """Number of rows in a block, the time resolution of the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
     def only(self, used: NDArray[np.bool_]) -> Instants:
-        """Return the record with `used` (M,) as its used rows."""
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def with_steps(self, times: tuple[float, ...]) -> Array:
-        """Return y with copies of its motion after each time, (M, WIDTH + 25 len(times))."""
+        """Return y and copies of its motion from each time on, (M, WIDTH + 25 len(times))."""
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
@@ -103,7 +100,7 @@ class Instants:
         return np.hstack(parts)
 
     def sums(self, y: Array, *, rows: int, lags: int = ORDER + 1) -> Array:
-        """Return sums (blocks, lags, W, W) of products of y (M, W), for blocks of `rows` rows."""
+        """Return sums of lagged products of y (M, W) over blocks, (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -126,15 +123,10 @@ def instants(
     lost: NDArray[np.bool_] | None = None,
     acceleration_noise: float = 0.0,
 ) -> Instants:
-    """Return block means of a record.
+    """Return block means of a record with N samples at even times `t` [s].
 
-    Args:
-        t: (N,) times, evenly spaced [s].
-        wrench: (N, 6) measured [f; tau] on the load, in S about So, Eq. (1) [N, N m].
-        motion: a function of time, or its values at `t` (see `Motion`).
-        gravity_W: (3,) gravity in the world [m/s^2]; None without orientation.
-        lost: (N,) True for ignored samples.
-        acceleration_noise: noise of the acceleration [m/s^2].
+    The wrench (N, 6) is [f; tau] on the load, in S about So, Eq. (1). `gravity_W` is in the world
+    [m/s^2], None without orientation. Samples with `lost` True are ignored.
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     size = max(1, round(1.0 / (_RATE_HZ * dt)), -(-len(t) // _MAX_ROWS))
@@ -231,10 +223,9 @@ def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
 
 
 def free_delay(data: Instants) -> float:
-    """Return the delay of the motion [s] with the smallest residual.
+    """Return the delay of the motion [s], within +-0.25 s, with the smallest residual.
 
-    It is within 0.25 s and a tenth of the record. No load is assumed: the wrench channels are
-    fitted by the 16 motion signals.
+    The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.
     """
     reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

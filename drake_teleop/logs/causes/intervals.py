@@ -34,10 +34,7 @@ _LARGEST_GAIN_ERROR = 0.025
 def covariance_of(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes.
-
-    `blocks` (16,) is from `block_deviations`, `gains` (16, 16) the covariance due to gain errors.
-    """
+    """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
     out = state.fit.covariance[LOAD, LOAD].copy()
     deviations = np.sqrt(np.diag(out))
     factor = misfit_factor(state, blocks)
@@ -50,7 +47,7 @@ def covariance_of(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return standard deviations (16,) of [offsets; phi] for a misfit without a named cause."""
+    """Return standard deviations (16,) of [offsets; phi] for a misfit without a found cause."""
     if state.smooth_misfit > (
         _CLEAR_SMOOTH_MISFIT
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
@@ -77,10 +74,7 @@ def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
 
 
 def gain_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] that errors of all 36 sensor gains cause.
-
-    The residual determines their size; 0 if gains explain little.
-    """
+    """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
     unit = np.repeat([1.0, TORQUE_ARM_M], 3)
@@ -115,7 +109,7 @@ def gain_covariance(state: State) -> Array:
 
 
 def factor_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] caused by an uncertain torque unit."""
+    """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in similar_factors(state):
         distance = other.x[LOAD] - state.x[LOAD]
@@ -123,7 +117,7 @@ def factor_covariance(state: State) -> Array:
     return out
 
 
-def attenuation(state: State) -> Array:
+def attenuation_bias(state: State) -> Array:
     """Return the bias (16,) of [offsets; phi] due to noise of the angular acceleration."""
     fit, data = state.fit, state.data
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))

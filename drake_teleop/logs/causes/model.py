@@ -51,17 +51,13 @@ _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @dataclass(frozen=True)
 class Step:
-    """Change of the offsets (6 parameters) or of the load (10 parameters) at `time` [s].
-
-    `kind` is "offsets" or "load".
-    """
+    """Change of the offsets (6 parameters) or of the load (10 parameters) at `time` [s]."""
 
     kind: str
     time: float
 
     @property
     def size(self) -> int:
-        """Number of parameters."""
         return 6 if self.kind == "offsets" else 10
 
 
@@ -74,7 +70,7 @@ class Model:
         gains: channels with a free gain.
         steps: changes of offsets or load.
         axes: (3, 3) signed permutation of the wrench's axes.
-        factor: factor of the torque; the part "torque factor" multiplies it.
+        factor: torque unit; the extension "torque factor" multiplies it.
     """
 
     parts: tuple[str, ...] = ()
@@ -84,12 +80,11 @@ class Model:
     factor: float = 1.0
 
     def extended(self, part: str) -> Model:
-        """Return the model with one more extension."""
         return self if part in self.parts else replace(self, parts=(*self.parts, part))
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Indices of the parameters of each extension."""
+        """Position of each extension's parameters in the parameter vector."""
         out, at = {}, DELAY + 1
         sizes = [(name, _SIZES[name]) for name in self.parts]
         sizes += [(f"gain {c}", 1) for c in self.gains]
@@ -101,12 +96,11 @@ class Model:
 
     @property
     def size(self) -> int:
-        """Number of parameters."""
         return max([DELAY + 1, *(x.stop for x in self.slices.values())])
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Indices (k,) of the columns of y, with its steps, that determine the wrench."""
+        """Indices (k,) of the signals in y that the model uses."""
         wide = bool({"gravity", "cable"} & set(self.parts))
         kept = np.ones(WIDTH + len(MOTION) * len(self.steps), bool)
         if not wide:
@@ -117,7 +111,7 @@ class Model:
 
     @cached_property
     def limits(self) -> Array:
-        """Largest change (size,) of each parameter in an iteration."""
+        """Largest change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
         out[DELAY] = _LARGEST_DELAY
         for name, where in self.slices.items():
@@ -126,11 +120,10 @@ class Model:
 
     @property
     def times(self) -> tuple[float, ...]:
-        """Times of the steps of offsets or load [s]."""
         return tuple(step.time for step in self.steps)
 
     def start(self, x: Array, of: Model) -> Array:
-        """Return parameters (size,) from the parameters x of the model `of`; new ones are 0."""
+        """Return parameters (size,) from parameters x of the model `of`; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY + 1] = x[: DELAY + 1]
         for name, where in self.slices.items():
@@ -139,7 +132,7 @@ class Model:
         return out
 
     def wrench(self, x: Array) -> Array:
-        """Return coefficients (B, 6, W) of the wrench in the signals y, for x (B, size)."""
+        """Return the wrench's coefficients (B, 6, W) in the signals, for parameters x (B, size)."""
         width, parts = WIDTH + len(MOTION) * len(self.steps), self.slices
         motion = self._motion(x)
         out = np.zeros((len(x), 6, width))
@@ -197,7 +190,7 @@ class Model:
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
 
     def derivative(self, x: Array) -> Array:
-        """Return the derivative (size, 6, k) of the wrench's coefficients by x (size,)."""
+        """Return the derivative (size, 6, k) of the wrench's coefficients by parameters x."""
         steps = np.ones(self.size)
         if "rotation" in self.slices:
             steps[self.slices["rotation"]] = _ROTATION_STEP

@@ -20,7 +20,7 @@ Spans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Selected rows (`used`, (M,)) of a record, and columns of its signals, for a model."""
+    """Rows of a record that are used (M,), and the columns of its signals that a model needs."""
 
     data: Instants
     used: NDArray[np.bool_]
@@ -28,12 +28,10 @@ class Rows:
     columns: NDArray[np.intp]
 
     def fits(self, model: Model) -> bool:
-        """Return whether `model` uses the same signals."""
         return self.times == model.times and np.array_equal(self.columns, model.columns)
 
     @cached_property
     def y(self) -> Array:
-        """Signals (M, W) of the model, 0 in unused rows."""
         return self.data.only(self.used).with_steps(self.times)[:, self.columns]
 
     @cached_property
@@ -62,7 +60,7 @@ class Rows:
         return np.asarray(y[at])
 
     def whitened(self, filters: Array) -> Array:
-        """Return sums of products (6, n, n) of n signals, filtered with 5 taps for each channel."""
+        """Return sums of products (6, n, n) of n signals, after each channel's 5-tap filter."""
         width = self.y.shape[1]
         taps = [(filters[:, : ORDER + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.sums.reshape(ORDER + 1, -1)
@@ -87,13 +85,11 @@ class Rows:
         return filters, np.maximum(power, floor)
 
     def rms(self, residual: Array) -> Array:
-        """Return the RMS (6,) of a residual with coefficients (6, W) in the signals."""
         e = self.y @ residual.T
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
 def in_spans(data: Instants, spans: Spans) -> NDArray[np.bool_]:
-    """Return (M,) booleans: True for rows within a time span."""
     inside = np.zeros(len(data.t), bool)
     for start, stop in spans:
         inside |= (data.t >= start) & (data.t <= stop)
@@ -129,7 +125,7 @@ class Fit:
         return -0.5 * len(self.rows.whole) * float(np.log(self.power).sum())
 
     def normal(self, model: Model, x: Array) -> tuple[Array, Array]:
-        """Return Gram matrix and right-hand side of the normal equations at x (size,)."""
+        """Return matrix and right-hand side of the normal equations at parameters x (size,)."""
         whitened = self.rows.whitened(self.filters) / self.power[:, None, None]
         J = model.derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
@@ -141,7 +137,6 @@ class Fit:
 def fit(
     model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
 ) -> Fit:
-    """Fit a model to rows from parameters `start` (size,), in at most `steps` iterations."""
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
@@ -167,7 +162,6 @@ def fit(
 
 
 def regularized_inverse(gram: Array) -> Array:
-    """Invert a Gram matrix with a small ridge on its scaled diagonal."""
     diagonal = np.diag(gram)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))
     scaled = gram * np.outer(scale, scale)
@@ -193,12 +187,10 @@ class State:
     def of(
         cls, data: Instants, model: Model, start: Array | None = None, spans: Spans = ()
     ) -> State:
-        """Fit a model outside of the time spans, from the parameters `start`."""
         used = data.used & ~in_spans(data, spans)
         return cls(data, spans, fit(model, Rows(data, used, model.times, model.columns), start))
 
     def extended(self, model: Model, start: Array | None = None, **options: int) -> State:
-        """Fit another model to the same rows."""
         if start is None:
             start = model.start(self.x, self.model)
         return State(self.data, self.spans, fit(model, self._rows_of(model), start, **options))
@@ -210,22 +202,19 @@ class State:
 
     @property
     def model(self) -> Model:
-        """Fitted model."""
         return self.fit.model
 
     @property
     def x(self) -> Array:
-        """Fitted parameters (size,)."""
         return self.fit.x
 
     def extension(self, name: str) -> tuple[Array, Array]:
-        """Return the parameters of a named extension of the load model, and their covariance."""
+        """Return the parameters of a named extension of the model, and their covariance."""
         where = self.model.slices[name]
         return self.x[where], self.fit.covariance[where, where]
 
     @property
     def rows(self) -> Rows:
-        """Rows outside of contacts."""
         return self.fit.rows
 
     @cached_property
@@ -242,22 +231,17 @@ class State:
 
     @cached_property
     def whole(self) -> Array:
-        """Indices of rows whose four predecessors are used, too."""
         return np.asarray(Rows(self.data, self.data.used, (), self.model.columns).whole)
 
     @cached_property
     def residual_ratio(self) -> float:
-        """Ratio of RMS residual to white noise, in the channel where it is largest."""
+        """RMS residual over white noise, in the channel where this ratio is largest."""
         white = np.maximum(self.data.white, 1e-12)
         return float(np.max(self.rows.rms(self.fit.residual) / white))
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """Measure of how much generic smooth signals would reduce the residual.
-
-        It is the gain of twice the log likelihood per degree of freedom: about 1 or below for noise
-        of any colour.
-        """
+        """Gain of `smooth_gain` per degree of freedom: about 1 or below for noise of any colour."""
         gain, freedom = self.smooth_gain
         return gain / max(1, freedom - self.model.size)
 
@@ -281,7 +265,7 @@ class State:
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
-            solved, rank = gain_of(x.T @ x, x.T @ white)
+            solved, rank = likelihood_gain(x.T @ x, x.T @ white)
             gain, freedom = gain + solved / self.fit.power[c], freedom + rank
         return gain, freedom
 
@@ -290,10 +274,10 @@ class State:
         x = model.start(self.x, self.model)
         rows = self._rows_of(model)
         residual = self.fit.residual if rows is self.rows else model.residual(x)
-        return gain_of(*replace(self.fit, rows=rows, residual=residual).normal(model, x))[0]
+        return likelihood_gain(*replace(self.fit, rows=rows, residual=residual).normal(model, x))[0]
 
 
-def gain_of(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
+def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
     """Return right^T gram^-1 right and the rank; diagonals below `least` count as rounding."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())

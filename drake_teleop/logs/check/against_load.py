@@ -26,8 +26,8 @@ from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
     SEARCH_RANGE,
     estimate_delay,
+    far_from_gaps,
     low_passed,
-    measured,
     resample,
     undelayed,
     white_noise,
@@ -63,14 +63,14 @@ class LoadFit:
 
     @property
     def good(self) -> bool:
-        """Whether some load of positive mass explains the wrench."""
+        """Whether the fitted load has a positive mass and explains the wrench."""
         return self.mass > 0 and self.unexplained < GOOD_SHARE + self.noise
 
 
 def load_fit(log: Log) -> LoadFit:
-    """Fit a load and constant offsets to a log, low-passed at 15 Hz."""
+    """Fit a load and constant offsets to a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_passed(log, cutoff).only(measured(log, cutoff))
+    smooth = low_passed(log, cutoff).only(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
     w = wrench - wrench.mean(axis=0)
@@ -108,7 +108,7 @@ def _scale(wrench: Array) -> Array:
 
 
 def decisive_factor(fit: LoadFit) -> float:
-    """Return the factor by which a corrected description must reduce the unexplained share."""
+    """Return the factor by which a correction must reduce the unexplained share of a fit."""
     n = max(1.0, fit.independent)
     return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARMS / _TESTED_EDITS)))
 
@@ -123,7 +123,7 @@ _SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
 _HALVED = 0.5
 
 
-def against_load(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
+def check_wrench(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
     """Return findings about wrench, orientation and clocks, and the motion's delay [s]."""
     log = data.read(description)
     delay = None if log.static else estimate_delay(log, 30.0)
@@ -222,10 +222,7 @@ def _without_remedy(
 
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
-    """Return a finding if a record does not determine the mass of a load.
-
-    `unexplained` is the unexplained share of the wrench's variance.
-    """
+    """Return a finding if a record does not determine the mass of a load."""
     if load.verdicts[6] != "not" and unexplained < UNDETERMINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
@@ -236,7 +233,7 @@ def payload_finding(load: Identification, unexplained: float) -> Finding | None:
     return Finding(
         "payload",
         f"payload not identifiable: {fitted}, which explains {share:.0f} % of the wrench's"
-        " variance; record slow turns about two horizontal axes that touch nothing",
+        " variance; record slow rotations about two horizontal axes, without contact",
     )
 
 
@@ -260,7 +257,6 @@ def _clock_edits(description: Description, log: Log) -> Iterator[tuple[None, Des
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
-    """Return a finding with a remedy if the motion is `delay` [s] behind the wrench."""
     if delay is None or abs(delay) <= SMALLEST_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"

@@ -1,7 +1,4 @@
-"""Errors of convention in a log description, found by the laws of motion.
-
-An error is reported if a corrected description agrees decisively better with the data.
-"""
+"""Errors of convention in a log description, found by the laws of motion."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_load import (
     GOOD_SHARE,
     LoadFit,
-    against_load,
+    check_wrench,
     drift_finding,
     load_fit,
     payload_finding,
@@ -30,7 +27,7 @@ from drake_teleop.logs.check.corrections import (
     Finding,
     correct_gravity_unit,
 )
-from drake_teleop.logs.check.imu_checks import against_itself, against_pose
+from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu_signals
 from drake_teleop.logs.check.log_data import LogData, channel_findings
 from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
@@ -53,7 +50,6 @@ class Conventions:
     """Result of the checks of a log description.
 
     Attributes:
-        findings: suspected errors.
         fit: fit of a load, after correction of IMU errors.
         mounting: mounting of the IMU relative to the pose, if determined.
         delay_s: delay of the motion behind the wrench, if determined [s].
@@ -66,7 +62,6 @@ class Conventions:
 
 
 def check_file(path: Path) -> Conventions:
-    """Check a canonical log or a log description against its data."""
     if path.suffix.lower() in FORMATS:
         table = read_table(path)
         return check_conventions(describe_canonical(path, table), str(path), {path: table})
@@ -82,13 +77,8 @@ def question_fit(
 ) -> tuple[Finding, ...]:
     """Return findings, except "lag", of a log whose identified load is suspicious.
 
-    Args:
-        predicted: (N, 6) wrench that the load predicts [N, N m].
-        delay: removed delay [s]; None if undetermined.
-        check: function that checks the log's description against its data.
-
-    Raises:
-        DrakeTeleopError: if the result is worthless and a finding has a remedy.
+    The load predicts the wrench `predicted` (N, 6). `check` checks the log's description against
+    its data. Raise DrakeTeleopError if the load is useless and a finding has a remedy.
     """
     if _never_changes(log):
         raise DrakeTeleopError(
@@ -129,7 +119,7 @@ def question_fit(
 
 
 def errors_of_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
-    """Return the findings of `check` that are errors of the described motion."""
+    """Return the findings of `check` that concern the described motion, not the wrench."""
     return tuple(x for x in _findings(check) if x.name in MOTION_ERRORS)
 
 
@@ -158,14 +148,13 @@ def _is_suspicious(log: Log) -> bool:
     if (np.ptp(few.wrench, axis=0) < 1e-9 * np.abs(few.wrench).max()).any():
         return True
     with suppress(ValueError, ArithmeticError):
-        return bool(against_itself(log.described, few)[0])
+        return bool(check_imu_signals(log.described, few)[0])
     return False
 
 
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Check a description against its data; `tables` are already read tables by path."""
     with one_blas_thread():
         found = _check(LogData(description, source, dict(tables or {})), description)
     if Path(source).suffix.lower() not in FORMATS:
@@ -190,11 +179,11 @@ def _check(data: LogData, description: Description) -> Conventions:
     if dead:  # A dead channel would cause wrong findings about motion and load.
         return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
     findings, description = correct_gravity_unit(description, log)
-    more, description = against_itself(description, data.thin(description))
+    more, description = check_imu_signals(description, data.thin(description))
     findings += more
     mounting = None
     if description.imu and description.pose:
-        more, mounting, description = against_pose(description, data)
+        more, mounting, description = check_imu_against_pose(description, data)
         findings += more
     fit = load_fit(data.thin(description))
     if broken or (mounting is not None and mounting.mirrored):
@@ -206,7 +195,7 @@ def _check(data: LogData, description: Description) -> Conventions:
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
         findings += position_finding(description, data, lag)
-    more, delay = against_load(description, data)
+    more, delay = check_wrench(description, data)
     findings = _one_clock(description, [*findings, *more], mounting, delay)
     rest = _rest_finding(log)
     if rest is not None:

@@ -45,7 +45,6 @@ Edit = tuple[Finding, Description]
 
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
-    """Return the description with one field changed; `path` is such as "imu.time.offset"."""
     first, *rest = path.split(".", 1)
     if rest:
         model: Any = getattr(description, first)
@@ -89,7 +88,7 @@ def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Findi
 
 
 def pose_edits(description: Description) -> Iterator[Edit]:
-    """Yield edits of the form of the orientation and of the sign of gravity."""
+    """Yield alternatives to the described form of the orientation and sign of gravity."""
     pose, imu = description.pose, description.imu
     sensed = imu is not None and imu.specific_force is not None
     if imu is not None and sensed:
@@ -131,7 +130,7 @@ def try_edit(function: Callable[[Description], Any], edited: Description) -> Any
 
 
 def load_edits(description: Description) -> Iterator[Edit]:
-    """Yield edits of signs, axes and units of wrench and motion, including `pose_edits`."""
+    """Yield alternatives to the described signs, axes and units of wrench and motion."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
     text = "the sign of the wrench is inverted"

@@ -80,6 +80,7 @@ _UNITS = {
 _POSE_VECTOR = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
 _POSE_WIDTHS = (7, 8)
 _QUATERNION_TOLERANCE = 0.01  # of the length
+_NUMBERED_QUATERNION = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_COUNTS = 2000.0  # median of integers that are raw counts
 _FILL_IN = "FILL IN"
@@ -99,11 +100,9 @@ class Draft(NamedTuple):
     head: list[str]
 
     def text(self) -> str:
-        """Return the description as YAML."""
         return yaml_text(self.streams, head=self.head)
 
     def corrected(self, finding: Finding) -> Draft:
-        """Return a copy of the draft with the corrected fields of a finding."""
         streams = copy.deepcopy(self.streams)
         for path, value in finding.fields.items():
             *outer, last = path.split(".")
@@ -142,13 +141,10 @@ _NOTHING = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
-    """Return a log description guessed from names and magnitudes of a table's columns.
-
-    `folder` is that of the draft, to which the path to the table is relative.
-    """
+    """Guess a log description from the names and magnitudes of a table's columns."""
     plain = {name: _normalized(name) for name in table.columns}
     found = _pose_vectors(table, plain) | _vectors(plain) | _euler_angles(plain)
-    found |= _numbered(plain) | _arrays(table, plain)
+    found |= _numbered(plain) | _numbered_quaternion(table, plain) | _arrays(table, plain)
     _resolve_translation(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
@@ -241,7 +237,7 @@ def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
 
 
 def _euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    """Return three angles that have the names of `_EULER` behind a common prefix."""
+    """Return three columns of angles, named as in `_EULER` after a common prefix."""
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
         prefix, _, end = words.rpartition("_")
@@ -255,7 +251,7 @@ def _euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
 
 
 def _resolve_translation(found: dict[str, _Columns], plain: dict[str, tuple[str, str]]) -> None:
-    """Replace a torque tx, ty, tz without a force by a position, as in trajectories of TUM."""
+    """Take tx, ty, tz without a force as a position, as in TUM files, not as a torque."""
     torque = found.get("torque", _NOTHING).columns
     bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
     if bare and "force" not in found and "position" not in found:
@@ -263,7 +259,7 @@ def _resolve_translation(found: dict[str, _Columns], plain: dict[str, tuple[str,
 
 
 def _pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    """Return position and quaternion of a numbered vector, which may end with a gripper's width."""
+    """Return position and quaternion of numbered columns, which may end with a gripper's width."""
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_POSE_VECTOR, words):
@@ -271,11 +267,26 @@ def _pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, 
     for columns in (group for group in groups.values() if len(group) in _POSE_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
-            length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
-            if np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE:
+            if _have_unit_length(table, quaternion):
                 position = columns[:3] if first else columns[4:7]
                 return {kind: _Columns(quaternion, ""), "position": _Columns(position, "")}
     return {}
+
+
+def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
+    length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
+    return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
+
+
+def _numbered_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    """Return four columns such as q1, q2, q3, q4 of ABB, if they have unit length."""
+    groups: dict[str, list[str]] = {}
+    for name, (words, _) in plain.items():
+        if re.search(_NUMBERED_QUATERNION, words):
+            groups.setdefault(_without_number(words), []).append(name)
+    fours = [group for group in groups.values() if len(group) == 4]
+    found = next((group for group in fours if _have_unit_length(table, group)), None)
+    return {"orientation": _Columns(found, "")} if found else {}
 
 
 def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
@@ -343,7 +354,7 @@ def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
 
 
 def _are_counts(table: Table, columns: list[str]) -> bool:
-    """Return whether columns have integers that are too large for a force in N."""
+    """Return whether columns contain integers too large for a force in N: raw sensor counts."""
     if _FILL_IN in columns:
         return False
     first = table.raw(columns[0], columns[0])

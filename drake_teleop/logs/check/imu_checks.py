@@ -33,8 +33,8 @@ _WINDOW_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
 _ROTATION_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
 
 
-def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
-    """Return findings about contradictions within an IMU, and the corrected description."""
+def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
+    """Return contradictions among the signals of an IMU, and the corrected description."""
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
         return [], description
@@ -127,13 +127,13 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     return Finding(
         "swapped axes",
         "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
-        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or take it"
-        " out",
+        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or remove"
+        " it",
     )
 
 
 def _mean_forces(log: Log, P: Array) -> Array:
-    """Return mean specific forces (2, n, 3) of Hann windows, and half a window later [m/s^2]."""
+    """Return specific forces (2, n, 3) in Hann windows, and half a window later [m/s^2]."""
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
@@ -185,10 +185,10 @@ def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
     )
 
 
-def against_pose(
+def check_imu_against_pose(
     description: Description, data: LogData
 ) -> tuple[list[Finding], Mounting | None, Description]:
-    """Return findings of IMU against pose, the IMU's mounting, and the corrected description."""
+    """Return contradictions of IMU and pose, the IMU's mounting, and the corrected description."""
 
     def mounting(edited: Description) -> Mounting | None:
         pose_alone = edited.model_copy(update={"imu": None})

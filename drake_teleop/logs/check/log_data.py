@@ -17,7 +17,7 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.clocks import seconds, spread
+from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_s
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import read_description
 from drake_teleop.logs.read.streams import MINIMUM_SAMPLES
@@ -28,7 +28,7 @@ _TIME_COLUMN = "thinned time stamps of"
 
 
 class LogData:
-    """Tables of a log, whole and thinned, which edited descriptions read without file access."""
+    """Tables of a log in memory, whole and thinned, for reading with edited descriptions."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source = source
@@ -48,11 +48,10 @@ class LogData:
             self._thin(name, stream, thin, min(steps[stream.source]))
 
     def read(self, description: Description) -> Log:
-        """Return the whole log, as a description defines it."""
         return read_description(description, self._source, tables=self.tables)
 
     def thin(self, description: Description) -> Log:
-        """Return the log at about 100 Hz, read with a description."""
+        """Return the log at about 100 Hz, as a description defines it."""
         stamped = {}
         for name, stream in _streams(description).items():
             if (time := getattr(stream, "time", None)) is not None:
@@ -84,16 +83,15 @@ class LogData:
         return self.tables[stream.source].filled(stream.columns)
 
     def _stamps(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
-        """Return the finite time stamps of a stream [s], and their rows."""
         if stream.time.column is None:
             rows = np.arange(self._table(stream).rows)
             return rows / stream.time.rate, rows
-        t, _ = seconds(stream.time, self._table(stream), "time")
+        t, _ = time_stamps_s(stream.time, self._table(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
-        return (spread(t) if shared else t), rows
+        return (spread_shared_stamps(t) if shared else t), rows
 
     def _thin(self, name: str, stream: Any, thin: Table, k: int) -> None:
         table, rows = self._table(stream), None

@@ -122,8 +122,8 @@ def _fit_with_offset(
     return x / size, np.sqrt(variance * np.diag(inverse)) / size
 
 
-def usable(log: Log) -> bool:
-    """Return whether a log has poses of at least 4 s for splines."""
+def has_usable_poses(log: Log) -> bool:
+    """Return whether a log has poses over at least 4 s, as splines require."""
     return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST_S
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, whole_file, write_table
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.array_files import library, read_hdf5, read_zarr
+from drake_teleop.logs.read.array_files import import_optional, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.table_files import expanded_columns, read_table
@@ -124,7 +124,7 @@ def _open_lerobot(path: Path) -> Dataset:
 def _open_hdf5(path: Path) -> Dataset:
     names: list[str] = []
     settings: dict[str, Any] = {}
-    with library("h5py", path).File(path, "r") as file:
+    with import_optional("h5py", path).File(path, "r") as file:
         if "data" in file:
             data = file["data"]
             names = sorted(data, key=lambda name: (len(name), name))
@@ -248,7 +248,7 @@ def _write_csv(path: Path, target: Path, new: Columns) -> None:
 
 
 def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
-    h5py = library("h5py", dataset.path)
+    h5py = import_optional("h5py", dataset.path)
     make_folder(out.parent)
     with whole_file(out) as temporary:
         shutil.copyfile(dataset.path, temporary)
@@ -263,7 +263,7 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None
 
 
 def _write_zarr(out: Path, columns: Sequence[Columns]) -> None:
-    zarr = library("zarr", out)
+    zarr = import_optional("zarr", out)
     group, new = zarr.open_group(out / "data", mode="r+"), _joined(columns)
     for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
         array = values.astype(np.float32 if values.ndim == 2 else bool)

@@ -16,10 +16,10 @@ from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
     Spectra,
     Window,
-    at_rate,
     averaged_splines,
     choose_spacing,
     clock_rate,
+    correct_clock_rate,
     delay_deviation,
     fit_levels,
     fit_linear_model,
@@ -83,12 +83,10 @@ class Frame:
 
     @property
     def position_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where a coordinate of the origin is determined."""
         return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
 
     @property
     def rotation_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where the rotation about an axis of S is determined."""
         return np.asarray(self.turn_deviations_deg < MAX_ROTATION_DEVIATION_DEG)
 
 
@@ -124,9 +122,8 @@ class PoseEstimate(PoseMotion):
         fit: load, with the pose frame as described or as estimated on request.
         free: load, with the pose frame always estimated.
         frame: pose frame of `free`.
-        seen: units, axes and masses before a rigid load is assumed.
+        seen: units, axes and masses from a fit without a rigid load.
         t, rejected: (M,) instants [s], and True for disturbed ones.
-        note: note for the user, or "".
     """
 
     fit: RigidFit
@@ -144,7 +141,6 @@ class PoseEstimate(PoseMotion):
 
     @property
     def covariance(self) -> Array:
-        """Covariance (16, 16) of [offsets; phi] [SI]."""
         return self.fit.covariance[LOAD, LOAD]
 
 
@@ -161,19 +157,12 @@ def estimate_from_poses(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseEstimate:
-    """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses.
+    """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses of P.
 
-    Args:
-        t: (N,) times, evenly spaced [s].
-        wrench: (N, 6) [f; tau] on the load, in S about So, Eq. (1) [N, N m].
-        poses: of P, on the same clock except for a delay.
-        gravity_W: (3,) gravity in the world [m/s^2].
-        p_SoPo_S: (3,) origin of P [m], or None to estimate it.
-        R_SP: (3, 3) rotation of P, or None to estimate it.
-        delay: delay of the poses behind the wrench [s], or None to estimate it.
-        gain: standard deviation of the sensor gains, such as 0.01.
-        lost: (N,) True for excluded samples.
-        imu: IMU data of S, used if they lower the cost.
+    The wrench (N, 6) at even times `t` is [f; tau] on the load, in S about So [N, N m]. Origin
+    `p_SoPo_S` [m], rotation `R_SP`, and delay of the poses behind the wrench [s] are estimated
+    where None. `gain` is the standard deviation of the sensor gains. Samples with `lost` True are
+    excluded. IMU data of S are used if they fit the wrench better.
     """
     with one_blas_thread():
         found, _, window = _find_motion(
@@ -229,10 +218,7 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseMotion:
-    """Return the motion from poses of S with which an identified load fits a wrench best.
-
-    `load` (6, 16) is from `load_coefficients`; other arguments as for `estimate_from_poses`.
-    """
+    """Return the motion from poses of S with which an identified load fits a wrench best."""
     with one_blas_thread():
         motion, last, _ = _find_motion(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
@@ -278,7 +264,9 @@ def _find_motion(
     part = replace(part, taper=exclude(part.taper, disturbed, grid.dt))
     rate = 0.0 if known else clock_rate(part, cache, late, spacing)
     if rate:
-        near_poses, poses = (at_rate(x, rate, part.grid, late) for x in (near_poses, poses))
+        near_poses, poses = (
+            correct_clock_rate(x, rate, part.grid, late) for x in (near_poses, poses)
+        )
         cache = averaged_splines(near_poses)
     choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:

@@ -35,7 +35,7 @@ class _Sensor:
 
 
 def compare_imu(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> ImuRows | None:
-    """Return the IMU data, corrected to fit splines of poses, or None if the two do not agree."""
+    """Return IMU data corrected to fit splines of poses, or None if the two do not agree."""
     powers = tuple(std**2 / splines.rate for std in splines.noise())
     averaged, sensors = imu.averaged(_COMPARISON_RATE_HZ), []
     for which, y in enumerate((averaged.specific_force, averaged.angular_velocity)):

@@ -1,7 +1,4 @@
-"""Linear model of the wrench in 16 signals of the motion, Eqs. (T73) to (T76).
-
-Its likelihood determines knots, delay, and the rate of the poses' clock.
-"""
+"""Linear model of the wrench in 16 signals of the motion, Eqs. (T73) to (T76)."""
 
 from __future__ import annotations
 
@@ -23,8 +20,8 @@ from drake_teleop.logs.pose_motion.spectra import (
     end_taper,
     moments,
     random_walk_shape,
+    shift_spectrum,
     shift_taper,
-    shifted,
     signal_spectrum,
     taper_derivative,
     wrench_spectrum,
@@ -86,7 +83,7 @@ def _wrench_powers(Z: Array) -> Array:
 def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
 ) -> LinearFit:
-    """Fit the model to moments of signals and wrench; with a known load only the constants."""
+    """Fit the linear model to moments; fit only the constants if `load` is given."""
     floor = _rounding_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T
@@ -159,9 +156,8 @@ class Spectra:
     """Spectra of wrench (K, 6) and motion signals (K, 16) of a record, for one taper and delay.
 
     Attributes:
-        of: frequency bands.
-        delay: delay of the signals [s].
         grid, taper: instants of the record, and their weights (M,).
+        delay: delay of the signals [s].
         zeta: (M, 16) signals in time.
     """
 
@@ -180,18 +176,17 @@ class Spectra:
 
     @cached_property
     def taper_fixed(self) -> bool:
-        """Whether the taper (weights of samples) stays in place if the delay changes."""
+        """Whether the weights of samples stay in place when the delay changes."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.load is not None)
 
     def at(self, delay: float) -> Spectra:
-        """Return the spectra with the signals at another delay [s]."""
         shift, signals = delay - self.delay, self.signals
         if self.taper_fixed:
             before = shift_taper(self.grid, self.taper, shift)
             signals = signal_spectrum(self.grid, before, self.zeta, len(signals))
-        late = shifted(signals, self.of.frequency, shift)
+        late = shift_spectrum(signals, self.of.frequency, shift)
         late[:, 0] = self.signals[:, 0]
         return replace(self, signals=late)
 
@@ -204,7 +199,7 @@ class Spectra:
         return moments(self.signals, self.wrench, self.of, rates)
 
     def fit(self) -> LinearFit:
-        """Fit the coefficients of all signals; only the constants if the load is known."""
+        """Fit the coefficients of all signals, or only the constants if the load is known."""
         Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
         parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z)
         fit = _fit_moments(*parts, Levels.flat(self.of), load)
@@ -224,7 +219,7 @@ class Spectra:
         return fits.costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
-        """Return moments of signals and wrench at delays (D,); the taper moves with the signals."""
+        """Return moments of signals and wrench at delays (D,) [s], with a moving taper."""
         of, Z = self.of, moments(self.signals, self.wrench, self.of)
         fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
         products = np.conj(self.signals)[:, :, None] * fixed[:, None]
@@ -259,7 +254,6 @@ class Window:
     top: float
 
     def part(self, rows: slice) -> Window:
-        """Return the window of some rows of the grid."""
         grid = self.grid
         wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
         grid = replace(grid, t=grid.t[rows], wrench=wrench)
@@ -279,7 +273,7 @@ class Window:
 def best_delay(
     spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
 ) -> tuple[float, float]:
-    """Return the delay [s] of lowest cost within `reach` [s], to `finest` [s], and this cost."""
+    """Return the delay of lowest cost within `reach`, to the step `finest` [s], and this cost."""
     step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs(at)
@@ -310,7 +304,7 @@ def guess_spacing(
 ) -> tuple[float, float]:
     """Return knot distance [s] and delay [s] of lowest cost on a coarse grid.
 
-    The delay is fixed if `known`.
+    The delay is not changed if `known`.
     """
     spacings, found = _allowed_spacings(cache)[::2], []
     start = window.spectra(cache.at(spacings[0]), delay)
@@ -327,9 +321,9 @@ def guess_spacing(
 def choose_spacing(
     window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return the splines (of `choices`), knot distance [s] and delay [s] with least cost.
+    """Return splines, knot distance [s] and delay [s] of about lowest cost.
 
-    Knots are 8 or 16 % closer than at least cost. `known`: keep `delay`.
+    Knots are 8 or 16 % closer than at lowest cost. The delay is not changed if `known`.
     """
     start = window.spectra(choices[0].at(SPACINGS[0]), delay)
     found = []
@@ -354,7 +348,7 @@ def choose_spacing(
 
 
 def averaged_splines(poses: Poses) -> SplineCache:
-    """Return splines of averaged poses, at the rate that a search needs."""
+    """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
     return SplineCache(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 
@@ -384,7 +378,7 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
             return 0.0
         if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CHANGE_S:
             break
-        splines = PoseSplines(at_rate(cache.poses, trial, grid, delay), spacing)
+        splines = PoseSplines(correct_clock_rate(cache.poses, trial, grid, delay), spacing)
         now = first.with_motion(splines, window.gravity_W, delay)
         cost = now.fit().cost
         if not cost < least:
@@ -393,11 +387,8 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
     return best if 2.0 * (start - least) > _MIN_LIKELIHOOD_GAIN else 0.0
 
 
-def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
-    """Return the poses on the wrench's clock, for a relative rate error of their own clock.
-
-    The delay at mid-record, `delay` [s], is unchanged.
-    """
+def correct_clock_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
+    """Return the poses on the wrench's clock, for a relative rate error of the poses' clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 

@@ -48,10 +48,9 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """IMU data at the sensor origin So, in the axes of S.
+    """IMU data at the sensor origin So, in the axes of S, at times t (K,) [s].
 
     Attributes:
-        t: (K,) times, evenly spaced except for gaps [s].
         specific_force: (K, 3) [m/s^2], or None.
         angular_velocity: (K, 3) [rad/s], or None.
     """
@@ -81,10 +80,9 @@ class Inertial:
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """Poses of S in a log, and the described frame P that was recorded.
+    """Poses of S in a log, with gravity in the world [m/s^2], and the described pose frame P.
 
     Attributes:
-        gravity_W: (3,) gravity in the world [m/s^2].
         p_SoPo_S: (3,) described origin of P [m].
         R_SP: (3, 3) described rotation of P.
     """

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.linear_model import ROUNDING, Spectra
-from drake_teleop.logs.pose_motion.spectra import Grid, distance
+from drake_teleop.logs.pose_motion.spectra import Grid, distance_to_flag
 from drake_teleop.logs.pose_motion.splines import MOTION_COLUMNS
 
 NOTHING_REJECTED = (
@@ -23,10 +23,7 @@ _MIN_MARGIN_S = 0.1
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
-    """Return (M,) booleans: True for disturbed instants (contact, impact, saturation), and a note.
-
-    For an identified load only the offsets are fitted.
-    """
+    """Return (M,) True for contact, impact or saturation, and a note for the user."""
     # A Gaussian gain, one half at `_PASSED_SHARE` / h, does not ring.
     gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED_SHARE) ** 2)
     grid = spectra.grid
@@ -57,7 +54,7 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
             break
     if not rejected.any():
         return rejected, ""
-    rejected = distance(rejected) * grid.dt <= max(_MIN_MARGIN_S, spacing)
+    rejected = distance_to_flag(rejected) * grid.dt <= max(_MIN_MARGIN_S, spacing)
     if _information_loss(test_signals, inside, inside & ~rejected) > _MAX_LOSS:
         return np.zeros(len(x), bool), NOTHING_REJECTED
     return rejected, ""

@@ -45,9 +45,9 @@ class RigidFit:
         state: estimated parameters; tau is relative to the delay of the moments.
         covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
             if undetermined, 0 if not free.
-        misfit, degrees: log likelihood ratio to the linear model (times 2), and its degrees of
+        misfit, degrees: twice the log likelihood ratio to the linear model, and its degrees of
             freedom.
-        misfit_of_gains: expected increase of the misfit by stated gain errors.
+        misfit_of_gains: expected increase of the misfit by the stated gain errors.
         one_weight: whether all bands had one weight.
     """
 
@@ -78,10 +78,9 @@ class RigidFit:
 
 
 def motion_map(R: Array, r: Array) -> Array:
-    """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79).
+    """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79), for R = R_PS, r = p_PoSo [m].
 
-    zeta (16): motion signals of pose frame P, F: wrench, z (19): Eq. (T4) in sensor frame S;
-    R = R_PS, r = p_PoSo [m].
+    It maps motion signals zeta (16) of pose frame P, and the wrench F, to the sensor frame S.
     """
     M = np.zeros((19, SIGNALS + 6))
     M[0, 0] = 1.0
@@ -100,7 +99,7 @@ _PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
     """Return the coefficients (6, 16) of a load phi (10,) in the linear model, Eq. (T73).
 
-    `removed_weight` (4,) is the [m, m c] of a weight that the wrench does not contain.
+    The wrench does not contain the weight of `removed_weight` [m, m c] (4,).
     """
     C = _coefficients_of(phi)
     if removed_weight is not None:
@@ -135,13 +134,8 @@ def fit_rigid(
 ) -> RigidFit:
     """Fit a rigid load; all bands get one weight if no rigid load explains the wrench.
 
-    Args:
-        Z: (bands, 38, 38) second moments, `Spectra.moments`.
-        Q: (bands, 38, 38) noise of the poses in Z, `spectra.noise_moments`.
-        levels: noise of the bands.
-        free: (23,) True for estimated parameters.
-        linear: fit of the linear model, whose residual gives the first weights.
-        gain: standard deviation of the sensor gains.
+    Z (bands, 38, 38) are second moments, Q the part that noise of the poses adds. Parameters with
+    `free` (23,) True are estimated. The residual of the fit `linear` gives the first weights.
     """
     record = _Record(Z, Q, levels, free, linear.power)
     solution = _solve(record, start)
@@ -345,7 +339,7 @@ _ITERATIONS = 5
 
 @dataclass(frozen=True, eq=False)
 class ReadOff:
-    """Units, axes and masses that the free coefficients of a linear model of the wrench imply.
+    """Units, axes and masses that the fit of a linear model of the wrench implies.
 
     Attributes:
         kappa: unit error of position; 1e-3 for mm described as m.
@@ -373,7 +367,6 @@ class ReadOff:
 
 
 def read_off(fit: LinearFit) -> ReadOff:
-    """Return units, axes and masses that a fitted linear model implies."""
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
     kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])

@@ -11,7 +11,7 @@ from scipy.fft import next_fast_len
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed
+from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed_noise_share
 
 Complex = NDArray[np.complex128]
 
@@ -34,7 +34,7 @@ MOMENTS_SIZE = 2 * SIGNALS + 6
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Instants t (M,) of the motion signals [s], about 100 Hz, and samples of the wrench.
+    """Instants t (M,) of the motion signals [s], at about 100 Hz, and samples of the wrench.
 
     Attributes:
         wrench: (N, 6) samples, N = M stride.
@@ -48,7 +48,6 @@ class Grid:
 
     @classmethod
     def of(cls, t: Array, wrench: Array, load: Array | None = None) -> Grid:
-        """Return the grid for even times (N,) [s] and wrenches (N, 6); `load` is only stored."""
         dt = (t[-1] - t[0]) / (len(t) - 1)
         stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
@@ -56,7 +55,6 @@ class Grid:
 
     @property
     def dt(self) -> float:
-        """Spacing of the instants [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
@@ -66,7 +64,6 @@ class Grid:
 
     @cached_property
     def frequency(self) -> Array:
-        """Frequencies (L,) of the Fourier transforms [Hz]."""
         return np.asarray(np.fft.rfftfreq(self.length, self.dt), np.float64)
 
 
@@ -87,7 +84,6 @@ class Bands:
 
     @property
     def count(self) -> int:
-        """Number of bands."""
         return int(self.band[-1]) + 1
 
     @cached_property
@@ -96,7 +92,6 @@ class Bands:
         return np.asarray(np.bincount(self.band, self.weight), np.float64)
 
     def sums(self, values: Array) -> Array:
-        """Return the weighted sums (count, ...) over the bands of values (K, ...)."""
         flat = values.reshape(len(values), -1) * self.weight[:, None]
         starts = np.searchsorted(self.band, np.arange(self.count))
         return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])
@@ -132,11 +127,11 @@ def end_taper(t: Array, start: float, stop: float) -> Array:
 
 def exclude(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((distance(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
+    edge = np.clip((distance_to_flag(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
-def distance(flags: NDArray[np.bool_]) -> Array:
+def distance_to_flag(flags: NDArray[np.bool_]) -> Array:
     """Return the number (M,) of instants to the nearest set flag; inf without any."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))
@@ -164,7 +159,7 @@ def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Comple
     return out
 
 
-def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
+def shift_spectrum(spectrum: Complex, frequency: Array, shift: float) -> Complex:
     """Return spectra (K, 16) of zeta and taper `shift` [s] later; the constant is unchanged."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
@@ -172,12 +167,10 @@ def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
 
 
 def shift_taper(grid: Grid, taper: Array, shift: float) -> Array:
-    """Return the taper (M,) moved by `shift` [s]."""
     return _filter(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
 
 
 def taper_derivative(grid: Grid, taper: Array) -> Array:
-    """Return the time derivative (M,) of the taper [1/s]."""
     return _filter(grid, taper, 2j * np.pi * grid.frequency)
 
 
@@ -188,7 +181,7 @@ def _filter(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Arra
 def moments(zeta: Complex, wrench: Complex, of: Bands, rates: Complex | None = None) -> Array:
     """Return second moments (bands, 38, 38) of y = [zeta (16), F (6), d zeta/dt (16)].
 
-    They are sums of Re y* y^T. Without rates the result is (bands, 22, 22).
+    They are sums of Re y* y^T; (bands, 22, 22) without `rates`, the spectra of d zeta/dt.
     """
     parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
     y = np.hstack(parts) * np.sqrt(of.weight)[:, None]
@@ -220,13 +213,13 @@ class Levels:
 
     @classmethod
     def flat(cls, of: Bands) -> Levels:
-        """Return levels of noise that is white within each group."""
+        """Return levels of noise that is white within each group of bands."""
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
     def power(self, sums: Array, used: Array | None = None) -> Array:
         """Return the noise power (..., bands, 6) of residuals with power `sums` (..., bands, 6).
 
-        `used` (bands, 6) are degrees of freedom that parameters use.
+        `used` (bands, 6) are the degrees of freedom of fitted parameters.
         """
         remaining = self.grouped(self.sizes)[:, None]
         if used is not None:
@@ -237,7 +230,7 @@ class Levels:
         return np.asarray(level[..., self.group, :] * self.shape)
 
     def grouped(self, x: Array) -> Array:
-        """Return the sums (groups, ...) over the bands of each group, of x (bands, ...)."""
+        """Return the sums (groups, ...) of x (bands, ...) over the bands of each group."""
         return np.asarray(np.add.reduceat(x, self._starts, axis=0))
 
     @cached_property
@@ -270,11 +263,11 @@ def noise_moments(
 ) -> Array:
     """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `Spectra.moments`.
 
-    `zeta` (M, 16): motion signals; `noise`: standard deviations of position [m], rotation [rad].
+    `noise`: standard deviations of position [m] and rotation [rad].
     """
     w2 = (2.0 * np.pi * of.frequency) ** 2
     per_number = np.sum(taper**2) / (grid.dt * splines.rate)
-    share = per_number * passed(of.frequency, splines.spacing)
+    share = per_number * passed_noise_share(of.frequency, splines.spacing)
     position_power, rotation_power = (std**2 * share for std in noise)
     if splines.imu_rows is not None:
         left = splines.imu_rows.share(of.frequency)

@@ -164,7 +164,7 @@ class PoseSplines:
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """Return the signals zeta (N, 16) of Eq. (T73) at times t (N,) [s], in the axes of P.
 
-        They are [1, acceleration, -gravity, alpha, products of omega]. Values at the ends are held.
+        They are [1, acceleration, -gravity, alpha, products of omega].
         """
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         zeta = np.empty((len(t), SIGNALS))
@@ -245,17 +245,13 @@ class SplineCache:
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def at(self, spacing: float) -> PoseSplines:
-        """Return the splines with a knot distance [s]."""
         if spacing not in self._fit:
             self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
         return self._fit[spacing]
 
 
-def passed(frequency: Array, spacing: float) -> Array:
-    """Return the share (K,) of white noise's power that splines pass, Eq. (T72).
-
-    `frequency` (K,) in [Hz], knot distance `spacing` in [s].
-    """
+def passed_noise_share(frequency: Array, spacing: float) -> Array:
+    """Return the share (K,) of white noise's power that splines pass at a frequency, Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)

@@ -25,7 +25,7 @@ SMOOTHER_WINDOW = 1.8
 
 
 def spacing(t: Array) -> float:
-    """Return the mean step of the times `t` (N,) [s]."""
+    """Return the mean step of times `t` (N,) [s]."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
@@ -61,10 +61,7 @@ def _interpolate(t_new: Array, t: Array, x: Array) -> Array:
 
 
 def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
-    """Filter samples x (N, ...) of spacing `dt` [s] without phase shift, Eq. (T10).
-
-    There is no filter for a cut-off of None or above the Nyquist rate.
-    """
+    """Filter samples x (N, ...) without phase shift, Eq. (T10); no filter for a cut-off None."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return x
     n = len(x)
@@ -135,7 +132,7 @@ def _differentiate_polynomials(coefficients: list[Array], tau: Array, order: int
 
 
 def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[Array, Array]:
-    """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS (N, 3, 3)."""
+    """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS."""
     _, first, second = smooth_derivatives(R_WS, dt, bandwidth_hz)
     R_SW = np.swapaxes(R_WS, 1, 2)
     return skew_parts(R_SW @ first), skew_parts(R_SW @ second)
@@ -157,7 +154,7 @@ def white_noise(x: Array) -> Array:
 
 
 def low_passed(log: Log, cutoff_hz: float | None) -> Log:
-    """Return the log with wrench and motion low-passed (zero phase); unchanged for static poses."""
+    """Return the log with zero-phase filtered wrench and motion; unchanged for static poses."""
     if log.static:
         return log
     return replace(
@@ -170,7 +167,7 @@ def low_passed(log: Log, cutoff_hz: float | None) -> Log:
 
 
 def undelayed(log: Log, delay_s: float) -> Log:
-    """Return the log with its motion advanced by `delay_s` [s]; remove samples without motion."""
+    """Return the log with its motion advanced by the delay, without samples that lack motion."""
     if log.static or delay_s == 0:
         return log
     at = log.t + delay_s
@@ -201,15 +198,15 @@ def undelayed(log: Log, delay_s: float) -> Log:
     )
 
 
-def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True for samples that no gap affects, even after the low-pass."""
+def far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
+    """Return (N,) True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
     return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
 
 
-def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True within `length_s` [s], or a low-pass period, of either end."""
+def near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
+    """Return (N,) True within `length_s` [s], or a period of the low-pass, of either end."""
     out = np.zeros(len(log), bool)
     if log.static:
         return out
@@ -221,7 +218,7 @@ def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_
 
 
 def widened(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True within `by` samples of a set flag."""
+    """Return flags (N,) that are also True within `by` samples of a set flag."""
     count = np.concatenate([[0], np.cumsum(flags)])
     at = np.arange(len(flags))
     return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]
@@ -235,15 +232,15 @@ _MIN_DELAY_SAMPLES = 32
 def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
     """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c of the wrench
-    w, within +-0.25 s or a tenth of the record. Offsets o, and phi (10,) if not given, are fitted.
+    It minimizes the log variance of the residual, summed over the wrench channels. Offsets, and
+    phi (10,) if not given, are fitted.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_passed(log, cutoff)
     reach = min(SEARCH_RANGE, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    gap = ~measured(log, cutoff)
+    gap = ~far_from_gaps(log, cutoff)
     gap = widened(gap, math.ceil(reach / log.dt)) if gap.any() else gap
     inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_DELAY_SAMPLES:
@@ -262,9 +259,9 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
 def delay_of(
     log: Log, cutoff_hz: float | None, delay: str | float, phi: Array | None = None
 ) -> tuple[float, str]:
-    """Return the delay of the motion to remove [s], and its source; `delay` is in [s], or "auto".
+    """Return the delay of the motion behind the wrench [s], and its source; `delay` may be "auto".
 
-    The source is "static", "given", "estimated" or "undetermined" (0).
+    The source is "static", "given", "estimated" or "undetermined" (delay 0).
     """
     if log.static:
         return 0.0, "static"

@@ -1,7 +1,7 @@
 """Arrays of HDF5, Zarr and MATLAB files; `group/name` becomes `group.name`.
 
-MATLAB files of version 7.3 are HDF5. Versions 5 to 7 are parsed here (MathWorks, MAT-File Format),
-because invalid files can crash SciPy's reader. Other types are ignored.
+MATLAB files of versions 5 to 7 are parsed here (MathWorks, MAT-File Format), because invalid files
+can crash SciPy's reader.
 """
 
 from __future__ import annotations
@@ -25,17 +25,10 @@ _MAX_VALUES, _MAX_ROW = 2**28, 64  # numbers of an array, and of one row: wider 
 def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[str, NDArray]:
     """Return the numeric arrays of an HDF5 file; links to other files are not followed.
 
-    Args:
-        path: the file.
-        transpose: reverse the axes, as for files of MATLAB.
-        group: only arrays in this group, with names relative to it.
-
-    Raises:
-        DrakeTeleopError: if h5py is not installed.
-        OSError: if the file is damaged.
-        ValueError: for an array that is too large or in another file.
+    Names are relative to `group`. `transpose` reverses the axes, as for files of MATLAB. Raise
+    OSError for a damaged file, ValueError for a too large array or one in another file.
     """
-    h5py, found = library("h5py", path), dict[str, NDArray]()
+    h5py, found = import_optional("h5py", path), dict[str, NDArray]()
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:
@@ -50,8 +43,8 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 
 
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
-    """Return some rows of the numeric arrays of a Zarr folder; raises errors as `read_hdf5`."""
-    zarr = library("zarr", path)
+    """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
+    zarr = import_optional("zarr", path)
     group = zarr.open_group(path, mode="r")
     members = group.members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}
@@ -71,8 +64,7 @@ def _is_table(item: Any, transpose: bool) -> bool:
     return True
 
 
-def library(name: str, path: Path) -> Any:
-    """Return an optional package that reads a file; raise DrakeTeleopError if it is missing."""
+def import_optional(name: str, path: Path) -> Any:
     try:
         return import_module(name)
     except ImportError:
@@ -97,8 +89,7 @@ _BROKEN = "it is damaged or incomplete"
 def read_mat(path: Path) -> dict[str, NDArray]:
     """Return the numeric arrays of a MATLAB file by name; fields are named `structure.field`.
 
-    Raises:
-        ValueError: if the file is invalid or has no arrays.
+    Raise ValueError if the file is invalid or has no arrays.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version

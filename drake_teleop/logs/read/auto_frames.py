@@ -186,7 +186,7 @@ def _require_determined(known: Any, where: str, quantity: str) -> None:
         raise DrakeTeleopError(
             f"the data do not determine {quantity} {axes}",
             where=where,
-            remedy="turn the sensor faster, about more axes, touching nothing; or give it",
+            remedy="turn the sensor faster, about more axes, without contact; or give the values",
         )
 
 
@@ -199,7 +199,6 @@ def _result_note(name: str, value: Any, deviation: str) -> str:
 
 
 def log_instants(log: Log) -> Instants:
-    """Return block means of a log's wrench and motion."""
     gravity = None
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:
@@ -213,9 +212,9 @@ def weight_wrench(weight: Array, gravity: Array) -> Array:
 
 
 def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
-    """Return the log with the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] added.
+    """Add the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] to a log.
 
-    `motion_log` is the same log with motion, from which the delay is estimated and removed.
+    The delay is estimated from `motion_log`, the same log with motion, and removed.
     """
     assert motion_log.gravity is not None
     at = np.clip(log.t + free_delay(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1])
@@ -248,7 +247,7 @@ def describe_gravity(
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
             where=f"{source}:gravity",
-            remedy="record the load in more orientations, touching nothing; or give the vector",
+            remedy="record the load in more orientations, without contact; or give the vector",
         )
     gravity = tuple((np.round(estimated, 4) + 0.0).tolist())
     note = (

@@ -1,8 +1,7 @@
 """ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
 Columns are numbers and arrays (up to 64) by path (`wrench.force.x`, `data.0`), unique short names
-(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp`, the latter of these two. Groups
-with covariance -1 are absent, as in ROS.
+(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp`, the latter of these two.
 """
 
 from __future__ import annotations
@@ -69,7 +68,6 @@ def is_bag(path: Path) -> bool:
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """Return the topics of a bag, sorted by name."""
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
@@ -81,7 +79,7 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
-    """Return the messages of a topic as a table, for TF of one child frame."""
+    """Return the messages of a topic as a table; of TF only those of one child frame."""
     with _open_bag(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
         if not connections:
@@ -112,7 +110,6 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """Return the table of a stream of a description: its file, or its topic of a bag."""
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):
@@ -121,7 +118,7 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
 
 
 def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dict[str, Any], list]:
-    """Return a draft log description and its comment lines; paths are relative to `folder`."""
+    """Return a draft log description with paths relative to `folder`, and its comment lines."""
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)
@@ -138,13 +135,12 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dic
     head = [
         "DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
         "above all wrench.sign and the frames.",
-        f"Other topics that would do: {', '.join(others) or 'none'}.",
+        f"Other suitable topics: {', '.join(others) or 'none'}.",
     ]
     return draft, head
 
 
 def topic_missing(path: Path) -> DrakeTeleopError:
-    """Return the error for a bag whose topic is not specified."""
     return DrakeTeleopError(
         "is a bag, and no topic is specified",
         where=str(path),

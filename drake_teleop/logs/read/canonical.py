@@ -138,7 +138,6 @@ class Log:
         return replace(self, t=self.t - start, posed=posed)
 
     def only(self, rows: slice | NDArray[np.bool_]) -> Log:
-        """Return the selected rows of the log."""
         if not isinstance(rows, slice) and rows.all():
             return self
         arrays = {name: getattr(self, name) for name in _ROW_SHAPES}
@@ -147,7 +146,6 @@ class Log:
 
     @property
     def motion(self) -> tuple[Array, Array, Array]:
-        """Specific force, angular velocity and angular acceleration, (N, 3) each [SI]."""
         return self.specific_force, self.angular_velocity, self.angular_acceleration
 
 

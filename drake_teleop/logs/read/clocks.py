@@ -1,17 +1,4 @@
-"""Clock of one stream: checks and corrections of its time stamps.
-
-=========================== ======================================================================
-time stamps                 result
-=========================== ======================================================================
-missing (NaN)               rows are removed, with a note
-repeated, rows identical    repetitions are removed, with a note
-repeated, rows differ       rows are spaced evenly, see `spread`, with a note
-decreasing or too uneven    error that names the row
-implausible rate            error that proposes a unit
-starting again              episodes follow each other after gaps, see `join_episodes`
-gaps                        samples in them are not used, see `gaps`
-=========================== ======================================================================
-"""
+"""Clock of one stream: checks and corrections of its time stamps (docs/log-description.md)."""
 
 from __future__ import annotations
 
@@ -43,7 +30,7 @@ _WINDOW = 50
 
 @dataclass(frozen=True)
 class Clock:
-    """Times t (N,) of the rows of a stream, increasing, on the common clock [s].
+    """Increasing times t (N,) of the rows of a stream on the common clock [s].
 
     Attributes:
         rows: (N,) row of the table for each time.
@@ -59,20 +46,20 @@ class Clock:
     episodes: int = 1
 
     def select(self, x: Array) -> Array:
-        """Return those rows of x (total, ...) that have a time."""
+        """Return the rows of x (total, ...) that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
-    """Return checked and corrected times of a stream's rows (see module `clocks`).
+    """Return checked and corrected times of a stream's rows.
 
-    A row is repeated if it equals the previous row in all `columns`.
+    A row with the same values in all `columns` as the previous row is a repetition.
     """
     if time.column is None:
         assert time.rate is not None
         rows = np.arange(table.rows)
         return Clock(_to_common_clock(rows / time.rate, time), rows, table.rows)
-    t, episodes = seconds(time, table, where)
+    t, episodes = time_stamps_s(time, table, where)
     total, rows = len(t), np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
@@ -89,7 +76,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     t = t[rows]
     shared = int((np.diff(t) == 0).sum())
     if shared:
-        even = spread(t)
+        even = spread_shared_stamps(t)
         _check_increasing(even, rows, table, where)
         notes.append(
             f"{shared} rows share the time stamp of the previous row: all rows are spaced evenly"
@@ -101,7 +88,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     return Clock(_to_common_clock(t, time), rows, total, tuple(notes), episodes)
 
 
-def seconds(time: Time, table: Table, where: str) -> tuple[Array, int]:
+def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
     """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
 
     Episodes are joined in the whole table, so that all its streams keep one clock.
@@ -146,8 +133,7 @@ def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
 def join_episodes(t: Array) -> tuple[Array, int]:
     """Return increasing times (N,) for a clock that starts again, and the number of its starts.
 
-    A new start is a step back to within two median steps of the first stamp, from which the clock
-    runs on. Other steps back are not changed. NaN stays NaN.
+    A step back to near the first stamp is a new start. Other steps back are not changed.
     """
     finite = np.isfinite(t)
     known = t[finite]
@@ -174,8 +160,7 @@ def _to_common_clock(t: Array, time: Time) -> Array:
     return t[0] + time.scale * (t - t[0]) + time.offset
 
 
-def spread(t: Array) -> Array:
-    """Return evenly spaced times for rows that share time stamps `t` (N,) [s]."""
+def spread_shared_stamps(t: Array) -> Array:
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))
     per_stamp = len(t) / len(distinct)
@@ -184,7 +169,7 @@ def spread(t: Array) -> Array:
     return np.concatenate([_smooth_stamps(part, half, step / per_stamp) for part in parts])
 
 
-def gaps(t: Array, bandwidth_hz: float | None) -> Array:
+def find_gaps(t: Array, bandwidth_hz: float | None) -> Array:
     """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s]."""
     steps = np.diff(t)
     at = np.flatnonzero(steps > shortest_gap(float(np.median(steps)), bandwidth_hz))

@@ -28,10 +28,7 @@ _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
-    """Return the table of a CSV file, and the number of its first data line.
-
-    Errors are those of polars.
-    """
+    """Return the table of a CSV file, and the number of its first data line."""
     import polars as pl
 
     with path.open("rb") as file:

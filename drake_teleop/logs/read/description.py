@@ -65,7 +65,7 @@ class Time(Strict):
         default=1.0,
         ge=0.5,
         le=2,
-        description="of the time since the first row, for a clock that drifts",
+        description="factor on the time since the first row, for a clock that drifts",
     )
 
     @model_validator(mode="after")
@@ -129,14 +129,16 @@ class _Stream(Strict):
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Columns of all quantities of the stream, without those of the time."""
+        """Columns of all quantities of the stream, except the time."""
         quantities = (getattr(self, field) for field in type(self).model_fields)
         return tuple(c for quantity in quantities for c in getattr(quantity, "columns", ()))
 
 
 class _Recorded(_Stream):
     topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
-    child_frame: str | None = Field(default=None, description="which transform of the topic")
+    child_frame: str | None = Field(
+        default=None, description="child frame of the transform in the topic"
+    )
     time: Time
 
     _defaults: ClassVar[tuple[str, ...]] = ()
@@ -184,7 +186,9 @@ class Imu(_Recorded):
     specific_force: Acceleration | None = None
     angular_velocity: AngularVelocity | None = None
     angular_acceleration: AngularAcceleration | None = None
-    sign: Literal[1, -1] = Field(default=1, description="of the specific force; -1 for g - a")
+    sign: Literal[1, -1] = Field(
+        default=1, description="sign of the specific force; -1 if the file has g - a"
+    )
     frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
     position: PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: it is found"
@@ -202,7 +206,6 @@ class Imu(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether frame or position is `auto`."""
         return self.frame == "auto" or self.position == "auto"
 
 
@@ -232,13 +235,12 @@ class Pose(_Recorded):
         shifted = self.position_in_sensor == "auto" or any(self.position_in_sensor)
         if self.position is None and (shifted or self.rotation_in_sensor == "auto"):
             raise ValueError(
-                "position_in_sensor and auto need positions: give pose.position, or leave them out"
+                "position_in_sensor and auto need positions: give pose.position, or remove them"
             )
         return self
 
     @property
     def automatic(self) -> bool:
-        """Whether position or rotation is `auto`."""
         return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
 
     @property
@@ -297,13 +299,9 @@ class Description(Strict):
                 raise ValueError("static poses cannot be combined with wrench, imu or pose")
             return self
         if self.wrench is None:
-            raise ValueError(
-                "no wrench: add wrench, from whichever file has it, or give static poses"
-            )
+            raise ValueError("no wrench: add wrench (from any file), or give static poses")
         if self.imu is None and self.pose is None:
-            raise ValueError(
-                "a wrench without kinematics: add imu or pose, from whichever file has it"
-            )
+            raise ValueError("a wrench without kinematics: add imu or pose (from any file)")
         if self.pose is None and (self.imu is None or self.imu.angular_velocity is None):
             raise ValueError("the angular velocity is missing: add imu.angular_velocity or pose")
         if self.pose is None and (self.imu is None or self.imu.specific_force is None):
@@ -331,14 +329,13 @@ class Description(Strict):
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
-        """Return the poses of S together with gravity, described pose frame and IMU data."""
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
         return Posed(poses, self.gravity_W, np.array(origin), rotation, imu)
 
     def scale(self, unit: str) -> float:
-        """Return the SI value of a unit; "g" is the described gravity."""
+        """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else UNITS[unit]
 
 

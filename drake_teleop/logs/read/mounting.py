@@ -16,9 +16,9 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import (
     estimate_delay,
+    far_from_gaps,
     low_pass,
     low_passed,
-    measured,
     resample,
     undelayed,
 )
@@ -41,7 +41,7 @@ def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
 def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
     """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
 
-    Any affine map of the IMU's axes is permitted. Effects linear in `arm` (N, k) are removed.
+    The axes of the IMU may differ by any affine map. Effects linear in `arm` (N, k) are removed.
     """
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
@@ -72,8 +72,7 @@ def clock_drift(
 ) -> tuple[float, float]:
     """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
 
-    `lag` [s] is a constant start, `independent` the number of independent samples. A drift that is
-    insignificant or below 10 ms in total is 0.
+    `lag` [s] is a first estimate. An insignificant drift is set to 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])
@@ -118,15 +117,13 @@ RANK = 1e-5
 _MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
-def solve(
+def solve_least_squares(
     residual: Callable[[Array], Array], x: Array, linear: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the solution x (n,) and its standard deviations (n,); inf if undetermined.
+    """Return the least-squares solution x (n,), and its standard deviations; inf if undetermined.
 
-    Args:
-        residual: function of x that returns residuals (N, 3 k).
-        x: start.
-        linear: (N, 3 k, m) constant derivatives by the last m parameters.
+    `residual` maps x to residuals (N, 3 k). `linear` (N, 3 k, m) are constant derivatives by the
+    last m parameters.
     """
     linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
     rows, channels, _ = linear.shape
@@ -205,7 +202,7 @@ class LeverArm:
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     """Return the position of the accelerometer, fitted with offsets, load and delay, Eq. (T21).
 
-    None for a poor fit (contact), or few samples outside of gaps.
+    Return None for a poor fit (contact), or few samples outside of gaps.
     """
     cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
@@ -227,7 +224,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     centred = ((V - V.mean(axis=0)) / size).reshape(-1, 10)
     phi = np.linalg.lstsq(centred, (wrench - wrench.mean(axis=0)).ravel(), rcond=RANK)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = solve(residual, np.concatenate([np.zeros(4), offsets, phi]))
+    x, deviations = solve_least_squares(residual, np.concatenate([np.zeros(4), offsets, phi]))
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual(x), wrench))
     if (left > MAX_UNEXPLAINED * whole).any():
         return None
@@ -236,17 +233,13 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 
 def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
-    """Return evenly spaced times at which all logs have samples."""
     t = np.linspace(start, stop, COMPARED_SAMPLES)
-    known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
+    known = [np.interp(t, log.t, far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
 
 def lever_matrix(omega: Array, alpha: Array) -> Array:
-    """Return the matrix K (N, 3, 3): K p is the acceleration of a point p relative to the origin.
-
-    Eq. (T20), for omega and alpha (N, 3).
-    """
+    """Return K (N, 3, 3), Eq. (T20): K p is the acceleration of point p relative to the origin."""
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
 
@@ -281,8 +274,8 @@ class Mounting:
         lag_s: constant lag of the IMU's clock behind the pose's clock [s].
         lag_middle_s, middle_s: lag at mid-record, and this time on the pose's clock [s].
         drift: growth of the lag [s/s]; 0 if insignificant.
-        unexplained: unexplained share of the variance of the specific force.
-        unexplained_turning: that of the angular velocity; None without a gyroscope.
+        unexplained, unexplained_turning: unexplained shares of the variance of specific force and
+            angular velocity (None without a gyroscope).
         mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (RMS), or None.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
@@ -312,7 +305,6 @@ class Mounting:
 
     @property
     def oblique_deg(self) -> float:
-        """Angle between R_SI and `right_angled` [deg]."""
         return _angle_deg(self.right_angled.T @ self.R_SI)
 
     @property
@@ -339,15 +331,10 @@ class Mounting:
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
-    """Estimate rotation, position and clock of an IMU relative to the pose.
+    """Estimate rotation, clock and (with `position`) accelerometer position of an IMU.
 
-    By least squares at 8 Hz, starting from the rotation of Kabsch (1976); lags are within +-1 s.
-    None if the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
-
-    Args:
-        imu: the log.
-        pose: the same log, read without the IMU.
-        position: True to estimate the position of the accelerometer.
+    `pose` is the same log as `imu`, read without the IMU. Lags are within +-1 s. Return None if
+    the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_MAX_LAG_S, 0.2 * float(stop - start))
@@ -427,7 +414,7 @@ def _refine(
     linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
     linear[:, :3, :3] = -K
     linear[:, :, 3:] = np.eye(3 * len(pairs))
-    x, deviations = solve(residual, first, linear)
+    x, deviations = solve_least_squares(residual, first, linear)
     return x, deviations, residual(x)
 
 

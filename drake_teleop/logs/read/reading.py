@@ -32,7 +32,7 @@ from drake_teleop.logs.read.auto_frames import (
 )
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.clocks import Clock, episodes_note, gaps, read_clock
+from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps, read_clock
 from drake_teleop.logs.read.description import (
     NO_YAML,
     Description,
@@ -377,7 +377,7 @@ class _Reader:
             self._notes.append(
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
-        found_gaps = gaps(t, self._bandwidth_hz)
+        found_gaps = find_gaps(t, self._bandwidth_hz)
         if clock.episodes > 1:
             described = (self._description.wrench, self._description.imu, self._description.pose)
             files = len({stream.source for stream in described if stream is not None})

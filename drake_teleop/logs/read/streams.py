@@ -54,7 +54,6 @@ class Stream:
 
     @property
     def dt(self) -> float:
-        """Mean sample spacing [s]."""
         return spacing(self.t)
 
 
@@ -83,10 +82,7 @@ def move_to_So(
     alpha: Array | None,
     pose: Stream | None,
 ) -> Array:
-    """Return the specific force (N, 3) of So from that of Io, a point of the same rigid body.
-
-    omega and alpha are those of the pose if None.
-    """
+    """Return the specific force (N, 3) of So from that of Io, a point of the same rigid body."""
     if omega is None or alpha is None:
         assert pose is not None and pose.angular_velocity is not None
         assert pose.angular_acceleration is not None
@@ -113,10 +109,7 @@ class Orientations:
             self._columns *= description.scale(orientation.unit)
 
     def output(self, count: int) -> Array:
-        """Return memory (count, 4) for the quaternions of increasing rows, written in their order.
-
-        It is that of the columns, if these are quaternions: each row is read before.
-        """
+        """Return memory (count, 4) for quaternions of increasing rows; it may be the columns'."""
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:

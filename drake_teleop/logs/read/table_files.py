@@ -38,7 +38,7 @@ _MAX_CELLS_IN_MEMORY = 2**24
 def read_table(path: Path, *, header: bool = True) -> Table:
     """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
 
-    Without a header the columns of a text file are named from "0" on.
+    The columns of a text file without header are named from "0" on.
     """
     kind = FORMATS.check(path.suffix.lower(), str(path))
     if not (os.path.isdir if kind == ".zarr" else os.path.isfile)(path):
@@ -95,9 +95,9 @@ def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
 
 
 def expanded_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
-    """Return the columns of a frame by name, also the elements of lists and structures.
+    """Return the columns of a frame by name, and elements of lists and structures as columns.
 
-    Columns of text and binary data, such as images, are left out.
+    Columns of text and binary data, such as images, are omitted.
     """
     import polars as pl
 
@@ -126,7 +126,6 @@ def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[s
 
 
 def _expand(label: str, column: pl.Expr, dtype: Any, frame: pl.LazyFrame) -> dict[str, pl.Expr]:
-    """Return the numeric parts of a column by name."""
     import polars as pl
 
     if isinstance(dtype, pl.Struct):
@@ -181,7 +180,7 @@ def _to_numpy(series: pl.Series) -> NDArray:
 
 
 def array_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Return arrays (N, ...) by name as columns, also their elements as `name[k]`."""
+    """Return arrays (N, ...) by name as columns, and their elements as `name[k]`."""
     arrays = {name: array for name, array in arrays.items() if len(array)}
     parts = {
         f"{name}[{k}]": array.reshape(len(array), -1)[:, k]

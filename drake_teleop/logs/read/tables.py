@@ -32,7 +32,7 @@ class Table:
         first_row: number of the first data row in the file.
         absent: names of column groups that the file marks as not provided.
         whole: table of all rows, if these are a part of them.
-        kept: numbers of these rows in `whole`, counted from 0; None: all rows.
+        kept: row numbers in `whole`, counted from 0; None: all rows.
     """
 
     path: Path
@@ -47,10 +47,7 @@ class Table:
         return self.first_row + int(row if self.kept is None else self.kept[row])
 
     def filled(self, names: Sequence[str | int]) -> Table:
-        """Return the rows in which at least one of the named columns has a number.
-
-        Recorders of several topics write one table, and leave the cells of other topics empty.
-        """
+        """Return the rows in which at least one of the named columns has a number."""
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.raw(names[0], "")).all():
             return self
@@ -64,7 +61,6 @@ class Table:
 
     @property
     def rows(self) -> int:
-        """Number of rows of the longest column."""
         if self.kept is not None:
             return len(self.kept)
         return max(len(column) for column in self.columns.values())
@@ -103,7 +99,6 @@ class Table:
                 )
 
     def all_raw(self, names: Sequence[str | int], where: str) -> Array:
-        """Return `raw` of several columns, which must have equal rows, side by side."""
         columns = [self.raw(name, where) for name in names]
         self._check_rows(names, columns, where, None)
         return np.hstack(columns)
@@ -156,9 +151,9 @@ class Table:
         if name not in self.columns:
             if name.rpartition(".")[0] in self.absent:
                 raise DrakeTeleopError(
-                    f"{self.path.name} says that it does not provide {name!r} (covariance -1)",
+                    f"{self.path.name} marks {name!r} as not provided (covariance -1)",
                     where=where,
-                    remedy="name another column, or leave this out",
+                    remedy="name another column, or remove this field",
                 )
             similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
             hint = "did you mean" if similar else "its columns are"
@@ -183,7 +178,11 @@ class Table:
             f"{cell!r} in row {self.line(row)} is not a number",
             where=f"{self.path}:{name}",
             remedy="correct the cell or delete the row"
-            + (", if it holds units: the log description has them" if row == 0 else ""),
+            + (
+                ", for example a row of units, which belong into the log description"
+                if row == 0
+                else ""
+            ),
         )
 
 

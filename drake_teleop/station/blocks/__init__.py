@@ -1,8 +1,4 @@
-"""Blocks of Fig. 4 with a named port for each signal, for a Diagram of a Drake user.
-
-They call the functions of the station's blocks, which join signals in one vector for speed
-(docs/blocks.md).
-"""
+"""Blocks of Fig. 4 with a named port for each signal, for a Diagram of a Drake user."""
 
 from drake_teleop.station.blocks.ends import PassivityAtMaster, PassivityAtSlave
 from drake_teleop.station.blocks.force_display import ForceDisplay

@@ -30,11 +30,11 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 
-class _End(DoubleOnly, LeafSystem):
-    """Base class: one step of one channel end in a cache entry, read by the outputs.
+class _PassivityEnd(DoubleOnly, LeafSystem):
+    """Base class of both ends of a passivity method.
 
     Args:
-        passivity: the method and its parameters, equal at both ends.
+        passivity: method and parameters, equal at both ends.
         period: time between packets [s].
         start: (7,) pose X_WS of the slave at the start.
         R_WB: (3, 3) alignment of the master's base with the world.
@@ -106,7 +106,7 @@ class _End(DoubleOnly, LeafSystem):
             discrete_state.set_value(group, part)
 
 
-class PassivityAtMaster(_End):
+class PassivityAtMaster(_PassivityEnd):
     """Master's end of a passivity method: renders a wrench, sends pose and energy.
 
     .. pydrake_system::
@@ -142,7 +142,7 @@ class PassivityAtMaster(_End):
         output.SetFromVector(self._results(context)[3][:6])
 
 
-class PassivityAtSlave(_End):
+class PassivityAtSlave(_PassivityEnd):
     """Slave's end of a passivity method: commands a pose, sends wrench and energy.
 
     .. pydrake_system::

@@ -1,4 +1,4 @@
-"""One direction of a network as a block: delay, jitter, loss and order of packets."""
+"""One direction of a network: delay, jitter, loss and order of packets."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
         - arriving: (N + 1,) the same at the next period; depends on the input
 
-    The packet of step k is in `received` at step k + 1 at the earliest. Connect `arriving` to a
-    block that updates at the same instants and whose output is a state.
+    Connect `arriving` to a block that updates at the same instants and whose output is a state.
 
     Args:
         size: N.

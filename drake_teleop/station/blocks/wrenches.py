@@ -1,8 +1,4 @@
-"""Wrench of a load and scaling of a measured wrench, for double, AutoDiffXd and Expression.
-
-Frames as in `drake_teleop.load.compensation`. The mathematics is compiled for double and is the
-same Python source for the other scalar types.
-"""
+"""Wrench of a load and scaling of a measured wrench, for double, AutoDiffXd and Expression."""
 
 from __future__ import annotations
 
@@ -40,8 +36,6 @@ def _vector(T: Any, size: int) -> Any:
 
 @TemplateSystem.define("NonContactWrench_")
 def NonContactWrench_(T: Any) -> Any:
-    """Return the class of the block for the scalar type T."""
-
     class Impl(LeafSystem_[T]):
         """Wrench V phi of a load's weight and inertia, Eq. (12).
 
@@ -93,8 +87,6 @@ NonContactWrench = NonContactWrench_[float]
 
 @TemplateSystem.define("WrenchScaling_")
 def WrenchScaling_(T: Any) -> Any:
-    """Return the class of the block for the scalar type T."""
-
     class Impl(LeafSystem_[T]):
         """Contact wrench and scaled wrench of a measured wrench, Eqs. (13) and (T7).
 

@@ -83,9 +83,9 @@ from drake_teleop.station.slave.plant_dynamics import (
     WATCHED,
     assemble_state,
     environment_wrench,
-    nearness,
     plant_rates,
     rates_under,
+    tool_proximity,
 )
 
 Array = NDArray[np.float64]
@@ -446,7 +446,7 @@ class WristSensor(LeafSystem):
             return TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q = state[: self._n]
-        return nearness(arm, pairs, self._watched, joints, q, around[:2], around[2:])
+        return tool_proximity(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
     def _plant_contact_W(self, context: Context) -> Array:
         assert self._contacts is not None

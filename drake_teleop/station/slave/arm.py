@@ -1,11 +1,8 @@
 """Compiled kinematics and dynamics of a serial arm with revolute and prismatic joints.
 
-`ArmModel.table` contains the arm. The kernels replace the plant's output ports, which are too slow
-at 8 kHz. For prismatic joints, read m for rad, N for N m, kg for kg m^2.
-
-The state ``x`` of a frame L has 21 numbers in world coordinates: ``[s(3), omega(3), alpha(3),
-p_WL(3), R_WL(9, by rows)]`` with the specific force ``s = a - g`` of its origin [m/s^2].
-"""
+For prismatic joints, read m for rad, N for N m, kg for kg m^2. The state ``x`` of a frame L has 21
+numbers in W: ``[s(3), omega(3), alpha(3), p_WL(3), R_WL(9, by rows)]`` with the specific force
+``s = a - g`` of its origin [m/s^2]."""
 
 from __future__ import annotations
 
@@ -57,17 +54,13 @@ class ArmModel:
         joint_names: names from the base outwards.
         table: (n+1, 26), a row for each joint and a last row for S, fixed to L_n. Columns: 0-8
             rotation from the joint's frame to the previous link's, by rows; 9-11 origin of the
-            joint's frame in the previous link's [m]; 12-21 phi [m, m c (3), Ixx, Ixy, Ixz, Iyy,
-            Iyz, Izz] of the link about the origin of L_j, in L_j (last row: of the load, in S);
-            22 rotor inertia [kg m^2]; 23 damping [N m s/rad]; 24 dry friction [N m], for
-            `forward_dynamics` only; 25 is 1 for a prismatic joint. Last row, 22-24: gravity
-            [m/s^2].
+            joint's frame in the previous link's [m]; 12-21 phi of the link about the origin of L_j,
+            in L_j (last row: of the load, in S); 22 rotor inertia [kg m^2]; 23 damping
+            [N m s/rad]; 24 dry friction [N m]; 25 is 1 for a prismatic joint. Last row, 22-24:
+            gravity [m/s^2].
         lower, upper: (n,) joint limits [rad], -inf and inf for joints that turn without end.
-        velocity_limit: (n,) speed limits [rad/s], inf if unknown.
-        acceleration_limit: (n,) acceleration limits [rad/s^2], inf if unknown.
-        effort_limit: (n,) torque limits [N m], inf if unknown.
-        position_index: (n,) indices in the plant's positions.
-        velocity_index: (n,) indices in the plant's velocities.
+        velocity_limit, acceleration_limit, effort_limit: (n,) [rad/s, rad/s^2, N m] or inf.
+        position_index, velocity_index: (n,) indices in the plant's positions and velocities.
     """
 
     joint_names: tuple[str, ...]
@@ -82,7 +75,6 @@ class ArmModel:
 
     @property
     def num_joints(self) -> int:
-        """Number of joints."""
         return len(self.joint_names)
 
     @property
@@ -96,7 +88,6 @@ class ArmModel:
 
     @property
     def phi_load(self) -> Array:
-        """Copy (10,) of the load's inertial parameters `load`."""
         return self.load.copy()
 
     @property
@@ -105,7 +96,6 @@ class ArmModel:
         return self.table[-1, PHI:ROTOR]
 
     def with_load(self, phi: Array) -> ArmModel:
-        """Return a copy of the arm with the load's inertial parameters `phi` (10,)."""
         table = self.table.copy()
         table[-1, PHI:ROTOR] = phi
         return replace(self, table=table)
@@ -113,7 +103,7 @@ class ArmModel:
 
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
-    """Replace the pose of the previous link in x by that of link `row`; return p_PL_W."""
+    """Replace the previous link's pose in the state x by that of link `row`; return p_PL_W [m]."""
     joint = table[row]
     p_PL_P = vector_at(joint, TRANSLATION)
     if joint[SLIDES] != 0.0:
@@ -144,7 +134,7 @@ def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: A
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
-    """Return accelerations s + g (N, 3) of So, in S, for specific forces s (N, 3) at q (N, n)."""
+    """Return accelerations s + g (N, 3) of So for specific forces s (N, 3), in S, at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
         acceleration_into(arm.table, q[k], s[k], out[k])
@@ -153,7 +143,6 @@ def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
 
 @njit(cache=True)
 def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
-    """Write the acceleration s + g (3,) of So, in S, to `out`; s (3,): specific force in S."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
     g = table[table.shape[0] - 1, GRAVITY : GRAVITY + 3]
@@ -163,7 +152,6 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
 
 @njit(cache=True, inline="always")
 def _set_world_at_rest(table: Array, x: Array) -> None:
-    """Set x to the state of the world frame at rest: s = -g, identity pose."""
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, GRAVITY + k]
@@ -193,7 +181,7 @@ def jacobian(table: Array, q: Array, J_out: Array) -> None:
 
 @njit(cache=True)
 def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
-    """Write `jacobian` to J_out, and the pose of S to x (21,): p_WS [m] in 9-11, R_WS in 12-20."""
+    """Write the Jacobian to J_out, p_WS [m] to x[9:12] and R_WS, by rows, to x[12:21]."""
     n = table.shape[0] - 1
     x[:] = 0.0
     x[12] = x[16] = x[20] = 1.0
@@ -216,10 +204,7 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 
 @njit(cache=True)
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write the motion that an ideal sensor at S measures to out (21,).
-
-    The output is s [m/s^2], omega_WS and alpha_WS in S, then p_WS [m] and R_WS by rows.
-    """
+    """Write s [m/s^2], omega_WS, alpha_WS in S, then p_WS [m], R_WS by rows, to out (21,)."""
     n = table.shape[0] - 1
     _set_world_at_rest(table, out)
     for row in range(n):
@@ -232,7 +217,7 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 @njit(cache=True)
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write the state x (module docstring) of each link, and of S, to the rows of out (n+1, 21)."""
+    """Write [s, omega, alpha, p_WL, R_WL] in W of each link, and of S, to out (n+1, 21)."""
     n = table.shape[0] - 1
     _set_world_at_rest(table, out[0])
     for row in range(n):
@@ -245,7 +230,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 
 @njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Write a link's z axis, origin, inertial force and moment about Wo, Eqs. (1)-(2)."""
+    """Write a link's z axis, origin, inertial force and moment about Wo, in W, to `link[row]`."""
     phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_at(phi, 4)
     s, omega, alpha = (
@@ -267,7 +252,7 @@ def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
 
 @njit(cache=True)
 def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
-    """Sum the wrenches of `_link_wrench` inboard and project them to torques tau (n,)."""
+    """Sum the link wrenches from tip to base and project them to joint torques tau (n,) [N m]."""
     n = tau.shape[0]
     for row in range(n, 0, -1):
         for k in range(6, 12):
@@ -288,8 +273,7 @@ def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
 def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Array) -> None:
     """Write joint torques (n,) [N m] by recursive Newton-Euler (Luh, Walker, Paul 1980).
 
-    Includes rotors, joint damping, gravity and the load; excludes contact and dry friction. The
-    plant's ``CalcInverseDynamics`` excludes damping.
+    They include rotors, joint damping, gravity and load, not contact and dry friction.
     """
     n = table.shape[0] - 1
     x = np.empty(21)
@@ -307,7 +291,6 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
 
 
 def holding_torque(arm: ArmModel, q: Array) -> Array:
-    """Return the joint torques (n,) [N m] that hold the arm at rest at q (n,)."""
     zeros, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
     inverse_dynamics(arm.table, q, zeros, zeros, torque)
     return torque
@@ -315,7 +298,7 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
-    """Add a link's inertial parameters about Wo, in W, to `inertia`, in the order of phi."""
+    """Add a link's inertial parameters phi (10,) about Wo, in W, to `inertia`."""
     phi, p = table[row, PHI:], vector_at(x, 9)
     m, h, about_Lo = phi[0], apply_matrix(matrix_at(x, 12), vector_at(phi, 1)), symmetric_at(phi, 4)
     inertia[0] += m
@@ -367,7 +350,7 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
 
 @njit(cache=True)
 def solve_spd(M: Array, x: Array) -> None:
-    """Replace x by M^-1 x (Cholesky method); the rounding differs from that of `vectors.solve`."""
+    """Replace x by M^-1 x (Cholesky); overwrite the lower half of M."""
     n = x.shape[0]
     for j in range(n):
         for k in range(j):
@@ -391,7 +374,7 @@ def forward_dynamics(
 ) -> None:
     """Write joint accelerations vdot: M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
-    F (6,) is the wrench on the load, about the world's origin, in W [N, N m].
+    F is the wrench `wrench_W` on the load, about the world's origin [N, N m].
     """
     n = table.shape[0] - 1
     x = np.empty(21)
@@ -430,16 +413,7 @@ def pose_into(arm, q, pose):
 
 
 class ForwardKinematics(LeafSystem):
-    """Block that converts joint positions to the pose of the slave's sensor frame.
-
-    .. pydrake_system::
-
-        name: ForwardKinematics
-        input_ports:
-        - slave_state: [q; v] of the arm [rad, rad/s]
-        output_ports:
-        - pose_slave: (7,) X_WS
-    """
+    """Block that outputs the pose X_WS (7,) of the sensor frame from the arm's state [q; v]."""
 
     __slots__ = ONE_DICT
 

@@ -52,11 +52,8 @@ def ArmModelFromPlant(
 ) -> ArmModel:
     """Return the chain from the world to the sensor frame of a finalized plant.
 
-    Joints beyond the sensor frame are held at their default positions.
-
-    Raises:
-        DrakeTeleopError: if the frame is missing, or the path to it is not a chain of welds,
-            revolute and prismatic joints without branches that move.
+    A DrakeTeleopError is raised unless it consists of welds, revolute and prismatic joints without
+    branches that move.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -100,7 +97,7 @@ def ArmModelFromPlant(
             X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
             table[body_row, PHI:ROTOR] += _phi_of_body(M_B, X_LB)
-    lower, upper = np.array([_range(j) for j in joints]).T.copy()
+    lower, upper = np.array([_joint_limits(j) for j in joints]).T.copy()
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
@@ -118,8 +115,7 @@ def _per_joint(values: list[float]) -> Array:
     return np.array(values, dtype=np.float64)
 
 
-def _range(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
-    """Return the joint limits, -inf or inf for none; a revolute joint then turns without end."""
+def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
@@ -143,7 +139,7 @@ def _joint_chain(
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
             raise DrakeTeleopError(
-                f"the arm hangs on a {joint.type_name()} joint",
+                f"the chain to the sensor contains a {joint.type_name()} joint",
                 where=joint.name(),
                 remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
             )
@@ -186,7 +182,7 @@ def _table_row(
 
 
 def _phi_of_body(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
-    """Return the inertial parameters phi (10,) of a body about the origin of L, in L."""
+    """Return the inertial parameters phi (10,) of a body B about the origin of L, in L."""
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
@@ -211,11 +207,8 @@ def with_all_limits(
 ) -> tuple[ArmModel, list[str]]:
     """Return the arm with defaults for missing limits, and one text per assumption.
 
-    `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is appended to the
-    assumption about accelerations.
-
-    Raises:
-        DrakeTeleopError: for a fixed joint or a wrong number of accelerations.
+    `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is added to the text
+    about accelerations.
     """
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, SLIDES] != 0.0
@@ -286,7 +279,7 @@ def with_all_limits(
 
 
 def _is_specified(limits: Array) -> NDArray[np.bool_]:
-    """Return (n,) booleans: True for specified limits; exporters write 0 for unknown ones."""
+    """Return (n,) booleans: True for finite limits above 0; exporters write 0 for unknown ones."""
     return np.isfinite(limits) & (limits > 0)
 
 
@@ -298,7 +291,7 @@ def check_size(arm: ArmModel, where: str) -> None:
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
     if 0.0 < length < _MIN_LENGTH_M or length > _MAX_LENGTH_M:
-        what = f"from its first joint to the sensor it is {length:.3g} m long"
+        what = f"from its first joint to the sensor the arm is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI:], strict=True):
         # Root mean square distance of the mass from the joint's origin.

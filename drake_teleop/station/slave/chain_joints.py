@@ -1,4 +1,4 @@
-"""Joints of a parsed plant: base and other joints welded, motors of the chain to the sensor."""
+"""Joints of a parsed plant: welds of base and other joints, motors of the chain to the sensor."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ _SLIDING_MOTOR_KG = 5.0  # mass that moves with a prismatic joint instead
 
 
 def moves(plant: MultibodyPlant, index: JointIndex) -> bool:
-    """Return whether a joint has a velocity."""
     return plant.get_joint(index).num_velocities() > 0
 
 
 def check_tree(plant: MultibodyPlant, where: str) -> None:
-    """Check that the joints form a tree; Drake aborts on loops, or never finishes."""
+    """Raise DrakeTeleopError unless the joints form a tree; Drake aborts on loops."""
     parents: dict[BodyIndex, Joint] = {}
     world = plant.world_body().index()
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -68,8 +67,7 @@ def weld_base(
 ) -> list[JointIndex]:
     """Weld a free base to the world; return the joints up to S, from the base outwards.
 
-    Raises:
-        DrakeTeleopError: if the model fixes its base although `X_WBase` is not the identity.
+    A DrakeTeleopError is raised if the model fixes its base and `X_WBase` is not the identity.
     """
     inboard = {j.child_body().index(): j for j in map(plant.get_joint, plant.GetJointIndices())}
     body, chain = frame.body(), list[Joint]()
@@ -89,7 +87,6 @@ def weld_base(
 
 
 def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:
-    """Weld bodies that are not connected to the arm to the world; return a note."""
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
     free = [body for body in bodies if body.index() not in held]
@@ -102,7 +99,7 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
 def check_chain(
     plant: MultibodyPlant, chain: list[JointIndex], dependent: dict[str, str], where: str
 ) -> None:
-    """Raise an error for joints of the chain that do not move alone, about or along one axis."""
+    """Raise DrakeTeleopError for joints of the chain that are coupled or have several axes."""
     for joint in (plant.get_joint(index) for index in chain):
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
             if name in dependent:
@@ -123,7 +120,7 @@ def check_chain(
 def weld_at(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld the named joints at angles or positions [rad, m]; return a note."""
+    """Weld joints, by name, at the positions `hold` [rad, m]; return notes for the user."""
     known = {plant.get_joint(k).name(): plant.get_joint(k) for k in joints if moves(plant, k)}
     for name, position in hold.items():
         joint = known.get(name)
@@ -148,7 +145,7 @@ def weld_at(
 def weld_other_joints(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
-    """Weld moving joints outside the chain at their default positions; return a note."""
+    """Weld moving joints outside the chain at their defaults; return notes for the user."""
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     added = set(plant.GetJointIndices()) - before - set(chain)
@@ -184,7 +181,7 @@ def actuate(
 ) -> None:
     """Give each moving joint of the chain one actuator, in the order of the chain.
 
-    `limits` are effort limits by joint, without an entry unlimited; None keeps Drake's.
+    `limits`: effort limits by joint, without an entry unlimited; None keeps Drake's.
     """
     moving = [index for index in chain if moves(plant, index)]
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
@@ -224,11 +221,9 @@ def set_torque_limits(
 def assume_rotor_inertias(
     plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
 ) -> list[str]:
-    """Give joints a rotor inertia if the links that they move have none; return a note.
+    """Give joints a rotor inertia if the links that they move have none; return notes for the user.
 
-    Without it the joint's acceleration is undefined, or so large that a run takes hours. Gravity
-    and the wrench at the sensor stay those of the model. The links of a joint at an `auxiliary`
-    body include those of the next joint.
+    The links of a joint at an `auxiliary` body include those of the next joint.
     """
     joints = [plant.get_joint(index) for index in chain]
     inertia = _ROTOR_MASS_KG * _length(joints, frame) ** 2
@@ -268,6 +263,7 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str])
 
 
 def _length(chain: list[Joint], frame: Frame) -> float:
+    """Return the length [m] of the chain from its first moving joint to `frame`."""
     while chain and chain[0].num_velocities() == 0:
         chain = chain[1:]
     ends = [*(joint.frame_on_parent() for joint in chain[1:]), frame][: len(chain)]

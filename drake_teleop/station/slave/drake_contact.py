@@ -1,8 +1,4 @@
-"""Contact wrench from Drake's contact results, for contacts outside the compiled law.
-
-Examples are meshes, cylinders and hydroelastic contact. The plant stops at each sample of the
-sensor, which slows the simulation.
-"""
+"""Contact wrench from Drake's contact results, for meshes, cylinders and hydroelastic contact."""
 
 from __future__ import annotations
 
@@ -26,7 +22,7 @@ def contact_wrench_W(
 ) -> NDArray[np.float64]:
     """Return the wrench (6,) of all contacts on the tool, about the world's origin, in W [N, N m].
 
-    `bodies` contains indices of the tool's bodies, `shapes` identifiers of its collision shapes.
+    `bodies`: indices of the tool's bodies; `shapes`: identifiers of its collision shapes.
     """
     wrench_W = np.zeros(6)
     for k in range(results.num_point_pair_contacts()):
@@ -47,16 +43,7 @@ def contact_wrench_W(
 
 
 class DrakeContact(LeafSystem):
-    """Block that outputs the true contact wrench for the log, see `contact_wrench_W`.
-
-    .. pydrake_system::
-
-        name: DrakeContact
-        input_ports:
-        - contact_results: contact results of the plant
-        output_ports:
-        - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
-    """
+    """Block with the contact wrench on the tool, for the log, from the plant's contact results."""
 
     __slots__ = ONE_DICT
 

@@ -1,4 +1,4 @@
-"""Drake's errors about models in the user's terms."""
+"""Translation of Drake's errors about model files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def translate_drake_errors(
 ) -> Iterator[None]:
     """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
 
-    `folder` contains repaired copies of files; messages name the files without it.
+    `folder` contains repaired copies of files; messages omit it.
     """
     try:
         yield

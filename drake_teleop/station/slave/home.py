@@ -28,10 +28,7 @@ _Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 def tool_down(
     arm: ArmModel, position: NDArray[np.float64], R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[NDArray[np.float64], IkStatus]:
-    """Return joint positions (n,) [rad] for S at `position` [m, in W] and `R_WS`, with `IkStatus`.
-
-    Without a closed form, the search avoids joint limits where possible.
-    """
+    """Return joint positions (n,) [rad] for S at `position` [m, in W] and `R_WS`, and status."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
@@ -46,7 +43,6 @@ def tool_down(
 
 
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    """Return joint positions (n,) [rad] with S at `position` [m, in W], z_S down, or raise."""
     q, status = tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
@@ -62,7 +58,6 @@ def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
 
 
 def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
-    """Return the configured start posture (n,) [rad], or raise DrakeTeleopError."""
     if not slave.home:
         return home_position(arm, slave.position)
     if len(slave.home) != arm.num_joints:

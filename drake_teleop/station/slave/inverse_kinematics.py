@@ -1,12 +1,10 @@
-"""Closed-form inverse kinematics of the Staubli RX90: eight branches, and the nearest one.
+"""Closed-form inverse kinematics of the Staubli RX90 (Pieper 1968).
 
-Joints 1-3 place the wrist centre, joints 4-6 orient the sensor frame (Pieper 1968). At q = 0 the
-arm points up and S is parallel to W. With the wrist centre at (x, y, z) above the shoulder and rho
-its signed distance from the first axis:
+At q = 0 the arm points up and S is parallel to W. With the wrist centre at (x, y, z) above the
+shoulder and rho its signed distance from the first axis:
 
     rho = -(l2 sin q2 + l3 sin(q2 + q3)),   z = l2 cos q2 + l3 cos(q2 + q3),
-    R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6).
-"""
+    R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6)."""
 
 from __future__ import annotations
 
@@ -41,8 +39,8 @@ _LIMIT_TOLERANCE_RAD = 1e-9
 class IkStatus(IntEnum):
     """Status of an inverse kinematics; the reference is the posture where the search starts.
 
-    The numeric method returns the nearest pose found. It reports WRIST_SINGULAR for nearly coplanar
-    last three axes and SHOULDER_SINGULAR at other singularities.
+    The numeric method reports WRIST_SINGULAR if the last three axes are nearly coplanar, and
+    SHOULDER_SINGULAR at other singularities.
     """
 
     OK = 0
@@ -70,7 +68,7 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 @njit(cache=True)
 def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array) -> int:
-    """Write all solutions to q (8, 6), see `inverse_kinematics`; `clamp` enforces the reach."""
+    """Write all eight solutions to q (8, 6), nan if out of reach; `clamp` moves p into reach."""
     status = _OK
     x = p[0] - FLANGE * R[0, 2]
     y = p[1] - FLANGE * R[1, 2]
@@ -130,7 +128,7 @@ def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q
 
 @njit(cache=True)
 def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> float:
-    """Return angle + 2 pi k within the limits, nearest to ``near``; nan if none exists."""
+    """Return angle + 2 pi k within the limits, nearest to `near`; nan if none exists."""
     full_turn = 2.0 * np.pi
     angle += full_turn * np.round((near - angle) / full_turn)
     if angle > upper + _LIMIT_TOLERANCE_RAD:
@@ -179,10 +177,7 @@ def _nearest_branch(
 def solve_pose_command(
     pose: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """Solve `nearest_branch` for a pose (7,) [qw, qx, qy, qz, px, py, pz]; write q (6,).
-
-    The quaternion has any nonzero length. Returns the `IkStatus` as a plain integer.
-    """
+    """Write the solution q (6,) for a pose X_WS (7,) nearest to `reference`; return `IkStatus`."""
     w, x, y, z = pose[0], pose[1], pose[2], pose[3]
     norm = w * w + x * x + y * y + z * z
     k = 2.0 / norm if norm > 0.0 else np.nan
@@ -194,14 +189,10 @@ def solve_pose_command(
 
 
 def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
-    """Return all joint positions for a pose, ignoring joint limits.
+    """Return all joint positions (8, 6) for a pose, in (-pi, pi] [rad], nan if out of reach.
 
-    An undetermined joint is 0: q1 with the wrist centre on the first axis, q4 with axes 4 and 6
-    aligned.
-
-    Returns:
-        (8, 6) joint positions in (-pi, pi] [rad], nan if out of reach. Row ``4 a + 2 b + c``: a = 1
-        reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has q5 <= 0.
+    Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
+    q5 <= 0. Joint limits are ignored; an undetermined joint is 0.
     """
     q = np.empty((8, 6))
     _branches(np.ascontiguousarray(R_WS), p_WS, 0.0, 0.0, False, q)
@@ -216,18 +207,10 @@ def nearest_branch(
     upper: Array,
     max_step: float = np.inf,
 ) -> tuple[Array, IkStatus]:
-    """Return the solution within the limits nearest to a reference [rad], and the `IkStatus`.
+    """Return the solution within the limits nearest to a reference (6,) [rad], and the `IkStatus`.
 
-    For a finite reference the result is finite and within the limits. Out of reach, the wrist
-    centre moves towards the shoulder onto the boundary. A singular joint keeps its reference.
-    Without an admissible branch the reference, clipped to the limits, is returned.
-
-    Args:
-        R_WS: (3, 3) orientation of S.
-        p_WS: (3,) position of S [m].
-        q_reference: (6,) joint positions [rad], normally the current ones.
-        lower, upper: (6,) joint limits [rad].
-        max_step: largest distance of a joint from the reference [rad].
+    Each joint moves by `max_step` [rad] at most. Out of reach, the wrist centre moves towards the
+    shoulder onto the boundary. Without a solution the reference is returned, within the limits.
     """
     q = np.empty(6)
     # Drake's matrices are stored by columns; one layout avoids a second compilation.
@@ -237,7 +220,6 @@ def nearest_branch(
 
 
 def has_closed_form(arm: ArmModel) -> bool:
-    """Return whether the closed form reproduces two test postures of the arm."""
     if arm.num_joints != 6 or arm.table[:, SLIDES].any():
         return False
     R_WS, p_WS, endless = np.empty((3, 3)), np.empty(3), np.full(6, np.inf)
@@ -258,10 +240,10 @@ class InverseKinematics(LeafSystem):
 
         name: InverseKinematics
         input_ports:
-        - pose_command: X_WS as [qw, qx, qy, qz, px, py, pz] [-, m]
-        - joint_position: (6,) measured positions [rad]
+        - pose_command: (7,) X_WS
+        - joint_position: (n,) measured positions [rad]
         output_ports:
-        - joint_command: (6,) the nearest branch [rad]
+        - joint_command: (n,) nearest solution [rad]
         - ik_status: an `IkStatus`
     """
 

@@ -1,4 +1,4 @@
-"""Sources of joint commands, by name, and the monitor of joint limits and inverse kinematics."""
+"""Sources of joint commands, and the monitor of joint limits and inverse kinematics."""
 
 from __future__ import annotations
 
@@ -41,11 +41,7 @@ _RANGE_TOLERANCE = 0.01
 
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
-    """Return the key in `IK_METHODS` for the setting `name`, for this arm.
-
-    Raises:
-        DrakeTeleopError: if `name` is "closed_form" and the arm has no closed form.
-    """
+    """Return the key in `IK_METHODS` for the scenario's setting, or raise DrakeTeleopError."""
     if name == AUTOMATIC:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
@@ -58,16 +54,9 @@ def ik_method_name(name: str, arm: ArmModel) -> str:
 
 
 class JointFollower(LeafSystem):
-    """Block that limits position and speed of the leader's joints; invalid input keeps the command.
+    """Block that follows the leader's joints (n,) [rad] within limits of position and speed.
 
-    .. pydrake_system::
-
-        name: JointFollower
-        input_ports:
-        - leader_joints: (n,) requested positions [rad]
-        output_ports:
-        - joint_command: (n,) [rad]
-        - ik_status: an `IkStatus`: OK, JOINT_LIMIT or BAD_POSE
+    Invalid input keeps the last command.
     """
 
     __slots__ = ONE_DICT
@@ -102,14 +91,7 @@ class JointFollower(LeafSystem):
 
 
 class JointTrajectory(LeafSystem):
-    """Block that plays one period of an excitation trajectory from `start` [s], else rests.
-
-    .. pydrake_system::
-
-        name: JointTrajectory
-        output_ports:
-        - joint_command: (n,) [rad]
-    """
+    """Block that plays one period of an excitation trajectory from `start` [s], else rests."""
 
     __slots__ = ONE_DICT
 
@@ -124,20 +106,7 @@ class JointTrajectory(LeafSystem):
 
 
 class SlaveMonitor(LeafSystem):
-    """Block that checks periodically that joints stay within their range plus 1 % of it.
-
-    .. pydrake_system::
-
-        name: SlaveMonitor
-        input_ports:
-        - slave_state: [q; v] of the arm [rad, rad/s]
-        - ik_status: status of the inverse kinematics (optional)
-        output_ports:
-        - ik_status: last value, for the log
-
-    Raises:
-        DrakeTeleopError: during simulation, if a joint is outside this range or not finite.
-    """
+    """Block that raises DrakeTeleopError if a joint leaves its range by more than 1 % of it."""
 
     __slots__ = ONE_DICT
 
@@ -167,6 +136,6 @@ class SlaveMonitor(LeafSystem):
             f"{q[joint]:.3f} {unit} is outside {self._arm.lower[joint]:.3f} to "
             f"{self._arm.upper[joint]:.3f} {unit}",
             where="simulation",
-            remedy="ask for a smaller or slower motion, start elsewhere (slave.position or home)"
-            ", or speed joints up no faster than they can (joint_control.servo: position)",
+            remedy="command a smaller or slower motion, start elsewhere (slave.position or home)"
+            ", or limit joint accelerations (joint_control.servo: position)",
         )

@@ -1,7 +1,4 @@
-"""Joint position control of the slave: a position loop around a velocity loop (VI-A).
-
-Computed torque decouples the joints.
-"""
+"""Joint position control of the slave: computed torque in a position and a velocity loop (VI-A)."""
 
 import copy
 from collections.abc import Mapping
@@ -52,7 +49,6 @@ class JointControlConfig:
 
     @property
     def position_interface(self) -> PositionInterface | None:
-        """Position interface of the servo; None for computed torque."""
         if self.servo == COMPUTED_TORQUE:
             return None
         return self.interface or INTERFACES.get(self.servo, PositionInterface())
@@ -84,7 +80,7 @@ class JointControlConfig:
             interface.check(f"{where}.interface", rate)
 
     def check_computed_torque(self, what: str) -> None:
-        """Raise DrakeTeleopError unless the servo is computed torque; `what`: the caller."""
+        """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
                 f"{what} does not support the servo {self.servo}",
@@ -98,11 +94,10 @@ class JointControlConfig:
 def joint_control_torque(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
-    """Write tau = ID(q, v, kv (clip(kp (q_command - q)) - v)) (n,), within the torque limits.
+    """Write tau = ID(q, v, kv (clip(kp (q_command - q)) - v)) (n,) [N m], within the torque limits.
 
-    ID is the inverse dynamics; `state` is [q; v], `scratch` (3 n,); gains in 1/s. If encoder
-    readings are invalid, the torque compensates gravity at the commanded posture. If the command
-    is invalid, the last torque is kept.
+    ID is the inverse dynamics, `state` [q; v]. Invalid encoder readings give gravity compensation
+    at the commanded posture, an invalid command the last torque.
     """
     if not all_in_range(command):
         return
@@ -122,7 +117,7 @@ def joint_control_torque(
 
 
 def servo_numbers(arm: ArmModel, config: JointControlConfig) -> tuple[float, float, Array, Array]:
-    """Return gains kp, kv and limits of speed and torque for `joint_control_torque`."""
+    """Return gains kp, kv [1/s] and (n,) limits of joint speed and torque."""
     return (
         2 * np.pi * config.position_bandwidth_hz,
         2 * np.pi * config.velocity_bandwidth_hz,
@@ -134,8 +129,8 @@ def servo_numbers(arm: ArmModel, config: JointControlConfig) -> tuple[float, flo
 class JointControl(LeafSystem):
     """Sampled joint position controller (computed torque).
 
-    While encoder readings are invalid, the motors only compensate gravity; an arm that has no
-    brakes drifts.
+    While encoder readings are invalid, the motors only compensate gravity. `q_start` is the posture
+    held before the first sample.
 
     .. pydrake_system::
 
@@ -145,8 +140,6 @@ class JointControl(LeafSystem):
         - slave_state: (2 n,) [q; v] of the arm [rad, rad/s]
         output_ports:
         - joint_torque: (n,) [N m], held between samples
-
-    `q_start` is the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT
@@ -182,15 +175,6 @@ class HeldTorque(LeafSystem):
     """Motors that hold a requested torque for a period, within their limits.
 
     An invalid request keeps the last torque; `q_start` is the posture held before the first.
-
-    .. pydrake_system::
-
-        name: HeldTorque
-        input_ports:
-        - requested_torque: (n,) [N m]
-        - slave_state: (2 n,) [q; v] of the arm; unused
-        output_ports:
-        - joint_torque: (n,) [N m]
     """
 
     __slots__ = ONE_DICT
@@ -213,7 +197,6 @@ class HeldTorque(LeafSystem):
 def MakeJointControl(
     arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
 ) -> LeafSystem:
-    """Return the block of the configured servo; arguments as for `JointControl`."""
     interface = config.position_interface
     if interface is None:
         return JointControl(arm, config, period, q_start)
@@ -221,7 +204,7 @@ def MakeJointControl(
 
 
 def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """Return the default `interface` of the servo that a `joint_control` block names, or None."""
+    """Return the position interface that `servo` of a `joint_control` block names, or None."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))
 
 
@@ -238,8 +221,7 @@ def mass_matrix(arm: ArmModel, q: Array) -> Array:
 def operational_inertia(arm: ArmModel, q: Array) -> Array:
     """Return the inertia Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W.
 
-    q must not be singular. Khatib, A unified approach for motion and force control of robot
-    manipulators (1987).
+    Khatib, A unified approach for motion and force control of robot manipulators (1987).
     """
     n = arm.num_joints
     still, J = np.zeros(n), np.empty((6, n))
@@ -254,14 +236,12 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
 
 
 class ServoAtTool(NamedTuple):
-    """Joint servo as a wrench at the tool: K (x_command - x) - D v.
-
-    Each attribute has two values, for translation and rotation.
+    """Joint servo as a wrench at the tool, K (x_command - x) - D v, for translation and rotation.
 
     Attributes:
-        stiffness: K [N/m, N m/rad].
-        damping: D [N s/m, N m s/rad].
-        mass: mass and inertia of arm and tool [kg, kg m^2].
+        stiffness: (2,) K [N/m, N m/rad].
+        damping: (2,) D [N s/m, N m s/rad].
+        mass: (2,) mass and inertia of arm and tool [kg, kg m^2].
     """
 
     stiffness: list[float]
@@ -273,11 +253,7 @@ def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoA
     """Return stiffness, damping and mass of the slave for the passivity methods.
 
     Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
-    blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. They bound the kinetic energy. The joint
-    loops accelerate with kv (kp (x_command - x) - v), which gives K and D.
-
-    Raises:
-        DrakeTeleopError: for a servo other than computed torque.
+    blocks of the inertia Lambda with diag(m, m, m, J, J, J) >= Lambda.
     """
     config.check_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)

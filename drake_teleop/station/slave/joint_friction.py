@@ -1,9 +1,6 @@
 """Regularized Coulomb friction of the arm's joints, which Drake's joints do not have.
 
-    tau = -tau_C tanh(v / v_0),  v_0 = 2 mrad/s (2 mm/s for a prismatic joint)
-
-Below v_0 a joint creeps instead of sticking. No controller compensates it.
-"""
+tau = -tau_C tanh(v / v_0),  v_0 = 2 mrad/s (2 mm/s for a prismatic joint)"""
 
 from __future__ import annotations
 
@@ -50,15 +47,7 @@ def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
 
 
 class JointFriction(LeafSystem):
-    """Block that applies the arm's dry friction as generalized force to the plant.
-
-    .. pydrake_system::
-
-        name: JointFriction
-        input_ports:
-        - slave_state: [q; v] of the arm [rad, rad/s]
-        output_ports:
-        - generalized_force: force on the whole plant [N m]
+    """Block that applies the arm's dry friction as generalized force [N m] to the whole plant.
 
     `index` contains the joints' indices in the plant's velocities.
     """
@@ -84,7 +73,6 @@ def AddJointFriction(
     coulomb: Array,
     index: NDArray[np.intp],
 ) -> None:
-    """Add the block "joint_friction" of the arm `instance` and connect it to the plant."""
     friction = builder.AddNamedSystem(
         "joint_friction", JointFriction(coulomb, index, plant.num_velocities())
     )

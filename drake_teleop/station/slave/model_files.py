@@ -1,4 +1,4 @@
-"""Model files in Drake's plant: one file, or those that model directives add, after repairs."""
+"""Parsing of model files and model directives into Drake's plant, after repairs."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _add_directives(
     purpose: Purpose,
     folder: TemporaryDirectory[str],
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    """Add the models of directives after the same repairs; welds and positions stay."""
+    """Add the models of a directives file after repairs; keep its welds and positions."""
     with raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
     repaired, purpose = dict[Path, RepairedModel](), purpose._replace(in_directives=True)

@@ -31,7 +31,7 @@ _MAX_NAMES = 12  # names of frames in an error: the most similar ones
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """Arm from `ParseModel`; `folder` contains converted meshes, which Drake reads later."""
+    """Arm in a plant; `folder` contains converted meshes, which Drake reads later."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
@@ -41,7 +41,7 @@ class ParsedModel:
 
 @dataclass(frozen=True)
 class ParsedTool:
-    """Tool from `ParseTool`; `body` is the body welded to the sensor frame."""
+    """Tool in a plant; `body` is welded to the sensor frame."""
 
     body: RigidBody
     assumptions: list[str]
@@ -58,13 +58,9 @@ def ParseModel(
 ) -> ParsedModel:
     """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
-    A free base is welded to the world at `X_WBase`. Other joints, such as a gripper's, are welded
-    at their default positions. `package_paths` are folders of `package://` addresses. The joints
-    `hold` are welded at the given positions [rad, m].
-
-    Raises:
-        DrakeTeleopError: if the file cannot be read, has no frame `sensor_frame` or joint of
-            `hold`, or fixes the base although `X_WBase` is not the identity.
+    A free base is welded to the world at `X_WBase`, the joints `hold` at the given positions
+    [rad, m], and other joints, such as a gripper's, at their defaults. Unreadable or contradictory
+    models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
     read = read_model(plant, path, package_paths, Purpose(sensor_frame, hold))
@@ -94,11 +90,7 @@ def ParseModel(
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Parse a tool with one root link, weld the root to S ("sensor_weld"), and weld other joints.
-
-    Raises:
-        DrakeTeleopError: if the file cannot be read or has another number of roots.
-    """
+    """Parse a tool with one root link, weld the root to S ("sensor_weld"), weld other joints."""
     before = set(plant.GetJointIndices())
     read = read_model(plant, path, package_paths, Purpose(is_tool=True))
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
@@ -119,11 +111,7 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
-    """Parse the surroundings of an arm; return the folder of their converted meshes.
-
-    Raises:
-        DrakeTeleopError: if the file cannot be read, or contains elements that Drake ignores.
-    """
+    """Parse the surroundings of an arm; return the folder of their converted meshes."""
     read = read_model(plant, path, (), Purpose(is_scene=True))
     for name, what in read.dependent.items():
         raise DrakeTeleopError(

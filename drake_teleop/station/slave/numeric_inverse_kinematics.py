@@ -1,11 +1,9 @@
 """Numeric inverse kinematics of any serial arm within limits of position and speed.
 
 Levenberg-Marquardt steps minimize ``e = [p_WS* - p_WS; L log(R_WS* R_SW)]``. Joints that the error
-pushes against a limit are fixed (active set). `follow_pose` starts from the last command. If the
-smallest singular value sigma of the Jacobian (rotations times L) is below ``s = SINGULAR``, it adds
-damping ``lambda^2 = s^2 - sigma^2`` (Chiaverini, Siciliano, Egeland 1994). `find_posture` searches
-without damping, from many starts.
-"""
+pushes against a limit are fixed (active set). If the smallest singular value sigma of the Jacobian
+(rotations times L) is below ``s = SINGULAR``, `follow_pose` adds damping ``lambda^2 = s^2 -
+sigma^2`` (Chiaverini, Siciliano, Egeland 1994)."""
 
 from __future__ import annotations
 
@@ -134,9 +132,9 @@ def _is_held(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _damped_step(H, g, damping, q, lower, upper, trial):
-    """Write q plus a damped step, within the limits, to trial (n,); return the largest component.
+    """Write q plus a damped step within the limits to trial (n,); return the largest component.
 
-    Joints that are at a limit, or would pass it, are fixed there and the others solved again.
+    Joints that would pass a limit are fixed there and the others solved again.
     """
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
@@ -187,23 +185,19 @@ def _singularity_status(L, J):
 def follow_pose(
     table, L, pose, reference, lower, upper, max_step, posture, pull, singular, steps, q
 ):
-    """Write joint positions q (n,) near a reference that meet a pose or approach it smoothly.
+    """Write joint positions q (n,) near a reference that meet a pose; return the `IkStatus`.
 
     Args:
         table: `ArmModel.table`.
-        L: `orientation_length` [m].
-        pose: (7,) X_WS ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any nonzero length.
+        L: length that weights orientation against position error [m].
+        pose: (7,) X_WS.
         reference: (n,) joint positions, normally the last command.
         lower, upper: (n,) joint limits.
         max_step: (n,) largest distance from the reference.
-        posture: (n,) joint positions that a redundant arm approaches; of an endless joint, the
-            nearest turn. An endless last joint turns the tool instead.
+        posture: (n,) joint positions that a redundant arm approaches.
         pull: fraction of the distance to the posture.
         singular: singular value below which the motion is damped [m].
         steps: maximum number of steps.
-
-    Returns:
-        The `IkStatus` as a plain integer.
     """
     n = q.shape[0]
     low, high = np.empty(n), np.empty(n)
@@ -313,10 +307,8 @@ def follow_pose(
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
     """Return joint positions (n,) that meet the pose X_WS (7,), and the `IkStatus`.
 
-    The search starts at the reference (n,) and then elsewhere; the first solution wins. Revolute
-    joints take the full rotation nearest to the reference. Without a solution, the positions
-    nearest to the pose are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the
-    singularity.
+    The search starts at the reference (n,). Without a solution, the positions nearest to the pose
+    are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
     """
     n, lower, upper = arm.num_joints, arm.lower, arm.upper
     first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts
@@ -361,11 +353,10 @@ def orientation_length(arm: ArmModel) -> float:
 def _follow_command(
     table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
 ):  # fmt: skip
-    """Move from the last command towards the pose with `follow_pose`; return the `IkStatus`.
+    """Write joint positions q (n,) from the last command towards the pose; return the `IkStatus`.
 
-    `speed` (n,) contains speed limits, which apply to the elapsed time; `last` (n + 1,) is the last
-    command and its time [s]. If the encoder readings `position` (n,) are invalid, the last command
-    is held.
+    `speed` (n,) contains speed limits; `last` (n + 1,) is the last command and its time [s], which
+    is held if the encoder readings `position` (n,) are invalid.
     """
     n = q.shape[0]
     copy_into(q, 0, last, 0, n)
@@ -385,20 +376,8 @@ def _follow_command(
 class NumericInverseKinematics(LeafSystem):
     """Block that converts a commanded pose to joint positions, for any serial arm.
 
-    Joints continue from the last command, not from the measured position, so that a redundant arm
-    does not drift. If encoder readings are invalid, the last command is held.
-
-    .. pydrake_system::
-
-        name: NumericInverseKinematics
-        input_ports:
-        - pose_command: X_WS as [qw, qx, qy, qz, px, py, pz] [-, m]
-        - joint_position: (n,) measured positions [rad]
-        output_ports:
-        - joint_command: (n,) [rad]
-        - ik_status: an `IkStatus`
-
-    `q_start` is the first command, and the posture that a redundant arm approaches.
+    Its ports are those of `InverseKinematics`. Joints continue from the last command, not from the
+    measured position, so that a redundant arm does not drift towards another posture.
     """
 
     __slots__ = ONE_DICT

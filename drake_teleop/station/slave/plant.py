@@ -50,10 +50,9 @@ class SlavePlant:
         tool: index of the tool's body on the sensor.
         arm: chain up to S, with all bodies beyond S as its load.
         start: (n,) joint positions at the start [rad].
-        X_WS_start: (7,) pose at the start, see `start_pose`.
+        X_WS_start: (7,) pose at the start [qw qx qy qz px py pz].
         tip: (3,) p_STip, contact point of the tool [m].
         assumptions: texts about data missing in the models.
-        environment: objects that the tool can touch, or None.
     """
 
     plant: MultibodyPlant
@@ -71,15 +70,14 @@ class SlavePlant:
 
     @property
     def contact_pairs(self) -> NDArray[np.float64]:
-        """Pairs (k, 28) of shapes for the compiled contact law, see `Pairs`."""
+        """Pairs (k, 28) of shapes for the compiled contact law."""
         return self.contact.pairs
 
     @cached_property
     def physics(self) -> tuple[NDArray[np.float64], ...]:
         """Argument of `plant_rates`: arm table, view of its load, pairs, leaf, joints, wrenches.
 
-        The table is a copy with dry friction; a grasp may change its load. Joint control uses
-        neither friction nor grasped load.
+        The table is a copy with dry friction, and with the load that a grasp may change.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION] = self.friction
@@ -88,7 +86,6 @@ class SlavePlant:
 
     @property
     def friction(self) -> NDArray[np.float64]:
-        """Dry friction (n,) of the joints [N m]."""
         return friction_of_joints(self.config.friction, self.arm.joint_names)
 
     @property
@@ -98,12 +95,11 @@ class SlavePlant:
 
     @property
     def can_touch(self) -> bool:
-        """True if the tool can touch an object."""
         return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
 
     @property
     def sensed_sheet(self) -> ModelInstanceIndex | None:
-        """Model instance `sheet` if the compiled contact law moves the sheet, else None."""
+        """Model instance of the sheet if the compiled contact law moves it, else None."""
         return None if self.contact.beyond else self.sheet
 
     @property
@@ -122,7 +118,6 @@ def start_pose(slave: Slave) -> NDArray[np.float64]:
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
-    """Return the slave's plant without environment, from a cache; raises as `AddSlavePlant`."""
     written = tuple(path.stat().st_mtime_ns for path in slave.files())
     return _nominal_slave(HashableByValue(slave), written)
 
@@ -153,12 +148,7 @@ def AddSlavePlant(
 ) -> SlavePlant:
     """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the configured start.
 
-    A scene graph slows every step and is added only with an environment. Only the tool makes
-    contact.
-
-    Raises:
-        DrakeTeleopError: if a model cannot be read, or the arm cannot reach the start or hold its
-            load.
+    A DrakeTeleopError is raised if the arm cannot reach the start or hold its load.
     """
     if environment is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
@@ -219,11 +209,7 @@ class ParsedSlave:
     folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
-        """Return the arm of the finalized plant, and the assumptions about its limits.
-
-        Raises:
-            DrakeTeleopError: if the sensor carries no mass, or as `ArmModelFromPlant`.
-        """
+        """Return the arm of the finalized plant, and the assumptions about its limits."""
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
@@ -275,10 +261,7 @@ def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
 
 
 def finalize(plant: MultibodyPlant) -> None:
-    """Finalize a continuous plant without Drake's warnings about ignored joint limits.
-
-    Limits set after finalizing cause no warning. Monitor and inverse kinematics enforce them.
-    """
+    """Finalize a continuous plant without Drake's warnings about joint limits."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
     for joint, (lower, upper) in zip(joints, limits, strict=True):
@@ -327,7 +310,7 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
 
 
 def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the point p_S (3,) in the middle of the shapes that reach farthest along z_S."""
+    """Return the point p_S (3,) [m] in the middle of the shapes that reach farthest along z_S."""
     reach = max(float(hull[:, 2].max()) for hull in hulls)
     farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SAME_REACH_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
@@ -370,11 +353,7 @@ class Arm:
 
 
 def arm_of(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
-    """Return the kinematics of the arm in a model file.
-
-    Raises:
-        DrakeTeleopError: if the model cannot be read or is no serial arm.
-    """
+    """Return the kinematics of the arm in a model file, or raise DrakeTeleopError."""
     plant = MultibodyPlant(0.0)
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)

@@ -1,8 +1,6 @@
-"""Compiled dynamics of the plant inside one step, with the wrench of the environment on the tool.
+"""Compiled dynamics of arm, leaf and contact inside one step, for tools of balls on boxes.
 
-Covers arm, tool, balls on boxes and one leaf (otherwise see `Contact.beyond`). The state is x = [q,
-leaf deflection, v, its rate], then the plant's [q; v] if other bodies move.
-"""
+The state is x = [q, leaf deflection, v, its rate], then the plant's [q; v] if other bodies move."""
 
 from __future__ import annotations
 
@@ -39,17 +37,15 @@ _TOUCH_TOLERANCE_M = 1e-9  # m
 
 @njit(cache=True)
 def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench_W):
-    """Write the environment's wrench on the tool, about the world's origin, in W.
+    """Write the environment's wrench (6,) on the tool, about the world's origin, in W [N, N m].
 
     Args:
         arm: `ArmModel.table`.
         pairs: (k, 28) pairs of shapes, `Pairs.known`.
         joints: (m, 21) joints of moving bodies, `JointTable`.
         applied_W: (6,) additional [f; tau] about So, in W [N, N m].
-        q, v: (n,) joint positions and speeds.
         sheet: (2,) deflection of the leaf and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
-        wrench_W: (6,) output [N, N m].
     """
     has_wrench = pairs.shape[0] > 0
     for i in range(6):
@@ -89,7 +85,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
 @njit(cache=True)
 def _place_box(pair, bodies, placed):
-    """Write the pair, with its box at the pose of its body, to `placed` (28,), and return this."""
+    """Write the pair, with its box at the pose of its body, to `placed` (28,); return `placed`."""
     body = bodies[int(pair[BODY])]
     copy_into(placed, 0, pair, 0, WIDTH)
     turn = (body[0], body[1], body[2], body[3])
@@ -103,7 +99,7 @@ def _place_box(pair, bodies, placed):
 
 
 @njit(cache=True)
-def nearness(arm, pairs, watched, joints, q, sheet, state):
+def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     """Return the tool's proximity `FAR`, `TOUCHING` or `WATCHED`; `watched` is `Pairs.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
@@ -131,17 +127,10 @@ def add_force(wrench_W, p_WC, force_W):
 
 
 class ToolContact(LeafSystem):
-    """Block that outputs the true contact wrench for the log, see `environment_wrench`.
+    """Block with the environment's wrench (6,) on the tool about the world's origin, for the log.
 
-    .. pydrake_system::
-
-        name: ToolContact
-        input_ports:
-        - slave_state: [q; v] of the arm
-        - sheet_state: [z; v_z] of the sheet spring (only if there is one)
-        - plant_state: [q; v] of the whole plant (only if other bodies move)
-        output_ports:
-        - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
+    Its ports sheet_state [z; v_z] and plant_state [q; v] exist only with a leaf or other moving
+    bodies.
     """
 
     __slots__ = ONE_DICT
@@ -183,10 +172,9 @@ def assemble_state(state, around, x):
 
 @njit(cache=True)
 def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot (2 n + 2,) of x, and the environment's wrench.
+    """Write the time derivative xdot (2 n + 2,) of the plant's state x, and the contact wrench.
 
-    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m]; `applied_W` and
-    `wrench_W` as for `environment_wrench`.
+    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m].
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
@@ -225,7 +213,7 @@ def _take_given_wrench(given, x, wrench_W):
 
 @njit(cache=True)
 def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot of x under a given environment wrench."""
+    """Write the time derivative xdot of the plant's state x under the contact wrench `wrench_W`."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]

@@ -1,13 +1,9 @@
-"""Commercial arm with a position interface.
+"""Commercial arm with a position interface (docs/station.md).
 
-    command --[dead time, held]--> target --[generator]--> r, dr/dt --[drives]--> torque
+command --[dead time, held]--> target --[generator]--> r, dr/dt --[drives]--> torque
 
-    d2r/dt2 = gain (target - (r + lookahead dr/dt))
-    d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz
-
-The generator respects speed and acceleration limits and brakes in time. Without integral action, a
-joint yields in contact by torque / (inertia w^2). See docs/station.md for sources and omissions.
-"""
+d2r/dt2 = gain (target - (r + lookahead dr/dt))
+d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
 
 import math
 from dataclasses import dataclass
@@ -132,8 +128,8 @@ def position_servo_torque(
 ):  # fmt: skip
     """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
 
-    `state` is [q; v], `scratch` (6, n), the others as for `_generate`. An invalid command is
-    replaced by the last one. If encoder readings are invalid, the torque compensates gravity.
+    `state` is [q; v], `scratch` (6, n). An invalid command is replaced by the last one. If encoder
+    readings are invalid, the torque compensates gravity.
     """
     n = torque.shape[0]
     _generate(command, interface, limits, memory, scratch)
@@ -154,16 +150,7 @@ def position_servo_torque(
 
 
 class PositionServo(LeafSystem):
-    """Block with the position interface of an arm, in place of `JointControl`.
-
-    .. pydrake_system::
-
-        name: PositionServo
-        input_ports:
-        - joint_command: (n,) [rad]
-        - slave_state: [q; v] of the arm [rad, rad/s]
-        output_ports:
-        - joint_torque: (n,) [N m], held between samples
+    """Block with the position interface of an arm; its ports are those of `JointControl`.
 
     `period` is the drives' period [s], `q_start` the posture held before the first command.
     """

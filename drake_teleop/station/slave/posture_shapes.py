@@ -1,9 +1,8 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
-Collision shapes count; of a body without them, its visual shapes. Drake uses convex hulls for
-meshes. Bodies that a joint or a telescope connects may overlap. So may pairs that overlap in nearly
-all random postures, such as the hulls of a forearm and the next link but one; an assumption names
-them. This is also the rule of MoveIt's setup assistant.
+Collision shapes count; of a body without them, its visual shapes; of meshes, their convex hulls.
+Bodies that a joint or a telescope connects, or that overlap in nearly all random postures, may
+overlap, as in MoveIt's setup assistant; an assumption names the latter.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ _SAME_DIRECTION = 0.999  # cosine of the angle between the axes of a telescope
 _SIDES = 24  # points on a circumference of a round shape
 
 
-class Near(NamedTuple):
+class Overlap(NamedTuple):
     """Two bodies and the distance of their nearest shapes [m], negative if they overlap."""
 
     first: RigidBody
@@ -69,13 +68,9 @@ class Near(NamedTuple):
 
 
 class PostureShapes:
-    """Plant with the shapes of a slave and its surroundings, for questions about postures.
-
-    Args:
-        sticks: True gives an arm without shapes sticks between its joints.
+    """Plant with the shapes of a slave and its surroundings; `sticks` replaces missing shapes.
 
     Attributes:
-        arm: the arm with its load.
         assumptions: texts about data missing in the models.
         tool_bodies: indices of the bodies beyond the sensor.
         surroundings: indices of the bodies of the environment.
@@ -116,25 +111,21 @@ class PostureShapes:
             )
 
     def shapes_of(self, body: BodyIndex) -> list[GeometryId]:
-        """Return the collision shapes of a body."""
         inspector = self._scene_graph.model_inspector()
         shapes = self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
         return [each for each in shapes if inspector.GetProximityProperties(each) is not None]
 
     def move_to(self, q: Array) -> None:
-        """Move the arm to joint positions q (n,) [rad, m]."""
         positions = self.plant.GetPositions(self.context)
         positions[self.arm.position_index] = q
         self.plant.SetPositions(self.context, positions)
 
     @property
     def X_WS(self) -> RigidTransform:
-        """Pose X_WS of the sensor frame S."""
         return self._parsed.sensor_frame.CalcPoseInWorld(self.context)
 
     @property
     def tool_body(self) -> BodyIndex:
-        """Index of the tool's body on the sensor."""
         return self._parsed.tool
 
     def sensor_link(self) -> set[BodyIndex]:
@@ -142,22 +133,21 @@ class PostureShapes:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
-    def near(self) -> list[Near]:
+    def overlaps(self) -> list[Overlap]:
         """Return the pairs of overlapping bodies, except those that overlap by design."""
         return [
-            Near(self.plant.get_body(first), self.plant.get_body(second), distance)
+            Overlap(self.plant.get_body(first), self.plant.get_body(second), distance)
             for (first, second), distance in self._distances().items()
             if (first, second) not in self._by_design
         ]
 
     def points(self, bodies: Collection[BodyIndex]) -> Array:
-        """Return points (k, 3) on the shapes of bodies, in W [m]."""
         return np.vstack(
             [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hulls(body))]
         )
 
     def hulls(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return points (k, 3) on the hull of each shape of a body, in W [m]; or of each visual."""
+        """Return points (k, 3) on the hulls of a body's collision, or visual, shapes, in W [m]."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [surface_points(self._scene_graph.model_inspector(), each) for each in shapes]
@@ -165,12 +155,10 @@ class PostureShapes:
         return [(X_WB @ points.T).T for points in hulls]
 
     def anchored(self) -> set[BodyIndex]:
-        """Return the indices of the slave's bodies that are fixed to the world."""
         fixed = self.plant.GetBodiesWeldedTo(self.plant.world_body())
         return {body.index() for body in fixed} - self.surroundings
 
     def moving(self) -> set[BodyIndex]:
-        """Return the indices of the slave's moving bodies."""
         every = set(map(BodyIndex, range(self.plant.num_bodies())))
         return every - self.surroundings - self.anchored()
 
@@ -192,7 +180,7 @@ class PostureShapes:
         return found
 
     def _exclude_joined(self) -> None:
-        """Exclude pairs on one link, joined by a joint or telescope, and in the environment."""
+        """Ignore overlaps in the environment, in a link, and across a joint or telescope."""
         plant, manager = self.plant, self._scene_graph.collision_filter_manager()
 
         def link(body: RigidBody) -> set[BodyIndex]:
@@ -234,7 +222,7 @@ class PostureShapes:
 
 
 def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
-    """Return the range (n,), (n,) of random joint positions: the limits, at most one rotation."""
+    """Return lower and upper ends (n,) for random joint positions: limits, at most one rotation."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
@@ -262,13 +250,9 @@ def _start_overlaps(
 
 
 def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
-    """Return one sentence for each pair of overlapping bodies: names, depth and remedy.
-
-    Args:
-        of_arm: True leaves out the surroundings.
-    """
+    """Return one sentence for each overlapping pair; `of_arm` leaves out the surroundings."""
     found = []
-    for first, second, distance in shapes.near():
+    for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
         if distance > -MIN_DEPTH_M or (of_arm and with_surroundings):
             continue
@@ -283,9 +267,9 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Add visual shapes as collision shapes where a body has none; drop unlimited shapes.
+    """Give bodies without collision shapes their visual ones; drop unlimited shapes.
 
-    Drake's distance query may hang for capsules that overlap: polyhedra replace curved shapes.
+    Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     """
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     added = []  # afterwards, because Drake's lists move when shapes are added

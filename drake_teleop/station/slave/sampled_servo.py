@@ -1,12 +1,11 @@
 """Joint control that samples faster than the simulation's events.
 
-Each event predicts the motion with `plant_rates`, one midpoint step per sample of the controller:
+Each event predicts the motion, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
 The plant receives the line a + b (t - h/2) over h = m T with the area and first moment of these
-steps. The prediction includes contacts, but no other force on the tool.
-"""
+steps."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ _EVENT_HZ = 2000.0
 def samples_per_event(control_hz: float, hand_hz: float) -> int:
     """Return the largest number of servo samples per event with events at 2 kHz or more.
 
-    Each operator-side sample remains an event.
+    Each operator-side sample remains an event. Arguments are rates [Hz].
     """
     ratio = control_hz / hand_hz
     whole = round(ratio)
@@ -47,7 +46,7 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 @njit(cache=True)
 def torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
-    """Write the torque over the next samples as a line in time.
+    """Write the torque over the next `samples` as a line in time.
 
     Args:
         arm: `ArmModel.table` of the controller.
@@ -56,9 +55,7 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
         sheet: (2,) deflection of the leaf and its rate.
         servo: gains and limits from `servo_numbers`.
         physics: `SlavePlant.physics`.
-        samples: number m of samples.
-        period: T [s].
-        scratch: (3 n,).
+        period: of the servo [s].
         line: (3 n,) output: torque [N m], its rate [N m/s], last sample [N m].
     """
     n = command.shape[0]
@@ -95,27 +92,17 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
 
 @njit(cache=True)
 def _evaluate_line(state, time, torque):
-    """Write the torque (n,) at `time`; `state` is `line` and its start time [s]."""
+    """Write the torque (n,) at `time` [s]; `state` is the line, then its start time [s]."""
     n = torque.shape[0]
     for i in range(n):
         torque[i] = state[i] + (time - state[-1]) * state[n + i]
 
 
 class SampledServo(LeafSystem):
-    """Block as `JointControl`, with several servo samples per event, see the module.
+    """Computed torque with several servo samples per event, given to the plant as a line in time.
 
-    .. pydrake_system::
-
-        name: SampledServo
-        input_ports:
-        - joint_command: (n,) [rad]
-        - slave_state: [q; v] of the arm [rad, rad/s]
-        - sheet_state: [z; v_z] of the leaf (only if there is one)
-        output_ports:
-        - joint_torque: (n,) now, on the line [N m]
-        - torque_rate: (n,) slope of the line, held between events [N m/s]
-
-    `period` is the servo's period [s], `q_start` the posture held before the first sample.
+    Outputs are the torque (n,) now [N m] and the slope (n,) of the line [N m/s]. `period` is the
+    servo's period [s], `q_start` the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT

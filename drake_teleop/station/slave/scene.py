@@ -1,8 +1,4 @@
-"""Environment from a file: SDF, URDF or Drake model directives.
-
-Bodies may be attached by joints with springs and damping. Free roots are welded to the world, or
-float.
-"""
+"""Environment from a file: SDF, URDF or Drake model directives."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -61,13 +57,11 @@ class Scene(Environment):
 
     @property
     def path(self) -> Path:
-        """Path of `file`, or of the shipped model with this name."""
         given, shipped = Path(self.file), models_dir() / self.file
         return shipped if not given.is_file() and shipped.is_file() else given
 
     @property
     def hydroelastic(self) -> bool:
-        """True if contacts may have a pressure over an area."""
         return self.contact == "hydroelastic"
 
     def found_from(self, folder: Path) -> "Scene":
@@ -76,7 +70,6 @@ class Scene(Environment):
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the file's bodies to a plant and place its free roots; raises DrakeTeleopError."""
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
@@ -109,7 +102,6 @@ class Scene(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Make the tool's shapes hydroelastic, if configured; raises DrakeTeleopError."""
         if not self.hydroelastic:
             return
         inspector = scene_graph.model_inspector()
@@ -134,5 +126,4 @@ class Scene(Environment):
 
 
 def is_hydroelastic(properties: ProximityProperties) -> bool:
-    """Return whether a shape has hydroelastic properties."""
     return bool(properties.HasProperty("hydroelastic", "compliance_type"))

@@ -81,26 +81,22 @@ class Slave:
 
     @property
     def path(self) -> Path:
-        """Model file of the arm."""
         return Path(self.model) if self.model else models_dir() / "rx90.sdf"
 
     @property
     def packages(self) -> tuple[Path, ...]:
-        """Folders of package:// addresses."""
+        """Folders in which package:// addresses are searched."""
         return tuple(Path(folder) for folder in self.package_paths)
 
     @property
     def X_WBase(self) -> RigidTransform:
-        """Pose of the arm's base in the world."""
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def files(self) -> list[Path]:
-        """Return the existing model files."""
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
         return [path for path in paths if path.is_file()]
 
     def check(self, where: str) -> None:
-        """Raise DrakeTeleopError for invalid numbers, lengths or tool."""
         if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
             raise DrakeTeleopError(
                 "contains a number that is negative or not finite",
@@ -117,7 +113,7 @@ class Slave:
         for joint, position in self.hold.items():
             if not np.isfinite(position):
                 raise DrakeTeleopError(
-                    f"{position:g} is no position",
+                    f"{position:g} is not a finite position",
                     where=f"{where}.hold.{joint}",
                     remedy="give an angle [rad] or a distance [m]",
                 )
@@ -149,7 +145,7 @@ class Slave:
 
 
 def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
-    """Weld the payload to a frame that coincides with S, if it has mass."""
+    """Weld the payload, if it has mass, to a frame that coincides with S."""
     if payload.mass == 0.0:
         return
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))

@@ -54,8 +54,7 @@ class Contact(NamedTuple):
         joints: (m, 21) joints of `JointTable`, which move the boxes of `pairs`.
         plant_size: size of the plant's state, 0 without joints.
         beyond: reason for using Drake's contact results instead of the compiled law, or empty.
-        bodies: indices of the tool's bodies.
-        shapes: identifiers of the collision shapes of these bodies.
+        bodies, shapes: identifiers of the tool's bodies, and of their collision shapes.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] and gravity [m/s^2] of the leaf.
         sheet: model instance of the leaf, or of another `moving_part`; None without one.
         moving: other moving bodies, by name.
@@ -74,12 +73,10 @@ class Contact(NamedTuple):
 
     @property
     def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Arguments `pairs` and `joints` for `environment_wrench`."""
         return self.pairs, self.joints
 
 
 def no_contact() -> Contact:
-    """Return the `Contact` of a tool without environment."""
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
     watched = np.zeros((0, WATCHED_WIDTH))
@@ -87,7 +84,6 @@ def no_contact() -> Contact:
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
-    """Add the environment to a plant that contains the tool, before finalizing."""
     before, sheet = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
@@ -107,11 +103,8 @@ def ContactWith(
 ) -> Contact:
     """Return the contact of the tool with the environment, in a finalized plant.
 
-    `scene_graph` contains the shapes of tool and environment only.
-
-    Raises:
-        DrakeTeleopError: if the requested contact model is impossible, or a moving body has no
-            mass.
+    `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
+    an impossible contact model, or a moving body without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
@@ -203,13 +196,12 @@ def _signal_name(name: str) -> str:
 
 
 def supports_pose(joint: Joint) -> bool:
-    """Return whether the joint's positions follow from a pose, see `positions_of`."""
+    """Return whether the joint's positions follow from the pose of its child frame."""
     kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
 def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
-    """Return the joint positions for the pose X_FM of the joint's child frame."""
     if isinstance(joint, RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
@@ -220,16 +212,7 @@ def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
 
 
 class MovingPose(LeafSystem):
-    """Block that outputs the pose of a moving body.
-
-    .. pydrake_system::
-
-        name: MovingPose
-        input_ports:
-        - plant_state: [q; v] of the whole plant
-        output_ports:
-        - pose: (7,) [qw, qx, qy, qz, px, py, pz] in W [1, m]
-    """
+    """Block that outputs the pose X_WB (7,) of a moving body from the whole plant's [q; v]."""
 
     __slots__ = ONE_DICT
 

@@ -38,12 +38,10 @@ class Ball:
 
     @property
     def shape(self) -> Shape:
-        """Drake's shape of the ball."""
         return Sphere(self.radius)
 
     @property
     def pose(self) -> RigidTransform:
-        """Pose of the ball in S."""
         return RigidTransform(self.position)
 
 
@@ -58,7 +56,6 @@ class Block:
 
     @property
     def shape(self) -> Shape:
-        """Drake's shape of the box."""
         return Box(*self.edges)
 
     @property
@@ -68,7 +65,6 @@ class Block:
 
     @property
     def pose(self) -> RigidTransform:
-        """Pose of the box in S."""
         return RigidTransform(RollPitchYaw(self.rpy), self.position)
 
 
@@ -91,11 +87,9 @@ class Tool:
 
     @property
     def path(self) -> Path:
-        """Model file of the tool, by default the paper's."""
         return Path(self.model) if self.model else models_dir() / "tool.sdf"
 
     def check(self, where: str) -> None:
-        """Raise DrakeTeleopError for file plus mass, shapes without mass, or an invalid inertia."""
         if self.model and self.mass:
             raise DrakeTeleopError(
                 "both a file and a mass define the tool",
@@ -110,14 +104,14 @@ class Tool:
             )
         if not _inertia(self).IsPhysicallyValid():
             raise DrakeTeleopError(
-                "no body has this inertia",
+                "the inertia is impossible for a rigid body",
                 where=f"{where}.inertia",
                 remedy="give entries of the tensor about the centre of mass, or leave it out",
             )
 
 
 def shapes_reach(tool: Tool) -> list[float] | None:
-    """Return the end point p_STip (3,) [m] of the shape that reaches farthest along z_S, if any."""
+    """Return the end p_STip (3,) [m] of the shape that reaches farthest along z_S, or None."""
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
         for each in tool.shapes
@@ -170,5 +164,4 @@ def _inertia(tool: Tool) -> SpatialInertia:
 
 
 def steel_ball_radius(mass: float) -> float:
-    """Return the radius [m] of a steel ball with a mass [kg]."""
     return float((mass / _STEEL_DENSITY * 3 / (4 * np.pi)) ** (1 / 3))
