@@ -117,10 +117,10 @@ def measured(run: OneDofRun, case: dict[str, Any]) -> Figures:
     charged = round(CHARGED / PERIOD)
     later = (run.accounts[:, HAND] + run.accounts[:, ACTUAL])[charged:]
     found = Figures(
-        actual=run.least(ACTUAL),
-        motor=run.least(MOTOR),
-        command=run.least(COMMAND),
-        hand=run.least(HAND),
+        actual=run.least_energy_sum(ACTUAL),
+        motor=run.least_energy_sum(MOTOR),
+        command=run.least_energy_sum(COMMAND),
+        hand=run.least_energy_sum(HAND),
         actual_later=run.start_energy + float(np.nanmin(later, initial=math.inf)),
     )
     if case["wall"] != "stands":
@@ -273,7 +273,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
 
     def least(passivity: PassivityConfig, model: OneDof, line: NetworkConfig, **more: Any) -> float:
-        return run_one_dof(model, passivity, line, **more).least(ACTUAL)
+        return run_one_dof(model, passivity, line, **more).least_energy_sum(ACTUAL)
 
     for name in names:
         one = PassivityConfig(method=name)

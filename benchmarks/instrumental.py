@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.numeric import Array, checked_rows
-from drake_teleop.common.vectors import put
+from drake_teleop.common.numeric import Array, broadcast_to_rows
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
     add_outer_product,
@@ -108,7 +108,7 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
         add_outer_product(y, y, memory[38:57])
         riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A)
         solve(A)
-        put(theta, 0, A[:, 16], 0, 16)
+        copy_into(theta, 0, A[:, 16], 0, 16)
 
 
 class RecursiveInstrumentalVariables(MomentEstimator):
@@ -139,7 +139,7 @@ class RecursiveInstrumentalVariables(MomentEstimator):
     ) -> None:
         """Update by N samples; instruments (N, 9) are [s; omega; alpha] from a second source."""
         motion = {"s": (s, 3), "omega": (omega, 3), "alpha": (alpha, 3)}
-        _, rows = checked_rows(wrench=(wrench, 6), **motion, instruments=(instruments, 9))
+        _, rows = broadcast_to_rows(wrench=(wrench, 6), **motion, instruments=(instruments, 9))
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 

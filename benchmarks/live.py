@@ -26,10 +26,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.common.progress import silent
+from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.inputs import NETWORKS, SLICE_MS
-from drake_teleop.live.live import FRAME, Live
+from drake_teleop.live.live import FRAME_PERIOD_S, Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import live_scenario
@@ -63,7 +63,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
     while clock() - start < seconds:
         now = clock()
         if now >= next_message:
-            next_message += FRAME
+            next_message += FRAME_PERIOD_S
             live.handle_message(1, json.dumps({"set": wanted(now - start)}), now)
         if not live.is_idle and live.pace.wait(now) <= 0:
             late.append(-live.pace.wait(now))
@@ -147,7 +147,7 @@ def main() -> None:
             figures = driven(options.seconds, Path(folder) / "drive")
         drive = read_drive(Path(folder) / "drive")
         cpu = time.process_time()
-        drive.repeat(silent(""), Path(folder) / "again")
+        drive.repeat(show_no_progress(""), Path(folder) / "again")
         seconds = drive.scenario.simulation.duration
         figures["core_share_of_repeat"] = (time.process_time() - cpu) / seconds
         parts = sorted((Path(folder) / "drive" / "log.parquet").iterdir())

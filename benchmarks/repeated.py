@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.common.progress import silent
+from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.inputs import NETWORKS, RANGES, SLICE_MS, Inputs
 from drake_teleop.live.scenarios import live_scenario
@@ -84,7 +84,7 @@ def begun(drive: Drive, late: int) -> SimulationResult:
     changes = list(drive.changes[:100])
     ms, inputs = changes[20]
     changes[20] = ms + late, inputs
-    return Drive(drive.scenario, drive.load, changes).repeat(silent(""))
+    return Drive(drive.scenario, drive.load, changes).repeat(show_no_progress(""))
 
 
 def differ(one: SimulationResult, other: SimulationResult) -> int:
@@ -115,11 +115,13 @@ def main() -> None:
         figures["numbers"] = sum(log[name].size for name in log)
         force = np.abs(log["true_contact_wrench_W"][:, 2])
         figures["contact_share"] = float((force > 0.5).mean())
-        drive.repeat(silent(""), again)
+        drive.repeat(show_no_progress(""), again)
         parts = sorted((folder / "log.parquet").iterdir())
         figures["same_bytes"] = all(p.read_bytes() == (again / p.name).read_bytes() for p in parts)
         for slice_ms in (1, 7, 1000):
-            figures[f"differ_{slice_ms}_ms"] = differ(log, drive.repeat(silent(""), None, slice_ms))
+            figures[f"differ_{slice_ms}_ms"] = differ(
+                log, drive.repeat(show_no_progress(""), None, slice_ms)
+            )
             print(f"sliced by {slice_ms} ms", flush=True)
         figures["differ_late"] = differ(begun(drive, 0), begun(drive, 1))
     for name, value in figures.items():

@@ -32,7 +32,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import GammaSearch, Settings, StationTrial
-from drake_teleop.lab.tuning.search import holds
+from drake_teleop.lab.tuning.search import meets_requirements
 from drake_teleop.lab.tuning.stated_set import stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.master.data_sheets import Master
@@ -102,12 +102,14 @@ def station(seed: int, draws: int, station_draws: int, jobs: int) -> dict[str, A
                         "wall": float(np.exp(rng.uniform(low, high)))}, 100 + k)
         for k in range(station_draws)
     ]  # fmt: skip
-    row["station_inside"] = float(np.mean([holds(run) for run in runs])) if runs else None
+    row["station_inside"] = (
+        float(np.mean([meets_requirements(run) for run in runs])) if runs else None
+    )
     advice = values | {"method": "ledger", "gamma": 1.0, "sigma_inertia": 0.0}
     advice["low_pass_hz"] = base.wrist_sensor.bandwidth_hz
     advised = [trial(advice | {"hand": hand, "wall": wall}, 0) for hand, wall in stated.corners[:2]]
     row |= {
-        "advice_holds": all(map(holds, advised)),
+        "advice_holds": all(map(meets_requirements, advised)),
         "advice_threshold_N": max(run["threshold_N"] for run in advised),
         "advice_share": min(run["share"] for run in advised),
     }

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 import drake_teleop
-from drake_teleop.common.errors import install_extra
+from drake_teleop.common.errors import remedy_to_install_extra
 
 pytestmark = pytest.mark.checks
 
@@ -146,4 +146,6 @@ def test_what_is_advised_installs_an_extra_that_there_is():
         if name
     }
     assert {"notebook", "ros", "robots", "cluster"} <= advised <= extras
-    assert install_extra("ros").endswith("pip install '.[ros]' in the clone of this project")
+    assert remedy_to_install_extra("ros").endswith(
+        "pip install '.[ros]' in the clone of this project"
+    )

@@ -21,18 +21,18 @@ INERTIA = np.array([[0.05, 0.01, -0.02], [0.01, 0.06, 0.003], [-0.02, 0.003, 0.0
 @pytest.mark.parametrize(
     ("function", "arguments", "expected"),
     [
-        (vectors.three, (phi, 1), phi[1:4]),
-        (vectors.nine, (phi, 1), phi[1:]),
-        (vectors.rows, (R,), R.ravel()),
+        (vectors.vector_at, (phi, 1), phi[1:4]),
+        (vectors.matrix_at, (phi, 1), phi[1:]),
+        (vectors.matrix_as_tuple, (R,), R.ravel()),
         (vectors.transposed, (R.ravel(),), R.T.ravel()),
         (vectors.plus, (a, b), a + b),
         (vectors.minus, (a, b), a - b),
-        (vectors.times, (3.0, b), 3 * b),
+        (vectors.scale_vector, (3.0, b), 3 * b),
         (vectors.dot, (a, b), a @ b),
         (vectors.cross, (a, b), np.cross(a, b)),
-        (vectors.plus_cross, (c, a, b), c + np.cross(a, b)),
-        (vectors.apply, (R.ravel(), a), R @ a),
-        (vectors.symmetric, (phi, 4), INERTIA.ravel()),
+        (vectors.add_cross_product, (c, a, b), c + np.cross(a, b)),
+        (vectors.apply_matrix, (R.ravel(), a), R @ a),
+        (vectors.symmetric_at, (phi, 4), INERTIA.ravel()),
     ],
 )
 def test_vector_functions_equal_numpy(function, arguments, expected, compiled):
@@ -50,7 +50,7 @@ def test_add_into_changes_only_the_given_index():
 
 @njit
 def solved(M, b, n):
-    vectors.solve(M, b, n)
+    vectors.solve_by_cholesky(M, b, n)
 
 
 @pytest.mark.long
@@ -64,7 +64,7 @@ def test_cholesky_and_solve_equal_numpy_and_read_the_lower_half(n):
     solved(lower, x, n)
     np.testing.assert_allclose(x, np.linalg.solve(M, right), rtol=1e-10)
     np.testing.assert_allclose(np.tril(lower), np.linalg.cholesky(M), rtol=1e-10)
-    vectors.solve(M, right, n)
+    vectors.solve_by_cholesky(M, right, n)
     np.testing.assert_allclose(right, x, rtol=1e-14)
 
 

@@ -19,13 +19,13 @@ assert drawn == [0.25]
     "02_delay_and_passivity": """
 assert figures(short, model).stable and not figures(long, model).stable
 assert created[0.05] > 1.0 and created[0.002] < 0.05
-assert passive.least(ACTUAL) >= 0.0
+assert passive.least_energy_sum(ACTUAL) >= 0.0
 assert over_internet.keys() == over_300_ms.keys() == set(METHODS)
 found = [{m: figures(r, model) for m, r in runs.items()} for runs in (over_internet, over_300_ms)]
 assert not found[0]["none"].stable and not found[1]["none"].stable
 assert found[0]["ledger"].stable and abs(found[0]["ledger"].force_error) < 0.01
 assert found[1]["wave"].stable and abs(found[1]["wave"].force_error) < 0.01
-assert min(over_300_ms[name].least(ACTUAL) for name in ("wave", "pspm", "ledger")) >= 0.0
+assert min(over_300_ms[name].least_energy_sum(ACTUAL) for name in ("wave", "pspm", "ledger")) >= 0.0
 assert other_hands["none"].release_speed > 1.0 > 3 * other_hands["ledger"].release_speed
 assert other_hands["ledger"].leaked == 0.0 < other_hands["tdpa"].leaked
 assert np.ptp(age["playout 150 ms"][400:]) < 1e-9 and np.ptp(age["internet"][400:]) > 0.02

@@ -20,5 +20,5 @@ for axes, method in zip(panels, ("none", "ledger"), strict=True):
     axes.plot(run.t, wall, label="wall")
     axes.plot(run.t, run.start_energy + hand + wall, "k", label="both, and the start")
     axes.set(title=method, xlabel="t [s]", ylabel="energy put in [J]")
-    print(f"{method:6}: least energy {run.least(ACTUAL):8.3f} J")
+    print(f"{method:6}: least energy {run.least_energy_sum(ACTUAL):8.3f} J")
 panels[0].legend()

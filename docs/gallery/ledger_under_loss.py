@@ -24,4 +24,4 @@ energy = run.start_energy + run.accounts[:, HAND] + run.accounts[:, ACTUAL]
 below.plot(run.t, 1e3 * energy, "k")
 below.axhline(0, color="red", linewidth=0.8)
 below.set(xlabel="t [s]", ylabel="left in the station [mJ]")
-print(f"least: {1e3 * run.least(ACTUAL):.1f} mJ, never below zero")
+print(f"least: {1e3 * run.least_energy_sum(ACTUAL):.1f} mJ, never below zero")

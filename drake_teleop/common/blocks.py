@@ -69,7 +69,7 @@ MEANINGS = {
 
 
 @njit(cache=True)
-def sound(numbers):
+def all_in_range(numbers):
     """Return whether all numbers are finite and at most `LARGEST` in magnitude."""
     good = True
     for x in numbers:

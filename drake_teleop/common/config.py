@@ -16,7 +16,7 @@ from inspect import cleandoc
 from textwrap import TextWrapper
 from typing import Any, NamedTuple, TypeVar
 
-from drake_teleop.common.errors import DrakeTeleopError, field_place, suggestion
+from drake_teleop.common.errors import DrakeTeleopError, field_place, suggest_name
 from drake_teleop.common.registry import Registry
 
 KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
@@ -85,7 +85,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
 def check_name(schema: type, name: Any, where: str) -> None:
     names = _field_names(schema)
     if name not in names:
-        remedy = suggestion(name, names, f"fields: {', '.join(names)}")
+        remedy = suggest_name(name, names, f"fields: {', '.join(names)}")
         raise DrakeTeleopError("there is no such field", where=where, remedy=remedy)
 
 
@@ -115,7 +115,7 @@ def _check_value(field: Any, kind: Kind, value: Any, place: str) -> None:
         if registry is not None:
             registry.check(value, place, *words)
         elif value not in words:
-            remedy = suggestion(value, words, f"choose one of {', '.join(words)}")
+            remedy = suggest_name(value, words, f"choose one of {', '.join(words)}")
             raise DrakeTeleopError(f"'{value}' is not known", where=place, remedy=remedy)
     elif "unit" in metadata and value is not None:
         _check_range(metadata, value, place)
@@ -220,7 +220,7 @@ def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
-        remedy = suggestion(tag, names, f"use one of !{', !'.join(names)}")
+        remedy = suggest_name(tag, names, f"use one of !{', !'.join(names)}")
         raise DrakeTeleopError(f"'!{tag}' is not known", where=place, remedy=remedy)
     return blocks[names.index(tag) if tag else 0]
 
@@ -293,7 +293,7 @@ class FieldInfo:
     def text(self) -> str:
         metadata = [self.range] if self.range else []
         if self.default is None or self.kind != "block":
-            metadata.append(f"default {_shown(self.default)}")
+            metadata.append(f"default {_format_value(self.default)}")
         return f"{self.name}: {self.meaning}" + (f" ({'; '.join(metadata)})" if metadata else "")
 
 
@@ -321,7 +321,7 @@ def _changed_lines(config: Any) -> Iterator[str]:
             continue
         blocks = value if isinstance(value, list) else [value]
         if not blocks or not dataclasses.is_dataclass(blocks[0]):
-            yield f"{entry.name}: {_shown(value)}"
+            yield f"{entry.name}: {_format_value(value)}"
             continue
         for index, block in enumerate(blocks):
             place = f"{entry.name}[{index}]" if isinstance(value, list) else entry.name
@@ -385,9 +385,9 @@ def _default(entry: dataclasses.Field[Any]) -> Any:
     return entry.default
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, list):
-        return f"[{', '.join(map(_shown, value))}]"
+        return f"[{', '.join(map(_format_value, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
 
 

@@ -78,13 +78,13 @@ def refuse_fork() -> None:
         )
 
 
-def suggestion(name: object, names: Sequence[str], otherwise: str) -> str:
+def suggest_name(name: object, names: Sequence[str], otherwise: str) -> str:
     """Return the remedy for an unknown name: a similar name, or `otherwise`."""
     near = difflib.get_close_matches(str(name), names, n=1)
     return f"did you mean '{near[0]}'?" if near else otherwise
 
 
-def install_extra(name: str) -> str:
+def remedy_to_install_extra(name: str) -> str:
     """Return the remedy for a missing library: installing this package's extra `name`."""
     return f"install the extra `{name}`: pip install '.[{name}]' in the clone of this project"
 
@@ -92,7 +92,7 @@ def install_extra(name: str) -> str:
 def require_library(module: str, library: str, extra: str, where: str) -> None:
     if importlib.util.find_spec(module) is None:
         what = f"needs the library {library}, which is not installed"
-        raise DrakeTeleopError(what, where=where, remedy=install_extra(extra))
+        raise DrakeTeleopError(what, where=where, remedy=remedy_to_install_extra(extra))
 
 
 def field_place(where: str, name: Any) -> str:

@@ -63,7 +63,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, data: Any) -> None:
     """Write indented JSON; non-finite numbers become null."""
-    write_text(path, json.dumps(_finite(data), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(_replace_nonfinite_numbers(data), indent=2, allow_nan=False) + "\n")
 
 
 def write_picture(path: Path, figure: Figure, **options: Any) -> None:
@@ -100,7 +100,7 @@ def output_folder(
     except CannotWrite as error:
         after = _file_states(out)
         existing = [name for name in after if name in kept or before.get(name) != after[name]]
-        raise CannotWrite(str(error), remedy=f"{out} keeps {_listed(existing)}") from error
+        raise CannotWrite(str(error), remedy=f"{out} keeps {_join_names(existing)}") from error
 
 
 def make_folder(folder: Path) -> None:
@@ -114,7 +114,7 @@ def make_folder(folder: Path) -> None:
         raise CannotWrite("is a write-protected folder", where=str(folder), remedy=remedy)
 
 
-def set_aside(*paths: Path) -> Path | None:
+def move_earlier_recordings(*paths: Path) -> Path | None:
     """Move existing recordings into a new folder `earlier-1`, `earlier-2`, ... and return it."""
     existing = [path for path in paths if path.exists()]
     if not existing:
@@ -154,11 +154,11 @@ def _reason(error: OSError) -> str:
     return error.strerror or str(error) or type(error).__name__
 
 
-def _finite(data: Any) -> Any:
+def _replace_nonfinite_numbers(data: Any) -> Any:
     if isinstance(data, dict):
-        return {key: _finite(value) for key, value in data.items()}
+        return {key: _replace_nonfinite_numbers(value) for key, value in data.items()}
     if isinstance(data, (list, tuple)):
-        return [_finite(value) for value in data]
+        return [_replace_nonfinite_numbers(value) for value in data]
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
@@ -171,7 +171,7 @@ def _file_states(folder: Path) -> dict[str, tuple[int, int]]:
     return found
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     if not names:
         return "nothing"
     more = f" and {len(names) - _MAX_LISTED_FILES} more" if len(names) > _MAX_LISTED_FILES else ""

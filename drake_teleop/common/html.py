@@ -12,7 +12,7 @@ from typing import Any
 import jinja2
 
 
-def render(package: str, template: str, **values: Any) -> str:
+def render_page(package: str, template: str, **values: Any) -> str:
     """Return the page of a Jinja template, which may extend page.html.j2.
 
     `values` are escaped; a missing one is an error.
@@ -32,7 +32,7 @@ def render(package: str, template: str, **values: Any) -> str:
     return environment.get_template(template).render(**values)
 
 
-def embedded(path: Path) -> str:
+def png_data_url(path: Path) -> str:
     """Return a PNG file as a data: URL."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
@@ -40,7 +40,7 @@ def embedded(path: Path) -> str:
 _SCRIPT = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
 
 
-def policy(page: str, host: str = "") -> str:
+def content_security_policy(page: str, host: str = "") -> str:
     """Return a page's Content-Security-Policy; `host`: server's "address:port", "" for a file."""
     scripts = (script.replace("\r\n", "\n") for script in _SCRIPT.findall(page))
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)

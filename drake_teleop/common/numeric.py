@@ -14,11 +14,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 Array: TypeAlias = NDArray[np.float64]
 
 
-def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
+def finite_array(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
     """Return a finite float64 array of this shape; `leading` allows more dimensions in front."""
     expected = ", ".join(["..."] * leading + [str(n) for n in shape])
     expected = f"({expected},)" if len(shape) == 1 and not leading else f"({expected})"
-    array = numbers(name, value, f"give an array of shape {expected}")
+    array = float_array(name, value, f"give an array of shape {expected}")
     actual = array.shape[array.ndim - len(shape) :] if leading else array.shape
     if actual != shape:
         raise DrakeTeleopError(f"has shape {array.shape} instead of {expected}", where=name)
@@ -31,7 +31,7 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
     return array
 
 
-def numbers(name: str, value: ArrayLike, remedy: str = "") -> Array:
+def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
     """Return `value` as a float64 array; raise DrakeTeleopError for complex or masked data."""
     try:
         if np.iscomplexobj(value) or np.ma.is_masked(value):
@@ -42,9 +42,11 @@ def numbers(name: str, value: ArrayLike, remedy: str = "") -> Array:
         raise DrakeTeleopError(what, where=name, remedy=remedy) from error
 
 
-def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
+def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
     """Return the common leading shape, and each array (..., n) as a contiguous table (N, n)."""
-    tables = {name: checked(name, value, n, leading=True) for name, (value, n) in arrays.items()}
+    tables = {
+        name: finite_array(name, value, n, leading=True) for name, (value, n) in arrays.items()
+    }
     try:
         leading = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))
     except ValueError as error:
@@ -61,10 +63,12 @@ def _rows(table: Array, shape: tuple[int, ...]) -> Array:
     return np.ascontiguousarray(same).reshape(-1, shape[-1])
 
 
-def number(name: str, value: Any) -> float:
+def to_float(name: str, value: Any) -> float:
     """Return `value` as a float, possibly NaN; raise DrakeTeleopError if not numeric."""
     try:
-        return float(numbers(name, value) if isinstance(value, (np.generic, np.ndarray)) else value)
+        return float(
+            float_array(name, value) if isinstance(value, (np.generic, np.ndarray)) else value
+        )
     except (TypeError, ValueError, OverflowError):
         raise DrakeTeleopError(
             f"expected a number, found {reprlib.repr(value)}", where=name
@@ -81,9 +85,9 @@ def check_identified(name: str, phi: Array) -> Array:
     return phi
 
 
-def positive(name: str, value: ArrayLike, *shape: int) -> Array:
-    """Return an array as `checked`; raise DrakeTeleopError unless all values are positive."""
-    array = checked(name, value, *shape)
+def positive_array(name: str, value: ArrayLike, *shape: int) -> Array:
+    """Return an array as `finite_array`; raise DrakeTeleopError unless all values are positive."""
+    array = finite_array(name, value, *shape)
     if not (array > 0.0).all():
         raise DrakeTeleopError(
             f"has the value {array.min():g}, which is not positive",
@@ -102,7 +106,7 @@ def one_blas_thread() -> AbstractContextManager[object]:
     return limits
 
 
-def runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return the first index of each run of set flags (N,), and the one after its last, (k, 2)."""
     ends = np.zeros(1, bool)
     return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
@@ -110,7 +114,10 @@ def runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
     times = np.asarray(t, float)
-    return [(float(times[a]), float(times[b - 1])) for a, b in runs(np.asarray(contact, bool))]
+    return [
+        (float(times[a]), float(times[b - 1]))
+        for a, b in find_runs_of_true(np.asarray(contact, bool))
+    ]
 
 
 def narrowest_half(x: Array) -> tuple[Array, Array]:

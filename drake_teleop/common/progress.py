@@ -14,7 +14,7 @@ Stage: TypeAlias = Callable[[str], Progress]
 """Function that begins a stage of work by its name, and returns its `Progress`."""
 
 
-def silent(name: str) -> Progress:
+def show_no_progress(name: str) -> Progress:
     """Return a progress function that shows nothing."""
     return lambda fraction, words="": None
 
@@ -25,7 +25,7 @@ def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Sta
     if callable(progress):
         yield progress
     elif not progress:
-        yield silent
+        yield show_no_progress
     elif not _is_interactive():
         yield _line_stages(after)
     else:

@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
-from drake_teleop.common.errors import DrakeTeleopError, suggestion
+from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 
 _Part = TypeVar("_Part")
 _SCRIPTS = "DRAKE_TELEOP_REGISTER"  # paths, which the processes of a study inherit
@@ -63,7 +63,7 @@ class Registry(dict[str, _Part]):
         if isinstance(name, str) and (name in others or name in self):
             return name
         names = (*others, *self)
-        remedy = suggestion(name, names, f"choose one of {', '.join(names)}, or register it")
+        remedy = suggest_name(name, names, f"choose one of {', '.join(names)}, or register it")
         raise DrakeTeleopError(f"there is no {self.kind} {name!r}", where=where, remedy=remedy)
 
     def __contains__(self, name: object) -> bool:

@@ -53,7 +53,7 @@ def nearest_rotation(R: Array) -> Array:
     return R
 
 
-def quaternions(R: Array) -> Array:
+def quaternions_of(R: Array) -> Array:
     """Return quaternions (N, 4) [w, x, y, z] of rotations (N, 3, 3), with either sign."""
     from scipy.spatial.transform import Rotation
 

@@ -178,7 +178,7 @@ class _NodeConverter:
             return self._mapping(node, place)
         if isinstance(node, yaml.SequenceNode):
             if node.tag != f"{_TAG_PREFIX}seq":
-                raise _error(f"a list takes no tag {_shown(node.tag)}", node, place)
+                raise _error(f"a list takes no tag {_quote_value(node.tag)}", node, place)
             return [self.data(item, f"{place}[{i}]") for i, item in enumerate(node.value)]
         return _scalar(node, place)
 
@@ -186,7 +186,7 @@ class _NodeConverter:
         found: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
-                raise _error(f"a field's name is a word, not {_shown(key.value)}", key, place)
+                raise _error(f"a field's name is a word, not {_quote_value(key.value)}", key, place)
             field = field_place(place, key.value)
             if key.value in found:
                 raise _error("is defined twice", key, field)
@@ -195,7 +195,7 @@ class _NodeConverter:
             found[key.value] = self.data(value, field)
         if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
             if not self._tagged:
-                raise _error(f"the tag {_shown(node.tag)} is not allowed here", node, place)
+                raise _error(f"the tag {_quote_value(node.tag)} is not allowed here", node, place)
             found["_tag"] = node.tag
         return found
 
@@ -205,7 +205,9 @@ def _scalar(node: Any, place: str) -> Any:
     if kind == "str":
         return text
     if kind not in _PATTERNS or not _PATTERNS[kind].match(text):
-        raise _error(f"{_shown(text)} does not match the tag {_shown(node.tag)}", node, place)
+        raise _error(
+            f"{_quote_value(text)} does not match the tag {_quote_value(node.tag)}", node, place
+        )
     if kind == "null":
         return None
     if kind == "bool":
@@ -215,7 +217,7 @@ def _scalar(node: Any, place: str) -> Any:
     digits = text.lstrip("+-")
     if digits.startswith("0") and digits != "0":
         remedy = f"write {digits.lstrip('0') or 0}, or '{text}' in quotes for a word"
-        raise _error(f"{_shown(text)} may be octal", node, place, remedy)
+        raise _error(f"{_quote_value(text)} may be octal", node, place, remedy)
     if len(digits) > _MAX_INTEGER_DIGITS:
         raise _error(f"an integer of {len(digits)} digits is too long", node, place)
     return int(text)
@@ -226,5 +228,5 @@ def _error(what: str, node: Any, place: str, remedy: str = "") -> DrakeTeleopErr
     return DrakeTeleopError(f"{what} (line {line})", where=place, remedy=remedy)
 
 
-def _shown(text: Any) -> str:
+def _quote_value(text: Any) -> str:
     return reprlib.repr(text.removeprefix(_TAG_PREFIX) if isinstance(text, str) else "a list")

@@ -15,19 +15,19 @@ from drake_teleop.common.compiled import njit
 
 
 @register_jitable
-def three(x, i):
+def vector_at(x, i):
     """Return the 3 numbers of x from index i as a vector."""
     return x[i], x[i + 1], x[i + 2]
 
 
 @register_jitable
-def nine(x, i):
+def matrix_at(x, i):
     """Return the 9 numbers of x from index i as a rotation matrix."""
     return x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5], x[i + 6], x[i + 7], x[i + 8]
 
 
 @register_jitable
-def rows(R):
+def matrix_as_tuple(R):
     """Return a matrix (3, 3) as a tuple of 9 numbers, by rows."""
     return R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
 
@@ -46,7 +46,7 @@ def add_into(x, i, a):
 
 
 @register_jitable
-def put(x, i, a, j, n):
+def copy_into(x, i, a, j, n):
     """Copy n numbers from index j of a to index i of x."""
     for k in range(n):
         x[i + k] = a[j + k]
@@ -63,7 +63,7 @@ def minus(a, b):
 
 
 @register_jitable
-def times(k, a):
+def scale_vector(k, a):
     return k * a[0], k * a[1], k * a[2]
 
 
@@ -78,7 +78,7 @@ def cross(a, b):
 
 
 @register_jitable
-def plus_cross(c, a, b):
+def add_cross_product(c, a, b):
     return (
         c[0] + a[1] * b[2] - a[2] * b[1],
         c[1] + a[2] * b[0] - a[0] * b[2],
@@ -87,7 +87,7 @@ def plus_cross(c, a, b):
 
 
 @register_jitable
-def apply(R, a):
+def apply_matrix(R, a):
     """Return the vector R a for any matrix R of 9 numbers."""
     return (
         R[0] * a[0] + R[1] * a[1] + R[2] * a[2],
@@ -97,7 +97,7 @@ def apply(R, a):
 
 
 @register_jitable
-def symmetric(x, i):
+def symmetric_at(x, i):
     """Return the symmetric matrix (9 numbers) of xx, xy, xz, yy, yz, zz from index i of x."""
     xx, xy, xz, yy, yz, zz = x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5]
     return xx, xy, xz, xy, yy, yz, xz, yz, zz
@@ -115,7 +115,7 @@ def cholesky(M, n):
 
 
 @register_jitable(inline="always")
-def solve(M, b, n):
+def solve_by_cholesky(M, b, n):
     """Replace b (n,) by M^-1 b, and M (n, n) as in `cholesky`."""
     cholesky(M, n)
     for i in range(n):
@@ -137,7 +137,7 @@ def cross_matrix(a: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def multiply(a, b):
+def quaternion_product(a, b):
     """Return the quaternion product a b, with R(a b) = R(a) R(b)."""
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -148,19 +148,19 @@ def multiply(a, b):
 
 
 @njit(cache=True)
-def conjugate(a):
+def conjugate_quaternion(a):
     return (a[0], -a[1], -a[2], -a[3])
 
 
 @njit(cache=True)
-def rotate(a, v):
-    axis = three(a, 1)
-    t = times(2.0, cross(axis, v))
-    return plus_cross(plus(v, times(a[0], t)), axis, t)
+def rotate_vector(a, v):
+    axis = vector_at(a, 1)
+    t = scale_vector(2.0, cross(axis, v))
+    return add_cross_product(plus(v, scale_vector(a[0], t)), axis, t)
 
 
 @njit(cache=True)
-def exponential(v):
+def quaternion_exponential(v):
     """Return the quaternion of a rotation vector [rad]."""
     angle = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     half = 0.5 * angle
@@ -170,7 +170,7 @@ def exponential(v):
 
 
 @njit(cache=True)
-def logarithm(a):
+def quaternion_logarithm(a):
     """Return the rotation vector [rad] of a quaternion, |v| <= pi; it is equal for a and -a."""
     sine = math.sqrt(a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     scale = 2.0 * math.atan2(sine, abs(a[0])) / sine if sine > 1e-12 else 2.0
@@ -180,7 +180,7 @@ def logarithm(a):
 
 
 @njit(cache=True)
-def normalized(a):
+def normalized_quaternion(a):
     scale = 1.0 / math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     return (scale * a[0], scale * a[1], scale * a[2], scale * a[3])
 
@@ -213,4 +213,4 @@ def quaternion_of(R):
             R[1, 2] + R[2, 1],
             1.0 + 2.0 * R[2, 2] - trace,
         )
-    return normalized(a)
+    return normalized_quaternion(a)

@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.numeric import Array, check_identified, contact_spans
-from drake_teleop.common.vectors import conjugate, logarithm, multiply
+from drake_teleop.common.vectors import (
+    conjugate_quaternion,
+    quaternion_logarithm,
+    quaternion_product,
+)
 from drake_teleop.lab.identification import sensor_samples, slave_arm
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -143,7 +147,9 @@ def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]
     for signal in (name for name in result.signals if name.startswith(POSE_OF)):
         name, first, last = signal.removeprefix(POSE_OF), *result[signal][[0, -1]]
         displacements[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
-        rotation = logarithm(multiply(tuple(last[:4]), conjugate(tuple(first[:4]))))
+        rotation = quaternion_logarithm(
+            quaternion_product(tuple(last[:4]), conjugate_quaternion(tuple(first[:4])))
+        )
         rotations[name] = float(np.degrees(np.linalg.norm(rotation)))
     return {"moved_mm": displacements, "turned_deg": rotations} if displacements else {}
 

@@ -12,7 +12,11 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import conjugate, logarithm, multiply
+from drake_teleop.common.vectors import (
+    conjugate_quaternion,
+    quaternion_logarithm,
+    quaternion_product,
+)
 from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
@@ -116,7 +120,9 @@ class DeviceLink:
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
         first = self._origin
-        turn = logarithm(multiply(state.orientation, conjugate(first.orientation)))
+        turn = quaternion_logarithm(
+            quaternion_product(state.orientation, conjugate_quaternion(first.orientation))
+        )
         values: dict[str, float] = {"held": 1}
         for k, name in enumerate("xyz"):
             values[name] = (state.position[k] - first.position[k]) / LENGTH

@@ -15,9 +15,14 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply
+from drake_teleop.common.vectors import (
+    conjugate_quaternion,
+    quaternion_exponential,
+    quaternion_logarithm,
+    quaternion_product,
+)
 from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master_side import CLUTCH_PERIOD
@@ -47,7 +52,7 @@ def _pose_on_path(path, time, out):
     share = min(max((time - path[_START_TIME]) / TICK, 0.0), 1.0)
     r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
     start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
-    rotation = multiply(exponential(r), start)
+    rotation = quaternion_product(quaternion_exponential(r), start)
     moves = 1.0 / TICK if share < 1.0 else 0.0
     for k in range(4):
         out[k] = rotation[k]
@@ -60,7 +65,7 @@ def _pose_on_path(path, time, out):
 @njit(cache=True)
 def _display_step(wrench, held, period, limits, last, now):
     fault = 0.0
-    if not sound(wrench):
+    if not all_in_range(wrench):
         fault = _WRENCH
     enabled = held and fault == 0.0
     change = _RETURN if enabled else -1.0 / _FADE_S
@@ -129,7 +134,9 @@ class ExternalMaster(LeafSystem):
         path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:
             path[_HELD], path[_DISPLACEMENT:_ROTATION] = 1.0, target[4:] - now[4:7]
-            path[_ROTATION:] = logarithm(multiply(tuple(target[:4]), conjugate(tuple(now[:4]))))
+            path[_ROTATION:] = quaternion_logarithm(
+                quaternion_product(tuple(target[:4]), conjugate_quaternion(tuple(now[:4])))
+            )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:

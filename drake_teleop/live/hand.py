@@ -18,16 +18,16 @@ from pydrake.systems.framework import (
 from drake_teleop.common.blocks import ONE_DICT
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import (
-    conjugate,
+    add_cross_product,
+    conjugate_quaternion,
+    copy_into,
     cross,
-    exponential,
-    logarithm,
-    multiply,
     plus,
-    plus_cross,
-    put,
-    three,
-    times,
+    quaternion_exponential,
+    quaternion_logarithm,
+    quaternion_product,
+    scale_vector,
+    vector_at,
 )
 from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master_side import MakeMasterSide
@@ -81,7 +81,7 @@ def _intention_into(path, time, pose, out):
         r[k] = (path[_ROTATION + k] + turning * t) * turning_decay
         rate[k] = (path[_ROTATION + 3 + k] - _ROTATION_POLE * turning * t) * turning_decay
     target = (path[_TARGET], path[_TARGET + 1], path[_TARGET + 2], path[_TARGET + 3])
-    orientation = multiply(exponential((r[0], r[1], r[2])), target)
+    orientation = quaternion_product(quaternion_exponential((r[0], r[1], r[2])), target)
     for k in range(4):
         out[k] = orientation[k]
     # omega = rate + a r x rate + b r x (r x rate)
@@ -106,15 +106,15 @@ def _rotation_vector_rate(r, omega):
         angle = math.sqrt(square)
         c = 1.0 / square - math.sin(angle) / (2.0 * angle * (1.0 - math.cos(angle)))
     across = cross(r, omega)
-    return plus_cross(plus(omega, times(-0.5, across)), times(c, r), across)
+    return add_cross_product(plus(omega, scale_vector(-0.5, across)), scale_vector(c, r), across)
 
 
 @njit(cache=True)
 def _path_into(path, time, now, target, poles):
     path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
-    put(path, _TARGET, target, 0, 7)
-    rotation = logarithm(multiply(now, conjugate(target)))
-    rate = _rotation_vector_rate(rotation, three(now, 10))
+    copy_into(path, _TARGET, target, 0, 7)
+    rotation = quaternion_logarithm(quaternion_product(now, conjugate_quaternion(target)))
+    rate = _rotation_vector_rate(rotation, vector_at(now, 10))
     for k in range(3):
         path[_OFFSET + k], path[_OFFSET + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
         path[_OFFSET + 6 + k] = now[13 + k]
@@ -175,14 +175,18 @@ class LiveHand(Operator):
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
         intention = self._present_intention(context)
-        rotation = np.array(logarithm(multiply(tuple(intention[:4]), conjugate(tuple(pose[:4])))))
+        rotation = np.array(
+            quaternion_logarithm(
+                quaternion_product(tuple(intention[:4]), conjugate_quaternion(tuple(pose[:4])))
+            )
+        )
         rotation *= before.rotational_stiffness / after.rotational_stiffness
         displacement = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
         damping = np.repeat(
             [before.damping / after.damping, before.rotational_damping / after.rotational_damping],
             3,
         )
-        intention[:4] = multiply(exponential(tuple(rotation)), tuple(pose[:4]))
+        intention[:4] = quaternion_product(quaternion_exponential(tuple(rotation)), tuple(pose[:4]))
         intention[4:7] = pose[4:] + displacement
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text
-from drake_teleop.common.vectors import exponential, logarithm
+from drake_teleop.common.vectors import quaternion_exponential, quaternion_logarithm
 from drake_teleop.common.version import __version__
 from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.station.operator.operator import GRIPS
@@ -145,12 +145,12 @@ class Inputs:
         """Return the intended pose X_BE (7,) of the stylus; None if released."""
         if not self.held:
             return None
-        turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
+        turn = quaternion_exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def holding(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
-        turn = logarithm(tuple(pose[:4]))
+        turn = quaternion_logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
         return self.changed({name: float(x) for name, x in (*places, *turns)} | {"held": 1})

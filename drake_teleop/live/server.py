@@ -34,7 +34,7 @@ from websockets.http11 import Request, Response
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder
-from drake_teleop.common.html import policy
+from drake_teleop.common.html import content_security_policy
 from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import Cockpit
@@ -304,7 +304,7 @@ class LiveDrive:
             return None
         if path == "/":
             page = self._page()
-            content_policy = policy(page, host)
+            content_policy = content_security_policy(page, host)
             return _make_response(
                 HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), content_policy
             )

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, checked_rows, number
-from drake_teleop.common.vectors import add_into, cross, minus, plus, three, times
+from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, to_float
+from drake_teleop.common.vectors import add_into, cross, minus, plus, scale_vector, vector_at
 from drake_teleop.load.regressor import wrench_of_load
 
 
@@ -32,17 +32,19 @@ def wrench_of_scales(
         a * phi_gripper[9] + b * phi_object[9],
     )
     force, torque = wrench_of_load(s, omega, alpha, phi)
-    force = plus(force, times(gamma, minus(three(wrench, 0), three(offsets, 0))))
-    return force, plus(torque, times(gamma, minus(three(wrench, 3), three(offsets, 3))))
+    force = plus(force, scale_vector(gamma, minus(vector_at(wrench, 0), vector_at(offsets, 0))))
+    return force, plus(
+        torque, scale_vector(gamma, minus(vector_at(wrench, 3), vector_at(offsets, 3)))
+    )
 
 
 @register_jitable
 def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
     """Return force and torque of V(-g) (excess_gripper phi_gripper + excess_object phi_object)."""
     a, b = excess_gripper, excess_object
-    up = times(-1.0, three(gravity, 0))
-    h = plus(times(a, three(phi_gripper, 1)), times(b, three(phi_object, 1)))
-    return times(a * phi_gripper[0] + b * phi_object[0], up), cross(h, up)
+    up = scale_vector(-1.0, vector_at(gravity, 0))
+    h = plus(scale_vector(a, vector_at(phi_gripper, 1)), scale_vector(b, vector_at(phi_object, 1)))
+    return scale_vector(a * phi_gripper[0] + b * phi_object[0], up), cross(h, up)
 
 
 @njit(cache=True)
@@ -97,7 +99,7 @@ def contact_wrench(
             [SI].
         phi: (10,) load about So in S.
     """
-    phis = checked("phi", phi, 10), np.zeros(10)
+    phis = finite_array("phi", phi, 10), np.zeros(10)
     scales = {"sigma_gripper": 0.0, "sigma_object": 0.0, "gamma": 1.0}
     return scaled_wrench(wrench, offsets, s, omega, alpha, *phis, **scales)
 
@@ -142,14 +144,16 @@ def scaled_wrench(
     scales = [*inertias, _scale("gamma", gamma)]
     if weights != inertias and gravity is None:
         raise unknown_gravity("gravity", "pass gravity, g in S, for each sample")
-    phis = checked("phi_gripper", phi_gripper, 10), checked("phi_object", phi_object, 10)
-    leading, rows = checked_rows(
+    phis = finite_array("phi_gripper", phi_gripper, 10), finite_array("phi_object", phi_object, 10)
+    leading, rows = broadcast_to_rows(
         wrench=(wrench, 6), offsets=(offsets, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
     )
     out = np.empty_like(rows[0])
     _scaled_wrenches(*rows, *phis, *scales, out)
     if weights != inertias and gravity is not None:
-        _, (down, _) = checked_rows(gravity=(gravity, 3), wrench=(rows[0].reshape(*leading, 6), 6))
+        _, (down, _) = broadcast_to_rows(
+            gravity=(gravity, 3), wrench=(rows[0].reshape(*leading, 6), 6)
+        )
         excess = [weight - inertia for weight, inertia in zip(weights, inertias, strict=True)]
         _add_weights(down, *phis, *excess, out)
     return out.reshape(*leading, 6)
@@ -174,7 +178,7 @@ def unknown_gravity(where: str, remedy: str) -> DrakeTeleopError:
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
     """Return the scales that remove the gripper and keep the share eta of the object, Eq. (14)."""
-    if not 0.0 <= number("eta", eta) <= 1.0:
+    if not 0.0 <= to_float("eta", eta) <= 1.0:
         raise DrakeTeleopError(
             f"{eta:g} is outside 0 to 1",
             where="eta",
@@ -184,7 +188,7 @@ def scales_from_eta(eta: float) -> tuple[float, float, float]:
 
 
 def _scale(name: str, value: float) -> float:
-    if not 0.0 <= number(name, value) < np.inf:
+    if not 0.0 <= to_float(name, value) < np.inf:
         raise DrakeTeleopError(
             f"{value} is not a finite number >= 0",
             where=name,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.files import write_json
-from drake_teleop.common.numeric import Array, check_identified, checked
+from drake_teleop.common.numeric import Array, check_identified, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
 
 VERDICTS = ("identified", "weakly", "not", "prior")
@@ -66,8 +66,8 @@ class Identification:
     prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
 
     def __post_init__(self) -> None:
-        check_identified("phi", checked("phi", self.phi, 10))
-        checked("offsets", self.offsets, 6)
+        check_identified("phi", finite_array("phi", self.phi, 10))
+        finite_array("offsets", self.offsets, 6)
 
     @property
     def mass(self) -> float:
@@ -132,7 +132,7 @@ class Identification:
             DrakeTeleopError: if a number is not finite or the file cannot be written.
         """
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
-            checked(f"{path}:{name}", getattr(self, name), *shape)
+            finite_array(f"{path}:{name}", getattr(self, name), *shape)
         covariance = self.covariance.tolist()
         for i in np.flatnonzero(np.isinf(np.diag(self.covariance))):
             covariance[i][i] = None
@@ -175,7 +175,7 @@ class Identification:
         def numbers(name: str, *shape: int, largest: float = np.inf) -> Array:
             if not _only_numbers(document[name]):
                 raise _file_error("contains values that are not numbers", f"{path}:{name}")
-            array = checked(f"{path}:{name}", document[name], *shape)
+            array = finite_array(f"{path}:{name}", document[name], *shape)
             if np.abs(array).max() > largest:
                 raise _file_error(f"has an absolute value above {largest:g}", f"{path}:{name}")
             return array
@@ -245,7 +245,7 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
     return np.where(unknown[0] | unknown[1:], np.inf, np.sqrt(np.maximum(squares, 0.0)))
 
 
-def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
+def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
     return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
@@ -286,7 +286,7 @@ def _read_covariance(where: str, value: Any) -> Array:
     unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
     if not _only_numbers(raw[~unknown].tolist()):
         raise _file_error("contains values that are not numbers", where)
-    covariance = checked(where, np.where(unknown, 0.0, raw), 16, 16)
+    covariance = finite_array(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
         raise _file_error("has a negative variance", where)
     return np.where(unknown, np.inf, covariance)
@@ -313,7 +313,7 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
 def _read_degrees(where: str, value: Any) -> Array:
     if not (isinstance(value, list) and _only_numbers([v for v in value if v is not None])):
         raise _file_error("is not a list of 16 numbers or null", where)
-    degrees = checked(where, [0.0 if v is None else v for v in value], 16)
+    degrees = finite_array(where, [0.0 if v is None else v for v in value], 16)
     unknown = np.array([v is None for v in value])
     if not (degrees[~unknown] > 0.0).all():
         raise _file_error("has a value that is not positive", where)
@@ -341,7 +341,7 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
             where="gripper",
             remedy="give the gripper alone as gripper, and the record with the object as the load",
         )
-    identifiable = worth_stating(deviations, phi) & ~undetermined
+    identifiable = is_precise_enough(deviations, phi) & ~undetermined
     identifiable[6:] &= total.identifiable[6:]
     return replace(
         total,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked
+from drake_teleop.common.numeric import Array, finite_array
 
 # Tolerance for rounding, so that rods, plates and points are consistent.
 _ROUNDING = 1e-12
@@ -23,9 +23,9 @@ def _point_inertia(about: Array, mass: float) -> Array:
 
 
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:
-    m = float(checked("mass", mass))
-    p = checked("p_SoBcm_S", p_SoBcm_S, 3)
-    I = checked("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
+    m = float(finite_array("mass", mass))
+    p = finite_array("p_SoBcm_S", p_SoBcm_S, 3)
+    I = finite_array("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
     if np.abs(I - I.T).max() > 1e-9 * np.abs(I).max():
         raise DrakeTeleopError(
             "the inertia tensor is not symmetric",
@@ -38,7 +38,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
 
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
     """Return mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m^2], all in S."""
-    phi = checked("phi", phi, 10)
+    phi = finite_array("phi", phi, 10)
     m = float(phi[0])
     if m == 0.0:
         raise DrakeTeleopError(
@@ -51,13 +51,13 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
 
 
 def inertia_about_origin(phi: ArrayLike) -> Array:
-    xx, xy, xz, yy, yz, zz = checked("phi", phi, 10)[4:]
+    xx, xy, xz, yy, yz, zz = finite_array("phi", phi, 10)[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def pseudo_inertia(phi: ArrayLike) -> Array:
     """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1)."""
-    phi = checked("phi", phi, 10)
+    phi = finite_array("phi", phi, 10)
     I = inertia_about_origin(phi)  # noqa: E741
     J = np.empty((4, 4))
     J[:3, :3] = 0.5 * np.trace(I) * np.eye(3) - I
@@ -67,7 +67,7 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 
 
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
-    J = checked("J", J, 4, 4)
+    J = finite_array("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
         raise DrakeTeleopError(
             "the pseudo-inertia is not symmetric", where="J", remedy="give, say, (J + J.T) / 2"
@@ -97,7 +97,7 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:
     """Return the load (10,) about Ao in frame A, from the load about Bo in frame B, Eq. (T2)."""
-    R = checked("R_AB", R_AB, 3, 3)
+    R = finite_array("R_AB", R_AB, 3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
         raise DrakeTeleopError(
             "is not a rotation matrix",
@@ -106,6 +106,6 @@ def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Arr
         )
     T = np.eye(4)
     T[:3, :3] = R
-    T[:3, 3] = checked("p_AoBo_A", p_AoBo_A, 3)
+    T[:3, 3] = finite_array("p_AoBo_A", p_AoBo_A, 3)
     J = T @ pseudo_inertia(phi_B) @ T.T
     return phi_from_pseudo_inertia(0.5 * (J + J.T))

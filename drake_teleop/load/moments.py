@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, checked_rows, positive
+from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
 from drake_teleop.load.regressor import regressor
 
 _MAX_BLOCKS = 1024
@@ -46,7 +46,7 @@ class Noise:
     motion: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        walk = checked("noise.walk", np.broadcast_to(self.walk, 12), 12)
+        walk = finite_array("noise.walk", np.broadcast_to(self.walk, 12), 12)
         if (walk < 0.0).any():
             raise DrakeTeleopError(
                 f"has the negative value {walk.min():g}",
@@ -55,7 +55,7 @@ class Noise:
             )
         rows = []
         for name in ("s", "omega", "alpha"):
-            std = checked(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
+            std = finite_array(f"noise.{name}", np.broadcast_to(getattr(self, name), 3), 3)
             if (std < 0.0).any():
                 raise DrakeTeleopError(
                     f"has the negative value {std.min():g}",
@@ -65,7 +65,7 @@ class Noise:
             rows.append(std)
         object.__setattr__(self, "motion", np.stack(rows))
         if self.wrench is not None:
-            positive("noise.wrench", self.wrench, 6)
+            positive_array("noise.wrench", self.wrench, 6)
 
 
 class Moments:
@@ -99,9 +99,11 @@ class Moments:
         weights: ArrayLike | None = None,
     ) -> None:
         """Add N samples, or a single one, with arguments as for `identify` and `weights` (N,)."""
-        _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+        _, rows = broadcast_to_rows(
+            wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
+        )
         n = rows[0].shape[0]
-        weight = np.ones(n) if weights is None else checked("weights", weights, n)
+        weight = np.ones(n) if weights is None else finite_array("weights", weights, n)
         for start in range(0, n, CHUNK):
             part = np.zeros((19, 19))
             chunk = (table[start : start + CHUNK] for table in (*rows, weight))

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtrc
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, number, positive
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.common.numeric import Array, finite_array, positive_array, to_float
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
     Moments,
     coefficients,
@@ -47,7 +47,7 @@ class NormalEquations(Moments):
     ) -> None:
         super().__init__()
         self._resolution = resolution
-        self._weights = np.ones(6) if noise is None else positive("noise", noise, 6) ** -2.0
+        self._weights = np.ones(6) if noise is None else positive_array("noise", noise, 6) ** -2.0
 
     def solve(self, delay_s: float = 0.0) -> Identification:
         inverse, undetermined, condition_number = self._pseudo_inverse()
@@ -65,9 +65,9 @@ class NormalEquations(Moments):
             phi=theta[6:],
             offsets=theta[:6],
             covariance=covariance,
-            identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
+            identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
-            delay_s=number("delay_s", delay_s),
+            delay_s=to_float("delay_s", delay_s),
             residual_rms=np.sqrt(self.residual_squares(theta) / self.samples),
             method="batch least squares",
             samples=int(self.samples),
@@ -97,7 +97,7 @@ class NormalEquations(Moments):
         return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-        weights = self._weights if weights is None else checked("weights", weights, 6)
+        weights = self._weights if weights is None else finite_array("weights", weights, 6)
         return normal_equations(self._sums, np.diag(weights))
 
     def _channel_grams(self) -> Array:
@@ -113,13 +113,13 @@ class NormalEquations(Moments):
         return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
-        squares = np.diag(residual_covariance(self._sums, checked("theta", theta, 16)))
+        squares = np.diag(residual_covariance(self._sums, finite_array("theta", theta, 16)))
         return np.maximum(squares, 0.0)
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
         """Return residual variances (6,) with correlation in time, and their degrees of freedom."""
         inverse, _, _ = self._pseudo_inverse()
-        return self._long_run_variances(checked("theta", theta, 16), inverse)[:2]
+        return self._long_run_variances(finite_array("theta", theta, 16), inverse)[:2]
 
     def slow_noise(self) -> NDArray[np.bool_]:
         """Return (6,) True for wrench channels whose noise is slower than the record resolves."""

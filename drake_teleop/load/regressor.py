@@ -13,8 +13,15 @@ from numba.extending import register_jitable
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.numeric import Array, checked, checked_rows
-from drake_teleop.common.vectors import apply, cross, plus, symmetric, three, times
+from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array
+from drake_teleop.common.vectors import (
+    apply_matrix,
+    cross,
+    plus,
+    scale_vector,
+    symmetric_at,
+    vector_at,
+)
 
 WRENCH = slice(0, 6)
 SPECIFIC_FORCE = slice(6, 9)
@@ -56,10 +63,10 @@ def regressor_into(s, omega, alpha, V):
 @register_jitable
 def wrench_of_load(s, omega, alpha, phi):
     """Return the force and the torque of V phi as tuples, for scalars of any type."""
-    s, omega, alpha = three(s, 0), three(omega, 0), three(alpha, 0)
-    m, h, inertia = phi[0], three(phi, 1), symmetric(phi, 4)  # h = m c
-    force = plus(plus(times(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
-    torque = plus(apply(inertia, alpha), cross(omega, apply(inertia, omega)))
+    s, omega, alpha = vector_at(s, 0), vector_at(omega, 0), vector_at(alpha, 0)
+    m, h, inertia = phi[0], vector_at(phi, 1), symmetric_at(phi, 4)  # h = m c
+    force = plus(plus(scale_vector(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
+    torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))
     return force, plus(torque, cross(h, s))
 
 
@@ -90,7 +97,7 @@ def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
         omega: (..., 3) angular velocity of S, in S [rad/s].
         alpha: (..., 3) angular acceleration of S, in S [rad/s^2].
     """
-    leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    leading, motion = broadcast_to_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     V = np.empty((motion[0].shape[0], 6, 10))
     _regressors(*motion, V)
     return V.reshape(*leading, 6, 10)
@@ -101,8 +108,8 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
 
     It acts on the load, about So, in S. Arguments as for `regressor`; phi (10,) about So in S.
     """
-    phi = checked("phi", phi, 10)
-    leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    phi = finite_array("phi", phi, 10)
+    leading, motion = broadcast_to_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     out = np.empty((motion[0].shape[0], 6))
     _non_contact_wrenches(*motion, phi, out)
     return out.reshape(*leading, 6)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, narrowest_half, runs
+from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half
 from drake_teleop.load.contact.detection import (
     MAX_NOISE_LEVEL,
     ContactDetector,
@@ -189,7 +189,7 @@ def _extrapolated(values: Array, block: int, samples: int) -> float:
 
 
 def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
-    for _, stop in runs(touched):
+    for _, stop in find_runs_of_true(touched):
         if stop < len(touched):
             touched[stop - hold : stop] = False
     return touched
@@ -198,7 +198,7 @@ def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
 def _remove_marginal(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
-    for start, stop in runs(touched):
+    for start, stop in find_runs_of_true(touched):
         if 2 * (stop - start) < hold and values[start:stop].max() < MARGIN * threshold:
             touched[start:stop] = False
 
@@ -271,7 +271,7 @@ def _quiet(contact: Array, floor: Array) -> NDArray[np.bool_]:
 def contacts_of(t: Array, contact: Array, touched: NDArray[np.bool_]) -> list[dict[str, Any]]:
     """Return times [s], peaks [N, N m], direction and point (in S) of each contact."""
     rows = []
-    for start, stop in runs(touched):
+    for start, stop in find_runs_of_true(touched):
         wrench = contact[start:stop]
         forces = np.linalg.norm(wrench[:, :3], axis=1)
         direction, point, _ = wrench_axis(wrench[np.argmax(forces)])

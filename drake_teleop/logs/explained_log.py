@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import yaml_data
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
@@ -272,7 +272,7 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
     share = why.state.data.alpha_noise_share
     extra[10:] = np.hypot(extra[10:], share * np.abs(load.phi[[4, 7, 9]]).max())
     covariance = load.covariance + np.diag(extra**2)
-    known = load.identifiable & worth_stating(np.sqrt(np.diag(covariance)), load.phi)
+    known = load.identifiable & is_precise_enough(np.sqrt(np.diag(covariance)), load.phi)
     return replace(load, covariance=covariance, identifiable=known)
 
 
@@ -286,10 +286,10 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
         if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MAX_DEVIATION_RATIO:
             return load
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
-        known = load.identifiable & worth_stating(np.sqrt(np.diag(wide)), load.phi)
+        known = load.identifiable & is_precise_enough(np.sqrt(np.diag(wide)), load.phi)
         return replace(load, covariance=wide, identifiable=known)
     deviations = np.sqrt(np.diag(why.covariance))
-    identifiable = worth_stating(deviations, why.theta[6:])
+    identifiable = is_precise_enough(deviations, why.theta[6:])
     if why.causes and why.causes[0].name == "no load":
         identifiable = np.repeat([True, False], [6, 10])
     if why.several_gains:

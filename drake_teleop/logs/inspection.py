@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
-from drake_teleop.common.numeric import Array, runs
+from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
@@ -317,7 +317,7 @@ def _labels(columns: Sequence[str], table: Table) -> list[str]:
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
-    return int(np.diff(runs(flags)).max(initial=0))
+    return int(np.diff(find_runs_of_true(flags)).max(initial=0))
 
 
 def _saturated(x: Array, same: NDArray[np.bool_]) -> int:

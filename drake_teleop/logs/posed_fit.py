@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import clock_note, motion_and_load, use_spline_motion
@@ -116,7 +116,7 @@ def _fit(
         phi=theta[6:],
         offsets=theta[:6],
         covariance=covariance,
-        identifiable=worth_stating(np.sqrt(np.diag(covariance)), theta[6:]),
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
         residual_rms=noise,
         method=METHODS[method].name,
     )

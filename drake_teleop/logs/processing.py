@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, number, one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread, to_float
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import (
@@ -579,7 +579,7 @@ def _scales(
 ) -> dict[str, float | None]:
     given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
     for name, value in given.items():
-        if value is not None and not 0.0 <= number(name, value) <= _LARGEST_SCALE:
+        if value is not None and not 0.0 <= to_float(name, value) <= _LARGEST_SCALE:
             raise DrakeTeleopError(
                 f"{value:g} is outside 0 to {_LARGEST_SCALE:g}",
                 where=name,

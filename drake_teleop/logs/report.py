@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.files import write_text
-from drake_teleop.common.html import embedded, render
+from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
@@ -102,7 +102,7 @@ def write_report(
     if summary["rejected"] > 0:
         samples += f"; {summary['rejected']:.1%} of them rejected as disturbed, shaded below"
     spectrum = "each pose" if log.static else "each frequency"
-    page = render(
+    page = render_page(
         "drake_teleop.logs",
         "report.html.j2",
         name=Path(summary["log"]).name,
@@ -114,12 +114,12 @@ def write_report(
         figures=[
             (
                 "Fit",
-                embedded(path.parent / "fit.png"),
+                png_data_url(path.parent / "fit.png"),
                 "Measured wrench and V φ, both without offsets, and their difference.",
             ),
             (
                 "Residual, intervals and identifiability",
-                embedded(path.parent / "knowledge.png"),
+                png_data_url(path.parent / "knowledge.png"),
                 f"Top: the residual at {spectrum}. Below: each parameter with its interval, and "
                 "its standard deviation, relative to a typical value for a load of this mass and "
                 "size: identified up to 5 %, weakly identified up to 50 %, else not identified.",

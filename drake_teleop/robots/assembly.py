@@ -13,7 +13,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.rotations import quaternions, rotation_matrices
+from drake_teleop.common.rotations import quaternions_of, rotation_matrices
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.logs.aligned_log import missing_orientation_error
@@ -286,7 +286,7 @@ class MotionWindow:
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
     """Return the pose (7,), [w x y z, position], of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
     R = rotation_matrices(np.radians([numbers[3:]]), "euler", "xyz")
-    return np.concatenate([quaternions(R)[0], numbers[:3]])
+    return np.concatenate([quaternions_of(R)[0], numbers[:3]])
 
 
 class _ClockOffset:
@@ -341,6 +341,7 @@ class Assembly:
         return self._delay if self._tracker is None else self._tracker.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
+        """Return the readings completed within `timeout_s` [s]; None after the last wrench."""
         arrived = self._parts.read(timeout_s)
         if arrived is None:
             return None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.files import set_aside
+from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.normal_equations import NormalEquations
@@ -217,7 +217,7 @@ def calibrate(
 
     def write_record() -> None:
         if recorder.seconds:
-            set_aside(*earlier)
+            move_earlier_recordings(*earlier)
             earlier.clear()
         recorder.write(path)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.files import set_aside
+from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED, handled_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
@@ -72,12 +72,12 @@ def run(
                 report(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    def timeout_s() -> float:
+    def longest_wait_s() -> float:
         left = compensator.time_to_stale(time.monotonic())
         return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
 
     with suppress(KeyboardInterrupt), handled_sigint():
-        while not INTERRUPTED.is_set() and (readings := source.read(timeout_s())) is not None:
+        while not INTERRUPTED.is_set() and (readings := source.read(longest_wait_s())) is not None:
             if (
                 source.live
                 and (stale := compensator.stale_output(time.monotonic()))
@@ -149,7 +149,7 @@ def compensate_command(
         print(text, file=sys.stderr, flush=True)
 
     file = [Path(sink)] if readings.live and is_file(sink) else []
-    if earlier := set_aside(*file):
+    if earlier := move_earlier_recordings(*file):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)
     control_port = None if control is None else Control(control)

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import multiply, rotate
+from drake_teleop.common.vectors import quaternion_product, rotate_vector
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Part
 
@@ -150,5 +150,5 @@ def _pose(p: Any, q: Any) -> Array:
 
 def _compose(a: Array, b: Array) -> Array:
     q = tuple(a[:4].tolist())
-    p = rotate(q, tuple(b[4:].tolist()))
-    return np.array([*multiply(q, tuple(b[:4].tolist())), *(a[4:] + p)])
+    p = rotate_vector(q, tuple(b[4:].tolist()))
+    return np.array([*quaternion_product(q, tuple(b[:4].tolist())), *(a[4:] + p)])

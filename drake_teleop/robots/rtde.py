@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError, require_library
-from drake_teleop.common.vectors import exponential
+from drake_teleop.common.vectors import quaternion_exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
@@ -38,7 +38,7 @@ class RtdeSource:
         require_library("rtde_receive", "ur_rtde", "robots", address)
         self._host, self._sign, self._partial, self._started = parsed.host, parsed.sign(), b"", 0.0
         self._start()
-        exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
+        quaternion_exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
         deadline = time.monotonic() + _START_TIMEOUT_S
         while len(self._first) < _RATE_SAMPLES and (left := deadline - time.monotonic()) > 0.0:
@@ -99,7 +99,7 @@ def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
     number = round(t / dt) if abs(t) < 1e12 else -1
     values_of_stream = {
         WRENCH: sign * values[:6],
-        POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
+        POSE: np.array([*quaternion_exponential(sample[10:13]), *sample[7:10]]),
         ACCELERATION: values[12:15],
     }
     return [Part(stream, number, t, each) for stream, each in values_of_stream.items()]

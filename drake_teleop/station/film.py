@@ -25,7 +25,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_teleop.common.files import make_folder, write_text
-from drake_teleop.common.html import policy, render
+from drake_teleop.common.html import content_security_policy, render_page
 
 Array = NDArray[np.float64]
 Show = Callable[[float, int], None]
@@ -154,10 +154,12 @@ class Film:
             "clock": self.clock,
             "curves": self.curves,
         }
-        player = render("drake_teleop.common", "player.html.j2", film=film)
+        player = render_page("drake_teleop.common", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
         whole = head.replace("<title>Drake MeshCat<", _TITLE, 1) + player + body + tail
-        return whole.replace("<title>", _POLICY.format(policy(whole)) + "<title>", 1)
+        return whole.replace(
+            "<title>", _POLICY.format(content_security_policy(whole)) + "<title>", 1
+        )
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:

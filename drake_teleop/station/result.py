@@ -16,12 +16,12 @@ import numpy as np
 from drake_teleop.common.errors import (
     DrakeTeleopError,
     expect,
-    install_extra,
     refuse_fork,
+    remedy_to_install_extra,
     wrap_read_errors,
 )
 from drake_teleop.common.files import PARTS_OF_LOG, make_folder, part_of_log, write_table
-from drake_teleop.common.numeric import numbers
+from drake_teleop.common.numeric import float_array
 from drake_teleop.common.parquet_sizes import check_parquet
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ class SimulationResult:
     def __init__(
         self, t: ArrayLike, signals: Mapping[str, ArrayLike], specs: Sequence[Signal]
     ) -> None:
-        self._t = _read_only(numbers("t", t))
+        self._t = _read_only(float_array("t", t))
         self._specs = {spec.name: spec for spec in specs}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
@@ -113,7 +113,7 @@ class SimulationResult:
             self._values = {name: self._checked_values(name, signals[name]) for name in self._specs}
 
     def _checked_values(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
-        array = numbers(name, values)
+        array = float_array(name, values)
         shape = (len(self._t), len(self._specs[name].components))
         if array.ndim == 1:
             array = array[:, np.newaxis]
@@ -199,7 +199,7 @@ class SimulationResult:
             raise DrakeTeleopError(
                 f"{error.name or 'a library'} is not installed",
                 where="to_pandas",
-                remedy=install_extra("notebook"),
+                remedy=remedy_to_install_extra("notebook"),
             ) from None
 
     def to_dataframe(self) -> pl.DataFrame:

@@ -20,7 +20,7 @@ from drake_teleop.common.config import (
     settings,
     unchecked_assignments,
 )
-from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
+from drake_teleop.common.errors import DrakeTeleopError, expect, suggest_name
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.texts import read_yaml
@@ -222,7 +222,7 @@ def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     path = folder / f"{name_or_path}.yaml" if str(name_or_path) in names else Path(name_or_path)
     if not os.path.isfile(path):  # False also for invalid file names
-        remedy = suggestion(name_or_path, names, f"give a YAML file or one of {', '.join(names)}")
+        remedy = suggest_name(name_or_path, names, f"give a YAML file or one of {', '.join(names)}")
         raise DrakeTeleopError(f"there is no {kind} '{name_or_path}'", remedy=remedy)
     return path
 

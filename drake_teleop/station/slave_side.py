@@ -10,7 +10,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
-from drake_teleop.common.numeric import check_identified, checked
+from drake_teleop.common.numeric import check_identified, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
@@ -89,7 +89,7 @@ def MakeSlaveSide(
     check_scenario(scenario)
     _check_load_is_known(scenario, load_estimate)
     if load_covariance is not None:
-        checked("load_covariance", load_covariance, 16, 16)
+        finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
     led, torques = scenario.master.leads_joints, _gives_torques(controller, scenario)
     body = _add_slave_blocks(
@@ -372,7 +372,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
             remedy="pass the attribute .estimate of this object",
         )
     if estimate is not None:
-        estimate = checked("load_estimate", estimate, 16)
+        estimate = finite_array("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
             check_identified("load_estimate", estimate[6:])
     scales = scenario.force_scaling.scales()

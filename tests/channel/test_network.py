@@ -13,7 +13,7 @@ from numba import njit
 from pydrake.common.yaml import yaml_load_typed
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import exponential, multiply
+from drake_teleop.common.vectors import quaternion_exponential, quaternion_product
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import (
     BACKWARD,
@@ -426,7 +426,9 @@ def test_silence(silence, silent):
     if silent and silence == "extrapolate":
         time = min(silent * PERIOD, LONGEST_EXTRAPOLATION)
         v, w = packet[VELOCITY][:3], packet[VELOCITY][3:]
-        expected[POSE][:4] = multiply(exponential(tuple(w * time)), tuple(packet[POSE][:4]))
+        expected[POSE][:4] = quaternion_product(
+            quaternion_exponential(tuple(w * time)), tuple(packet[POSE][:4])
+        )
         expected[POSE][4:] += v * time
         if silent * PERIOD > LONGEST_EXTRAPOLATION:
             expected[VELOCITY] = 0.0

@@ -16,7 +16,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.comparison import compare_passivity as study
 from drake_teleop.lab.comparison import delayed_contact
 from drake_teleop.lab.comparison.one_dof import OneDof, Task
-from drake_teleop.lab.comparison.report import COLUMNS, cells
+from drake_teleop.lab.comparison.report import COLUMNS, table_cells
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.environment.solids import Wall
@@ -62,7 +62,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     assert 0.0 <= runs["tdpa"]["left_behind"] == abs(runs["tdpa"]["drift"]) < 0.5e-3
     # A run that is not at rest in its hold ends there.
     assert runs["none"]["left_behind"] is None is runs["none"]["drift"]
-    assert cells(runs["none"])[[key for key, *_ in COLUMNS].index("left_behind")] == "–"
+    assert table_cells(runs["none"])[[key for key, *_ in COLUMNS].index("left_behind")] == "–"
     assert runs["none"]["leaked"] > 0.3 > 100 * runs["tdpa"]["leaked"]
     # Taps leak, the press does not.
     assert [cell["verdict"] for cell in summary["decision"]] == ["unstable", "leaks"]
@@ -81,7 +81,7 @@ def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     # 8.5 px, and a column 11 px to its neighbour. Headings take as many lines as they have words.
     assert re.search(r"\nth\.number {[^}]*white-space: normal", page)
     rows = [["charged_tdpa", "Stable", *(heading for _, heading, _, _ in COLUMNS)]]
-    rows += [["four_channel", "yes", *cells(row)] for row in summary["station"]]
+    rows += [["four_channel", "yes", *table_cells(row)] for row in summary["station"]]
     words = [max(map(len, " ".join(column).split())) for column in zip(*rows, strict=True)]
     assert page.split("</thead>")[0].count("<th") - 1 == len(words)  # <thead> is one of them
     assert sum(8.5 * letters + 11 for letters in words) < 944

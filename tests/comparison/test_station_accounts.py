@@ -107,7 +107,7 @@ def test_station_without_channel_raises():
     kept = [name for name in result if name != "ports"]
     less = SimulationResult(result.t, {n: result[n] for n in kept}, [SIGNALS[n] for n in kept])
     with pytest.raises(
-        DrakeTeleopError, match=r"accounts: .*lacks the signals .*ports; run a station over"
+        DrakeTeleopError, match=r"result: .*lacks the signals .*ports, which .*; run a station with"
     ):
         station_accounts(less, SCENARIO)
 

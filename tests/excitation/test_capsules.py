@@ -23,7 +23,7 @@ def test_capsule_of_a_beam_is_parallel_to_it(long):
     size[long] = 1.0
     capsule = bounding_capsule(Box(size))
     for corner in product(*[(-s / 2, s / 2) for s in size]):
-        assert capsule.holds(Capsule(np.array([corner, corner]), 0.0))
+        assert capsule.contains(Capsule(np.array([corner, corner]), 0.0))
     # The beam's edges are 0.071 m from its axis; a ball would need 0.505 m.
     assert 0.0707 <= capsule.radius < 0.15
     ends = np.delete(capsule.ends, long, axis=1)
@@ -54,7 +54,7 @@ def test_capsule_of_a_capsule_is_itself():
                          (0.05, 0.04, True), (0.05, 0.06, False), (0.15, 0.0, False)])  # fmt: skip
 def test_containment_of_capsules_includes_their_radius(aside, radius, held):
     ends = np.array([[0.0, 0.0, -0.2], [0.0, 0.0, 0.2]])
-    assert Capsule(ends, 0.1).holds(Capsule(0.5 * ends + [0.0, aside, 0.0], radius)) is held
+    assert Capsule(ends, 0.1).contains(Capsule(0.5 * ends + [0.0, aside, 0.0], radius)) is held
 
 
 def test_minimum_distance_subtracts_the_quartile_of_the_excess():

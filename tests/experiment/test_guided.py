@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from drake_teleop.common.progress import silent
+from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
@@ -92,7 +92,7 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person.guided.close()
     drive = read_drive(tmp_path / "drives" / "01" / "0000-1")
     assert all(inputs.sigma == 37 for ms, inputs in drive.changes[1:])
-    assert drive.repeat(silent).t[-1] == pytest.approx(0.5, abs=0.03)
+    assert drive.repeat(show_no_progress).t[-1] == pytest.approx(0.5, abs=0.03)
     messages = json.dumps(person.frames) + json.dumps(person.guided.hello())
     assert "secret" not in messages
     assert all(f["inputs"]["sigma"] == 0 and f["inputs"]["gamma"] == 100 for f in person.frames)

@@ -13,7 +13,7 @@ import pytest
 from websockets.sync.server import serve
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.progress import silent
+from drake_teleop.common.progress import show_no_progress
 from drake_teleop.live.device_client import Client
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_link import DeviceConnection, DeviceLink
@@ -366,7 +366,7 @@ def test_drive_by_a_device_repeats_to_the_same_bytes(scenario, load, tmp_path):
     session.close()
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     drive = read_drive(tmp_path)
-    again = drive.repeat(silent(""))
+    again = drive.repeat(show_no_progress(""))
     assert all(np.array_equal(log[name], again[name], equal_nan=True) for name in ("t", *log))
     assert max(rendered) > 0.3
     assert max(rendered[80:101]) > 0.3

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply
+from drake_teleop.common.vectors import (
+    conjugate_quaternion,
+    quaternion_exponential,
+    quaternion_logarithm,
+    quaternion_product,
+)
 from drake_teleop.live.hand import LiveHand
 from drake_teleop.station.operator.operator import OperatorConfig
 
@@ -41,7 +46,9 @@ class MovingHand:
 
 def rotation_between(to: np.ndarray, since: np.ndarray) -> np.ndarray:
     """Return the rotation vector (3,) in B [rad] between two orientations."""
-    return np.array(logarithm(multiply(tuple(to), conjugate(tuple(since)))))
+    return np.array(
+        quaternion_logarithm(quaternion_product(tuple(to), conjugate_quaternion(tuple(since))))
+    )
 
 
 @pytest.fixture
@@ -49,7 +56,7 @@ def moving_hand() -> MovingHand:
     """Return a hand on its way to the last of several targets."""
     moving_hand = MovingHand()
     for time, turn, position in TARGETS:
-        moving_hand.move_to(time, exponential(turn), position)
+        moving_hand.move_to(time, quaternion_exponential(turn), position)
     return moving_hand
 
 
@@ -57,8 +64,8 @@ def moving_hand() -> MovingHand:
 def test_new_target_keeps_position_velocity_and_acceleration(moving_hand, angle):
     orientation, position, twist, acceleration = moving_hand.intention(0.11)
     across = np.cross(twist[3:], [0.3, -0.2, 0.5])
-    turn = exponential(tuple(angle / np.linalg.norm(across) * across))
-    moving_hand.move_to(0.11, multiply(turn, tuple(orientation)), (0.1, 0.1, 0.1))
+    turn = quaternion_exponential(tuple(angle / np.linalg.norm(across) * across))
+    moving_hand.move_to(0.11, quaternion_product(turn, tuple(orientation)), (0.1, 0.1, 0.1))
     then = moving_hand.intention(0.11)
     assert np.linalg.norm(twist[3:]) > 5.0
     np.testing.assert_allclose(rotation_between(then[0], orientation), 0.0, atol=1e-12)

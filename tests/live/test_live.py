@@ -12,7 +12,7 @@ from full_disk import small_disk
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
-from drake_teleop.common.progress import silent
+from drake_teleop.common.progress import show_no_progress
 from drake_teleop.live.live import FRAME_PERIOD_S, MAX_MESSAGE_BYTES, Live, parse_message
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.session import Session, read_drive
@@ -74,7 +74,7 @@ def test_closed_page_releases_the_hand_and_completes_the_record(scenario, load, 
     pull = log["hand_wrench_E"][gone:, :3] + 20.0 * log["twist_master"][gone:, :3]
     np.testing.assert_allclose(pull, 0.0, atol=1e-12)
     assert np.ptp(log["pose_command"][gone + 10 :, 4:], axis=0).max() == 0.0
-    again = read_drive(folder).repeat(silent(""))
+    again = read_drive(folder).repeat(show_no_progress(""))
     assert len(again.t) == len(log.t)
     np.testing.assert_array_equal(again["slave_state"], log["slave_state"])
 

@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
-from drake_teleop.common.progress import silent
+from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import LEAD_TIME_S
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, csv_header, csv_row, read_inputs
@@ -71,11 +71,11 @@ def test_recorded_drive_repeats_for_any_slices(driven, scenario, load):
     assert drive.scenario == replace(scenario, simulation__duration=1e-3 * END)
     assert dict(drive.changes).items() >= dict(script(scenario)).items()
     for slice_ms in (1, 7, END):
-        assert same(drive.repeat(silent(""), slice_ms=slice_ms), log)
+        assert same(drive.repeat(show_no_progress(""), slice_ms=slice_ms), log)
     assert len(log.t) == END + 1 and np.abs(log["true_contact_wrench_W"][:, 2]).max() > 5.0
     # One input one slice late is another drive.
     late = [(ms + 5 * (ms == 100), inputs) for ms, inputs in script(scenario)]
-    assert not same(Drive(scenario, load, late).repeat(silent("")), log)
+    assert not same(Drive(scenario, load, late).repeat(show_no_progress("")), log)
 
 
 @pytest.mark.slow

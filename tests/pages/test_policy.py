@@ -8,7 +8,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from drake_teleop.common.html import policy, render
+from drake_teleop.common.html import content_security_policy, render_page
 from drake_teleop.station.film import Film
 
 CODE = "const a = 1;\nlet b = 'é';"
@@ -23,16 +23,20 @@ def hashed(script: str) -> str:
 def test_policy_contains_the_hashes_of_the_scripts(tag, end):
     """Browsers hash scripts with line feeds only."""
     page = f"<body>{tag}{CODE}</script><p>{tag}other()</script>".replace("\n", end)
-    parts = dict(part.split(" ", 1) for part in policy(page).split("; "))
+    parts = dict(part.split(" ", 1) for part in content_security_policy(page).split("; "))
     assert parts["script-src"].split() == [hashed(CODE), hashed("other()")]
     assert parts["default-src"] == parts["base-uri"] == parts["form-action"] == "'none'"
 
 
 def test_policy_allows_connections_only_to_the_given_server():
-    served = dict(part.split(" ", 1) for part in policy("", "127.0.0.1:80").split("; "))
+    served = dict(
+        part.split(" ", 1) for part in content_security_policy("", "127.0.0.1:80").split("; ")
+    )
     assert served["connect-src"].split() == ["'self'", "ws://127.0.0.1:80", "data:", "blob:"]
     assert served["script-src"].split() == ["'self'"]
-    assert "http" not in policy("<script>x</script>") and "'self'" not in policy("")
+    assert "http" not in content_security_policy(
+        "<script>x</script>"
+    ) and "'self'" not in content_security_policy("")
 
 
 @pytest.mark.long
@@ -41,6 +45,10 @@ def test_replays_and_reports_have_a_policy(tmp_path):
     film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)
     page = (tmp_path / "x.html").read_text(encoding="utf-8")
     head, _, rest = page.partition("<title>")
-    assert policy(page) in head and "<script" not in head and rest.count("<script") >= 3
-    report = render("drake_teleop.common", "page.html.j2")
+    assert (
+        content_security_policy(page) in head
+        and "<script" not in head
+        and rest.count("<script") >= 3
+    )
+    report = render_page("drake_teleop.common", "page.html.j2")
     assert "default-src 'none'" in report.partition("<title>")[0]

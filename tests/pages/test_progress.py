@@ -14,7 +14,7 @@ from rich.console import Console
 import drake_teleop
 from drake_teleop import identify_load, run_scenario, simulate
 from drake_teleop.cli.excitation import excite_command
-from drake_teleop.common.progress import show_progress, silent
+from drake_teleop.common.progress import show_no_progress, show_progress
 from drake_teleop.lab.analysis.analyze import analyze, analyze_command
 from drake_teleop.lab.comparison.compare_passivity import compare_command
 from drake_teleop.lab.excitation.excite import excite
@@ -62,7 +62,7 @@ def test_terminal_shows_each_stage(terminal):
 
 def test_no_output_without_progress(terminal, capsys):
     shown(False)
-    shown(silent)
+    shown(show_no_progress)
     shown(True, after=3600.0)  # done before
     assert terminal.getvalue() == capsys.readouterr().err == ""
 

@@ -7,7 +7,7 @@ import pytest
 
 from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import multiply, normalized, rotate
+from drake_teleop.common.vectors import normalized_quaternion, quaternion_product, rotate_vector
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
@@ -148,13 +148,15 @@ def test_the_world_axes_do_not_matter(method):
         wrenches(rng, 800),
         line(rng, 800),
     )
-    R = normalized(tuple(rng.normal(size=4)))
+    R = normalized_quaternion(tuple(rng.normal(size=4)))
 
     def turned(vectors):
-        return np.array([[*rotate(R, v[:3]), *rotate(R, v[3:6])] for v in vectors])
+        return np.array([[*rotate_vector(R, v[:3]), *rotate_vector(R, v[3:6])] for v in vectors])
 
     def turned_poses(x):
-        return np.array([[*multiply(R, tuple(row[:4])), *rotate(R, row[4:])] for row in x])
+        return np.array(
+            [[*quaternion_product(R, tuple(row[:4])), *rotate_vector(R, row[4:])] for row in x]
+        )
 
     wrench, command, *_ = run(method, config, master, slave, f_e, newest)
     wrench_R, command_R, *_ = run(

@@ -25,7 +25,11 @@ from drake_teleop.lab.reproduction.experiments import (
     ideal_values,
     raw_excess,
 )
-from drake_teleop.lab.reproduction.report import compare_with_paper, describe_unaccepted, flat
+from drake_teleop.lab.reproduction.report import (
+    compare_with_paper,
+    describe_unaccepted,
+    values_by_full_name,
+)
 from drake_teleop.lab.run_summary import in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -134,7 +138,7 @@ def test_everything_is_written(run):
     for name in ("fig6", "fig7", "fig8"):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     table = (out / "table.md").read_text(encoding="utf-8")
-    assert len(table.splitlines()) == 2 + len(compare_with_paper(flat(summary)))
+    assert len(table.splitlines()) == 2 + len(compare_with_paper(values_by_full_name(summary)))
     assert [table.count(f"| {verdict} |") for verdict in ("agrees", "differs")] == [5, 0]
     page = (out / "report.html").read_text(encoding="utf-8")
     assert 'src="replay.html"' in page
@@ -259,7 +263,7 @@ def test_contact_is_not_detected_without_elimination(motion):
     largest = 1.5 * np.abs(motion.raw_free[:, 2]).max()
     figures = contact_values(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
     assert figures["detected_s"] is None
-    assert np.isnan(flat({"contact": figures})["contact.detected_s"])
+    assert np.isnan(values_by_full_name({"contact": figures})["contact.detected_s"])
 
 
 def test_contact_time_is_null_without_contact(motion):
@@ -310,7 +314,7 @@ def ideal_run(run, results):
 
 
 def ideal_rows(values):
-    rows = compare_with_paper(defaultdict(lambda: 0.5, flat({"ideal": values})))
+    rows = compare_with_paper(defaultdict(lambda: 0.5, values_by_full_name({"ideal": values})))
     return [row.holds for row in rows if row.what.startswith("All axes")]
 
 

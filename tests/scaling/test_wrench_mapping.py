@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 
-from drake_teleop.common.vectors import exponential
+from drake_teleop.common.vectors import quaternion_exponential
 from drake_teleop.station.scaling.force_scaling import wrench_to_master, wrench_to_master_into
 from drake_teleop.station.scaling.kinematic_scaling import scale_pose_into
 
@@ -54,7 +54,9 @@ def test_equal_scales_of_motion_and_force_keep_the_power(R_WS, R_WB, seed, scale
     start_W = np.array([*RotationMatrix(R_WS).ToQuaternion().wxyz(), 0.1, 0.2, 0.3])
     step, moved = 1e-6, []
     for sign in (1, -1):
-        pose = np.array([*exponential(tuple(sign * step * omega_B)), *(sign * step * velocity_B)])
+        pose = np.array(
+            [*quaternion_exponential(tuple(sign * step * omega_B)), *(sign * step * velocity_B)]
+        )
         out = np.empty(7)
         scale_pose_into(
             pose, np.array([1.0, 0, 0, 0, 0, 0, 0]), start_W, alignment, scale, 1.0, out

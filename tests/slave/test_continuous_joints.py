@@ -14,7 +14,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import multiply
+from drake_teleop.common.vectors import quaternion_product
 from drake_teleop.lab.excitation.check import check
 from drake_teleop.lab.excitation.excite import excite
 from drake_teleop.lab.excitation.robot import RobotFromModel
@@ -91,14 +91,14 @@ def pose_of(arm, q):
 def turned_tool(pose, angle):
     """Return the pose turned about z_S."""
     turn = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2))
-    return np.append(multiply(tuple(pose[:4]), turn), pose[4:])
+    return np.append(quaternion_product(tuple(pose[:4]), turn), pose[4:])
 
 
 def turned_base(pose, angle):
     """Return the pose turned about z_W."""
     turn, c, s = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)), np.cos(angle), np.sin(angle)
     x, y, z = pose[4:]
-    return np.append(multiply(turn, tuple(pose[:4])), [c * x - s * y, s * x + c * y, z])
+    return np.append(quaternion_product(turn, tuple(pose[:4])), [c * x - s * y, s * x + c * y, z])
 
 
 def pose_error(a, b):

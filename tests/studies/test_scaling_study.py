@@ -14,8 +14,8 @@ from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
     SELECTIONS,
     TASKS,
-    answer,
     choice_picture,
+    rate_scales,
 )
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.station.scenario import ScenarioNames
@@ -45,22 +45,22 @@ def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndar
 def test_best_point_of_each_selection():
     # Indices of (sigma, gamma).
     for criteria, best in ((("effort",), (0, 0)), (("time",), (0, 3)), (("force",), None)):
-        found = answer(tables(), criteria)
+        found = rate_scales(tables(), criteria)
         place = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
         assert place[1] == 5 if best is None else place == best
         assert np.all((found.low <= found.merit) & (found.merit <= found.high))
         assert found.merit[4, 2] == pytest.approx(1.0)  # the reference against itself
         assert found.best.sum() == pytest.approx(1.0)
-    assert answer(tables(), ("effort",)).best[0, 0] > 0.95
+    assert rate_scales(tables(), ("effort",)).best[0, 0] > 0.95
     # Without dependence on sigma the choice must be uncertain.
-    assert answer(tables(), ("force",)).best.max() < 0.95
+    assert rate_scales(tables(), ("force",)).best.max() < 0.95
 
 
 def test_points_with_many_failures_are_excluded():
     failing = tables()
     failing["press"]["success"][0, 0, :2] = 0.0  # one in ten
     failing["press"]["effort"][0, 0, :2] = np.nan
-    found = answer(failing, ("effort",))
+    found = rate_scales(failing, ("effort",))
     assert np.isnan(found.merit[0, 0])
     assert found.best[0, 0] == 0.0
 
@@ -70,7 +70,7 @@ def test_seeds_with_failed_reference_are_excluded(failing, best):
     rows = tables(seeds=3)
     rows["press"]["success"][4, 2, :failing] = 0.0
     rows["press"]["effort"][4, 2, :failing] = np.nan
-    found = answer(rows, ("effort",))
+    found = rate_scales(rows, ("effort",))
     assert np.isfinite(found.low).sum() == np.isfinite(found.merit).sum() == 29 * best
     assert found.best.sum() == pytest.approx(best)
 
@@ -78,7 +78,7 @@ def test_seeds_with_failed_reference_are_excluded(failing, best):
 def test_choice_picture_has_one_scale_and_no_empty_cell():
     failing = tables()
     failing["press"]["success"][:2, 0, :3] = 0.0  # three of twenty
-    answers = {way: answer(failing, criteria) for way, criteria in SELECTIONS.items()}
+    answers = {way: rate_scales(failing, criteria) for way, criteria in SELECTIONS.items()}
     sigmas, gammas = [0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8]
     figure = choice_picture(answers, sigmas, gammas)
     images = [image for axes in figure.axes for image in axes.images]
@@ -94,7 +94,7 @@ def test_choice_picture_has_one_scale_and_no_empty_cell():
 
 def test_more_seeds_give_narrower_intervals():
     widths = [np.mean(found.high - found.low) for found in (
-        answer(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)
+        rate_scales(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)
     )]  # fmt: skip
     assert widths[1] < 0.5 * widths[0]
 

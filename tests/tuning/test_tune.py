@@ -18,7 +18,7 @@ from drake_teleop.lab.tuning.press_trial import (
     press_depth,
     rms_above,
 )
-from drake_teleop.lab.tuning.search import holds, search_settings
+from drake_teleop.lab.tuning.search import meets_requirements, search_settings
 from drake_teleop.lab.tuning.stated_set import stated_set, without_task_and_method
 from drake_teleop.lab.tuning.tune import tune
 from drake_teleop.station.environment.sheet_spring import SheetSpring
@@ -82,8 +82,8 @@ def test_only_force_above_5_hz_counts_as_oscillation():
     "change", [{"rests": 0.0}, {"rest_force_N": 1.2 * MAX_REST_FORCE_N}, {"share": 0.8}]
 )
 def test_station_holds_only_if_it_rests_quietly_and_renders_the_force(change):
-    assert holds(GOOD)
-    assert not holds(GOOD | change)
+    assert meets_requirements(GOOD)
+    assert not meets_requirements(GOOD | change)
 
 
 class FakeStation:
@@ -126,7 +126,7 @@ def test_search_finds_the_largest_gamma_that_the_station_holds_with_the_margin()
     assert 1.1 * found.settings.gamma * 20000.0 <= limit < 1.1 * 1.15 * found.settings.gamma * 2e4
     assert {row["gamma"] for row in found.inside} == {1.1 * found.settings.gamma}
     assert {(row["hand"], row["wall"]) for row in found.inside} == set(trial().stated.corners)
-    assert not all(holds(row) for row in found.limits)
+    assert not all(meets_requirements(row) for row in found.limits)
 
 
 def test_search_refuses_a_set_that_no_settings_hold():

@@ -27,8 +27,13 @@ from pydrake.systems.analysis import InitializeParams
 from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import checked
-from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply
+from drake_teleop.common.numeric import finite_array
+from drake_teleop.common.vectors import (
+    conjugate_quaternion,
+    quaternion_exponential,
+    quaternion_logarithm,
+    quaternion_product,
+)
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port
 from drake_teleop.station.channel.channel import Channel
@@ -223,7 +228,7 @@ def linearize(
     """
     check_scenario(scenario)
     if load_estimate is not None:
-        load_estimate = checked("load_estimate", load_estimate, 16)
+        load_estimate = finite_array("load_estimate", load_estimate, 16)
         # The sensor of the linear model has no offset.
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
     period = _Period(scenario, load_estimate)
@@ -554,12 +559,17 @@ class _Period:
 
 def _displace(pose: Array, change: Array) -> Array:
     return np.concatenate(
-        [multiply(exponential(tuple(change[3:])), pose[:4]), pose[4:] + change[:3]]
+        [
+            quaternion_product(quaternion_exponential(tuple(change[3:])), pose[:4]),
+            pose[4:] + change[:3],
+        ]
     )
 
 
 def _pose_difference(pose: Array, other: Array) -> Array:
-    turn = logarithm(multiply(tuple(pose[:4]), conjugate(tuple(other[:4]))))
+    turn = quaternion_logarithm(
+        quaternion_product(tuple(pose[:4]), conjugate_quaternion(tuple(other[:4])))
+    )
     return np.concatenate([pose[4:] - other[4:], turn])
 
 

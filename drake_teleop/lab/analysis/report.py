@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drake_teleop.common.files import write_picture, write_text
-from drake_teleop.common.html import embedded, render
+from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.style import (
     BLACK,
     COLOURS,
@@ -69,12 +69,12 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
     }
     for name, figure in pictures.items():
         write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
-    page = render(
+    page = render_page(
         "drake_teleop.lab.analysis",
         "report.html.j2",
         s=summary,
         wall=curves.wall[0],
-        pictures={name: embedded(out / f"{name}.png") for name in pictures},
+        pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
         axis_rows=axis_rows(summary["axis"]),
         margin_rows=[margin_cells(row, summary["delay_s"]) for row in summary["margins"]],
     )

@@ -15,7 +15,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import checked
+from drake_teleop.common.numeric import finite_array
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.station.environment.point_contact import STIFFNESS
 from drake_teleop.station.environment.solids import Wall
@@ -60,7 +60,7 @@ def task_direction(
     `load_estimate` (16,) the tool mass has no error.
     """
     check_scenario(scenario)
-    n_W = checked("direction", direction, 3)
+    n_W = finite_array("direction", direction, 3)
     if not np.linalg.norm(n_W) > 0.0:
         raise DrakeTeleopError(
             "has length zero", where="direction", remedy="give a vector (3,) in W"
@@ -75,7 +75,7 @@ def task_direction(
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    displacement_B = checked("displacement", displacement, 3)
+    displacement_B = finite_array("displacement", displacement, 3)
     hand_B = np.concatenate([R_WB.T @ n_W, np.zeros(3)])
     device_mass, device_damping = _device_mass_and_damping(scenario, displacement_B, hand_B)
     slave = NominalSlave(scenario.slave)

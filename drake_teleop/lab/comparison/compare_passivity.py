@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.errors import DrakeTeleopError, suggestion
+from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.lab.comparison.decision import decide
@@ -84,7 +84,7 @@ def compare_command(
     """
     for name in networks:
         if name not in PRESETS:
-            remedy = suggestion(name, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
+            remedy = suggest_name(name, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
             what = f"there is no network '{name}'"
             raise DrakeTeleopError(what, where="networks", remedy=remedy)
     methods = tuple(METHODS) if methods is None else methods
@@ -290,7 +290,7 @@ def _covering_study(stage: Stage) -> list[dict[str, Any]]:
                 "sigma": sigma,
                 "round_trip_s": round_trip,
                 "wall_N_per_m": wall,
-                "injected_J": max(0.0, -run.least(ACTUAL)),
+                "injected_J": max(0.0, -run.least_energy_sum(ACTUAL)),
                 "damping_Ns_per_m": covering_damping(model, round_trip),
             }
         )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put, quaternion_of
+from drake_teleop.common.vectors import copy_into, quaternion_of
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
@@ -154,5 +154,5 @@ def _poses(arm, q):
         orientation = quaternion_of(R)
         for i in range(4):
             poses[k, i] = orientation[i]
-        put(poses[k], 4, p, 0, 3)
+        copy_into(poses[k], 4, p, 0, 3)
     return poses

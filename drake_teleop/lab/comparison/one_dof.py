@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_normal
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.lab.analysis.one_axis import Axis
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.channel import (
@@ -118,7 +118,7 @@ class OneDofRun:
     accounts: NDArray[np.float64]  #: (N, 4) J
     start_energy: float  #: E_0 of the method's stores [J]
 
-    def least(self, place: int) -> float:
+    def least_energy_sum(self, place: int) -> float:
         """Return the least sum over time of start energy and `accounts` at HAND and `place` [J].
 
         A negative sum means that the station is active.
@@ -364,9 +364,9 @@ def _simulate(
             frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip
         command, accounts[COMMAND] = received[4], ports[6]
-        put(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
-        put(rows[k], 7, ports, 4, 2)
-        put(rows[k], 9, accounts, 0, 4)
+        copy_into(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
+        copy_into(rows[k], 7, ports, 4, 2)
+        copy_into(rows[k], 9, accounts, 0, 4)
         servo_force = K * (command - x_s) - D * v_s
         for i in range(_SUBSTEPS):
             share = (i + 0.5) / _SUBSTEPS

@@ -69,7 +69,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
             _displayed_share(found, scale, rate, 0.5 * round_trip)
             for found, rate in zip(tapping, TAP_RATES, strict=True)
         ),
-        leaked=max(max(0.0, -found.least(ACTUAL)) for found in (released, *tapping)),
+        leaked=max(max(0.0, -found.least_energy_sum(ACTUAL)) for found in (released, *tapping)),
     )
 
 

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from drake_teleop.common.files import write_picture, write_text
-from drake_teleop.common.html import embedded, render
+from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.comparison.decision import (
     CHATTERS,
@@ -63,19 +63,19 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
     }
     for name, figure in pictures.items():
         write_picture(out / f"{name}.png", figure, dpi=PAGE_DPI)
-    page = render(
+    page = render_page(
         "drake_teleop.lab.comparison",
         "report.html.j2",
         networks=[(name, 2e3 * PRESETS[name].delay) for name in summary["networks"]],
         columns=[heading for _, heading, _, _ in COLUMNS],
-        station=[(row, cells(row)) for row in summary["station"]],
+        station=[(row, table_cells(row)) for row in summary["station"]],
         covering=summary["covering"],
-        pictures={name: embedded(out / f"{name}.png") for name in pictures},
+        pictures={name: png_data_url(out / f"{name}.png") for name in pictures},
     )
     write_text(out / "report.html", page)
 
 
-def cells(row: Mapping[str, Any]) -> list[str]:
+def table_cells(row: Mapping[str, Any]) -> list[str]:
     return [
         # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"

@@ -37,9 +37,9 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     """
     if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
-            f"the result lacks the signals {', '.join(missing)}",
-            where="accounts",
-            remedy="run a station over a network, or with a method",
+            f"the result lacks the signals {', '.join(missing)}, which the energy balances need",
+            where="result",
+            remedy="run a station with a network or a passivity method",
         )
     t, torque = result.t, result["joint_torque"]
     q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])

@@ -54,10 +54,10 @@ class Capsule:
     ends: Array
     radius: float
 
-    def moved(self, X: RigidTransform) -> Capsule:
+    def transformed(self, X: RigidTransform) -> Capsule:
         return Capsule(X.multiply(self.ends.T).T, self.radius)
 
-    def holds(self, other: Capsule) -> bool:
+    def contains(self, other: Capsule) -> bool:
         distances = _distances(self.ends, other.ends)
         return bool(np.all(distances + other.radius <= self.radius + 1e-9))
 
@@ -237,7 +237,7 @@ class Scene:
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
             X_LB = X_WB if row < 0 else _pose(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
-            capsules[shape] = row, capsule.moved(X_LB @ inspector.GetPoseInFrame(shape))
+            capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
             if inspector.GetName(shape).endswith(_TABLE):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _outermost(shape, capsules) for shape in capsules}
@@ -307,7 +307,7 @@ def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]
     holding = [
         (other.radius, -_number(name), name)
         for name, (other_row, other) in capsules.items()
-        if other_row == row and other.holds(capsule)
+        if other_row == row and other.contains(capsule)
     ]
     return max(holding, key=lambda entry: entry[:2])[2]
 

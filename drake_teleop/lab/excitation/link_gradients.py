@@ -11,16 +11,16 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import (
     add_into,
-    apply,
+    apply_matrix,
     cross,
     dot,
+    matrix_at,
     minus,
-    nine,
     plus,
-    symmetric,
-    three,
-    times,
+    scale_vector,
+    symmetric_at,
     transposed,
+    vector_at,
 )
 from drake_teleop.station.slave.arm import MOTION_SIZE, SLIDES
 
@@ -31,12 +31,12 @@ _S, _OMEGA, _ALPHA, _P, _THETA, _V, _W = 0, 3, 6, 9, 12, 15, 18
 
 @njit(cache=True)
 def to_world(motion, a):
-    return apply(nine(motion, 12), a)
+    return apply_matrix(matrix_at(motion, 12), a)
 
 
 @njit(cache=True)
 def to_link(motion, a):
-    return apply(transposed(nine(motion, 12)), a)
+    return apply_matrix(transposed(matrix_at(motion, 12)), a)
 
 
 @njit(cache=True)
@@ -44,7 +44,7 @@ def seed_vector(motion, place, gradient, seed):
     """Add to `seed` a derivative by s, omega or alpha (`place` 0, 3, 6), in the link's frame."""
     g = to_world(motion, gradient)
     add_into(seed, place, g)
-    add_into(seed, _THETA, cross(g, three(motion, place)))
+    add_into(seed, _THETA, cross(g, vector_at(motion, place)))
 
 
 @njit(cache=True)
@@ -57,16 +57,16 @@ def seed_point(motion, point, gradient, seed):
 @njit(cache=True)
 def seed_wrench(motion, phi, g_force, g_torque, seed):
     """Add to `seed` (21,) derivatives by the wrench of a load phi, both in the link's frame."""
-    s = to_link(motion, three(motion, _S))
-    w = to_link(motion, three(motion, _OMEGA))
-    h, inertia = three(phi, 1), symmetric(phi, 4)
+    s = to_link(motion, vector_at(motion, _S))
+    w = to_link(motion, vector_at(motion, _OMEGA))
+    h, inertia = vector_at(phi, 1), symmetric_at(phi, 4)
     lever = cross(g_torque, h)
-    gs = plus(times(phi[0], g_force), lever)
-    ga = plus(cross(h, g_force), apply(inertia, g_torque))
+    gs = plus(scale_vector(phi[0], g_force), lever)
+    ga = plus(cross(h, g_force), apply_matrix(inertia, g_torque))
     # Terms of f: w x (w x h); of tau: w x (I w).
     gw = plus(cross(cross(w, h), g_force), cross(h, cross(g_force, w)))
-    gw = plus(gw, cross(apply(inertia, w), g_torque))
-    gw = plus(gw, apply(inertia, cross(g_torque, w)))
+    gw = plus(gw, cross(apply_matrix(inertia, w), g_torque))
+    gw = plus(gw, apply_matrix(inertia, cross(g_torque, w)))
     seed_vector(motion, _S, gs, seed)
     seed_vector(motion, _OMEGA, gw, seed)
     seed_vector(motion, _ALPHA, ga, seed)
@@ -83,11 +83,11 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
     v = w = p = (0.0, 0.0, 0.0)
     for row in range(n + 1):
         motion, phi = motions[row], table[row, 12:22]
-        here = three(motion, _P)
+        here = vector_at(motion, _P)
         v = plus(v, cross(w, minus(here, p)))
         p = here
         if row < n:
-            along = times(c[row], (motion[14], motion[17], motion[20]))
+            along = scale_vector(c[row], (motion[14], motion[17], motion[20]))
             if table[row, SLIDES] != 0.0:
                 v = plus(v, along)
             else:
@@ -96,11 +96,11 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
         virtual[row, 3], virtual[row, 4], virtual[row, 5] = w
         v_L, w_L = to_link(motion, v), to_link(motion, w)
         s, omega = seed_wrench(motion, phi, v_L, w_L, seeds[row])
-        alpha = to_link(motion, three(motion, _ALPHA))
-        h, inertia = three(phi, 1), symmetric(phi, 4)
-        force = plus(times(phi[0], s), cross(alpha, h))
+        alpha = to_link(motion, vector_at(motion, _ALPHA))
+        h, inertia = vector_at(phi, 1), symmetric_at(phi, 4)
+        force = plus(scale_vector(phi[0], s), cross(alpha, h))
         force = plus(force, cross(omega, cross(omega, h)))
-        torque = plus(apply(inertia, alpha), cross(omega, apply(inertia, omega)))
+        torque = plus(apply_matrix(inertia, alpha), cross(omega, apply_matrix(inertia, omega)))
         torque = plus(torque, cross(h, s))
         F, N = to_world(motion, force), to_world(motion, torque)
         add_into(seeds[row], _V, F)
@@ -120,37 +120,37 @@ def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
     for row in range(n, -1, -1):
         motion, seed = motions[row], seeds[row]
         inboard = motions[row - 1] if row > 0 else still
-        w, a = three(inboard, _OMEGA), three(inboard, _ALPHA)
-        gs, gw = plus(gs, three(seed, _S)), plus(gw, three(seed, _OMEGA))
-        ga, gp = plus(ga, three(seed, _ALPHA)), plus(gp, three(seed, _P))
-        gt, gv = plus(gt, three(seed, _THETA)), plus(gv, three(seed, _V))
-        go = plus(go, three(seed, _W))
+        w, a = vector_at(inboard, _OMEGA), vector_at(inboard, _ALPHA)
+        gs, gw = plus(gs, vector_at(seed, _S)), plus(gw, vector_at(seed, _OMEGA))
+        ga, gp = plus(ga, vector_at(seed, _ALPHA)), plus(gp, vector_at(seed, _P))
+        gt, gv = plus(gt, vector_at(seed, _THETA)), plus(gv, vector_at(seed, _V))
+        go = plus(go, vector_at(seed, _W))
         z, slides = (motion[14], motion[17], motion[20]), table[row, SLIDES] != 0.0
         if row < n and slides:
-            gz = plus(times(qdd[row], gs), times(2.0 * qd[row], cross(gs, w)))
-            gz = plus(gz, times(c[row], gv))
+            gz = plus(scale_vector(qdd[row], gs), scale_vector(2.0 * qd[row], cross(gs, w)))
+            gz = plus(gz, scale_vector(c[row], gv))
             g_qd[row] += 2.0 * dot(cross(w, z), gs)
             g_qdd[row] += dot(z, gs)
             gt = plus(gt, cross(z, gz))
         elif row < n:
-            gz = plus(times(qd[row], plus(gw, cross(ga, w))), times(qdd[row], ga))
-            gz = plus(gz, times(c[row], go))
+            gz = plus(scale_vector(qd[row], plus(gw, cross(ga, w))), scale_vector(qdd[row], ga))
+            gz = plus(gz, scale_vector(c[row], go))
             g_qd[row] += dot(z, gw) + dot(cross(w, z), ga)
             g_qdd[row] += dot(z, ga)
             gt = plus(gt, cross(z, gz))
             g_q[row] += dot(z, gt)
-            gw = plus(gw, times(qd[row], cross(z, ga)))
+            gw = plus(gw, scale_vector(qd[row], cross(z, ga)))
         turned, gr = cross(gs, w), gp
         if row > 0:
             gr = plus(gp, plus(cross(gs, a), cross(turned, w)))
-            gr = plus(gr, cross(gv, three(virtual[row - 1], 3)))
+            gr = plus(gr, cross(gv, vector_at(virtual[row - 1], 3)))
         if row < n and slides:
             g_q[row] += dot(z, gr)
         if row > 0:
-            r = minus(three(motion, _P), three(inboard, _P))
+            r = minus(vector_at(motion, _P), vector_at(inboard, _P))
             gw = plus(gw, plus(cross(cross(w, r), gs), cross(r, turned)))
             ga = plus(ga, cross(r, gs))
             go = plus(go, cross(r, gv))
             gt = plus(gt, cross(r, gr))
             if row < n and slides:
-                gw = plus(gw, times(2.0 * qd[row], cross(z, gs)))
+                gw = plus(gw, scale_vector(2.0 * qd[row], cross(z, gs)))

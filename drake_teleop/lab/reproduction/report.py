@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.files import write_text
-from drake_teleop.common.html import embedded, render
+from drake_teleop.common.html import png_data_url, render_page
 
 # Parameters of Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETERS = (
@@ -134,12 +134,12 @@ def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return as text the rows whose values are outside the accepted range."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
-        for row in compare_with_paper(flat(summary))
+        for row in compare_with_paper(values_by_full_name(summary))
         if row.holds is False
     ]
 
 
-def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def values_by_full_name(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return all values by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
     return {
         f"{part}.{name}": math.nan if value is None else value
@@ -210,14 +210,14 @@ def write_report(
     replay: str | None = None,
 ) -> None:
     """Write the HTML page with embedded figures; equal runs give equal pages."""
-    page = render(
+    page = render_page(
         "drake_teleop.lab.reproduction",
         "report.html.j2",
         setup=dict(setup),
         versions=versions(),
         tiles=_tiles(summary),
         comparisons=compare_with_paper(summary),
-        figures=[(item, embedded(item.png)) for item in figures],
+        figures=[(item, png_data_url(item.png)) for item in figures],
         parameters=parameters,
         summary=summary,
         replay=replay,

@@ -44,8 +44,8 @@ from drake_teleop.lab.reproduction.report import (
     ReportFigure,
     captions,
     compare_with_paper,
-    flat,
     parameter_rows,
+    values_by_full_name,
     write_report,
 )
 from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
@@ -96,7 +96,7 @@ def reproduce_command(
             write_json(out / "summary.json", summary)
         written(1.0)
     if not quiet:
-        _print(compare_with_paper(flat(summary)), out)
+        _print(compare_with_paper(values_by_full_name(summary)), out)
     return summary | session
 
 
@@ -170,7 +170,7 @@ def _write(
     for name, picture in pictures.items():
         write_picture(out / f"{name}.png", picture, dpi=PAGE_DPI)
     write_replay(out / "replay.html", contact.touched, contact.scenario, slow_motion=_SLOW_MOTION)
-    figures = flat(summary)
+    figures = values_by_full_name(summary)
     write_text(out / "table.md", _markdown(compare_with_paper(figures)))
     write_report(
         out / "report.html",

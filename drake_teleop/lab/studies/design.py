@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from drake_teleop.common.config import check_ranges, choice, plain, quantity, settings
-from drake_teleop.common.errors import DrakeTeleopError, suggestion
+from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.studies.measures import MEASURES, default_measures
 
@@ -127,7 +127,7 @@ class Study:
                 raise DrakeTeleopError(
                     f"there is no measure '{name}'",
                     where=f"{where}:measures",
-                    remedy=suggestion(name, MEASURES, f"choose among {', '.join(MEASURES)}"),
+                    remedy=suggest_name(name, MEASURES, f"choose among {', '.join(MEASURES)}"),
                 )
         for index, factor in enumerate(self.factors):
             factor.check(f"{where}:factors[{index}]")

@@ -137,7 +137,9 @@ class LevelModel:
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
-            halves.append(np.hypot(design * self._spread(terms), self._seeds(table, terms)))
+            halves.append(
+                np.hypot(design * self._spread(terms), self._half_width_over_seeds(table, terms))
+            )
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
@@ -179,7 +181,7 @@ class LevelModel:
         variance = self._variance(table.mean(axis=1, keepdims=True), 1)
         return _quantile(together, self._freedom) * float(np.sqrt(variance))
 
-    def _seeds(self, table: Array, terms: Array) -> float:
+    def _half_width_over_seeds(self, table: Array, terms: Array) -> float:
         seeds = table.shape[1]
         if seeds == 1:
             return 0.0

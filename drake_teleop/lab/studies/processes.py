@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.store import Store
 
@@ -152,7 +152,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
         from distributed import Client
     except ImportError:
         raise DrakeTeleopError(
-            "Dask is not installed", where="--cluster", remedy=install_extra("cluster")
+            "Dask is not installed", where="--cluster", remedy=remedy_to_install_extra("cluster")
         ) from None
     local = {
         "n_workers": jobs if jobs > 0 else None,
@@ -222,14 +222,14 @@ def _on_same_version(run: Run) -> Run:
     """Return `run` with a check of the version, for workers that join later."""
     version, expected = _version_reader(), __version__
 
-    def checked(chunk: Chunk) -> Chunk:
+    def run_on_same_version(chunk: Chunk) -> Chunk:
         from distributed import get_worker
 
         if (found := version()) != expected:
             raise _wrong_version(get_worker().address, found, expected)
         return run(chunk)
 
-    return checked
+    return run_on_same_version
 
 
 def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:

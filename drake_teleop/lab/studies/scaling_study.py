@@ -83,7 +83,9 @@ def scaling_study_command(
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
     sigmas, gammas = _axes()
-    answers = {selection: answer(tables, criteria) for selection, criteria in SELECTIONS.items()}
+    answers = {
+        selection: rate_scales(tables, criteria) for selection, criteria in SELECTIONS.items()
+    }
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {
@@ -101,7 +103,7 @@ def scaling_study_command(
     return summary
 
 
-def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
+def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
     """Return merits, bootstrap intervals and failures for a selection of criteria."""
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}

@@ -1,4 +1,7 @@
-"""Search of settings: linear limit, one axis, then the whole station at the edges of the set."""
+"""Search of settings that hold for all stated hands and walls (`StatedSet`), in three stages.
+
+Limit of the linear loop; simulation in one axis; the whole station at the corners of the set.
+"""
 
 from __future__ import annotations
 
@@ -134,7 +137,7 @@ def _station_limit(
         for wall in dict.fromkeys(trial.stated.walls[::-1]):
             name = f"station_{settings.method}_{tries}_{wall:.0f}"
             rows += execute(name, _study_of(tried, hands, [wall]), trial)
-            if not all(holds(row, margin) for row in rows):
+            if not all(meets_requirements(row, margin) for row in rows):
                 rows = []
                 break
         tries += 1
@@ -157,7 +160,7 @@ def _station_limit(
     return gamma, inside
 
 
-def holds(row: Mapping[str, Any], margin: float = 1.0) -> bool:
+def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
     """Return True if the station comes to rest, is quiet, and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
     return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drake_teleop.common.errors import DrakeTeleopError, suggestion
+from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.operator.operator import GRIPS
@@ -70,7 +70,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
     for what, names, known in (("hands", hands, tuple(GRIPS)), ("task", (task,), tuple(TASKS))):
         for name in names:
             if name not in known:
-                remedy = suggestion(name, known, f"choose among {', '.join(known)}")
+                remedy = suggest_name(name, known, f"choose among {', '.join(known)}")
                 raise DrakeTeleopError(f"'{name}' is unknown", where=what, remedy=remedy)
     if not hands:
         raise DrakeTeleopError("no grip is given", where="hands", remedy="give light, for instance")
@@ -93,7 +93,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
 def without_task_and_method(scenario: Scenario, network: str | None) -> Scenario:
     """Return the scenario over this network, without environment, task and passivity method."""
     if network is not None and network not in PRESETS:
-        remedy = suggestion(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
+        remedy = suggest_name(network, tuple(PRESETS), f"choose among {', '.join(PRESETS)}")
         raise DrakeTeleopError(f"'{network}' is unknown", where="network", remedy=remedy)
     scaling = scenario.force_scaling
     simulation = dataclasses.replace(scenario.simulation, max_step=_MAX_STEP_S, end_with_task=False)

@@ -17,12 +17,12 @@ from drake_teleop.common.files import (
     write_picture,
     write_text,
 )
-from drake_teleop.common.html import embedded, render
+from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
-from drake_teleop.lab.tuning.search import Found, holds, search_settings, studies_in
+from drake_teleop.lab.tuning.search import Found, meets_requirements, search_settings, studies_in
 from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import commented, write_scenario
@@ -88,11 +88,11 @@ def tune(
         write_scenario(out / "tuned.yaml", tuned, heading=summary["sentences"])
         picture = draw_trade_off(found, summary)
         write_picture(out / "trade_off.png", picture, dpi=PAGE_DPI)
-        page = render(
+        page = render_page(
             "drake_teleop.lab.tuning",
             "report.html.j2",
             summary=summary,
-            picture=embedded(out / "trade_off.png"),
+            picture=png_data_url(out / "trade_off.png"),
         )
         write_text(out / "report.html", page)
         write_json(out / "summary.json", summary)
@@ -106,12 +106,12 @@ def _summary(
 ) -> dict[str, Any]:
     at_edge = [row for row in found.limits if row["wall"] <= stated.walls[1]]
     scale = tuned.force_scaling.force_scale
-    failed = [row for row in found.limits if not holds(row)]
+    failed = [row for row in found.limits if not meets_requirements(row)]
     worst_given = max(row["threshold_N"] for row in found.given)
     figures = {
         "share": min(row["share"] for row in [*found.inside, *at_edge]),
         "threshold_N": max(row["threshold_N"] for row in at_edge),
-        "given_threshold_N": worst_given if all(map(holds, found.given)) else None,
+        "given_threshold_N": worst_given if all(map(meets_requirements, found.given)) else None,
         "rest_force_N": max(row["rest_force_N"] for row in at_edge),
         "margin": stated.requirements.margin,
         "fails_at": {"hand": failed[0]["hand"], "wall_N_per_m": failed[0]["wall"]}

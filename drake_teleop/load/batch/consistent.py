@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked
+from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, pseudo_inertia
 
 _BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
@@ -60,7 +60,7 @@ class Prior:
 
     def information(self, samples: int) -> Array:
         """Return the inverse covariance (10, 10) of phi that the prior contributes."""
-        parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _BASIS)
+        parts = np.linalg.solve(pseudo_inertia(finite_array("prior.phi", self.phi, 10)), _BASIS)
         return np.asarray(samples * self.weight * np.einsum("aij,bji->ab", parts, parts))
 
 
@@ -78,7 +78,10 @@ class Ellipsoid:
 
     def row(self) -> Array:
         """Return a (10,) such that a^T phi >= 0 for each phi whose mass is inside the ellipsoid."""
-        A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
+        A, c = (
+            finite_array("ellipsoid.matrix", self.matrix, 3, 3),
+            finite_array("center", self.center, 3),
+        )
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
             raise DrakeTeleopError(
                 "is not positive definite",
@@ -105,7 +108,9 @@ def consistent_least_squares(
     inside = row is None or row @ theta[6:] >= 0.0
     if prior is None and inside and is_physically_consistent(theta[6:]):
         return theta
-    unit = _parameter_units(theta[6:] if prior is None else checked("prior.phi", prior.phi, 10))
+    unit = _parameter_units(
+        theta[6:] if prior is None else finite_array("prior.phi", prior.phi, 10)
+    )
     cross = gram[:6, 6:]
     offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))
     reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
@@ -134,7 +139,7 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
     """Return phi / unit of the consistent load with the least phi^T H phi / 2 - b^T phi + prior."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
-        J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
+        J0_inverse = np.linalg.inv(pseudo_inertia(finite_array("prior.phi", prior.phi, 10) / unit))
         scaled = [J0_inverse @ part for part in _BASIS]
         pull = prior.weight * np.array([np.trace(part) for part in scaled])
         if prior.kind == "geodesic":

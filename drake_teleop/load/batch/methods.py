@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
-from drake_teleop.common.numeric import Array, checked_rows, number
+from drake_teleop.common.numeric import Array, broadcast_to_rows, to_float
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import (
@@ -27,7 +27,7 @@ from drake_teleop.load.batch.uncertainty import (
     white_covariance,
     with_prior,
 )
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
     CHUNK,
     Moments,
@@ -192,13 +192,13 @@ def identify_batch(
     """
     METHODS.check(method, "method")
     expect((Noise, type(None)), noise, "noise")
-    if not number("gain_std", gain_std) >= 0.0:
+    if not to_float("gain_std", gain_std) >= 0.0:
         raise DrakeTeleopError(f"{gain_std} is negative", where="gain_std", remedy="give 0 or more")
     if method != "consistent" and (prior, ellipsoid) != (None, None):
         raise DrakeTeleopError(
             f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
         )
-    _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     record = Record(*rows)
     fit = METHODS[method].fit(
         record, Options(noise or Noise(), offsets, shared_noise, prior, ellipsoid)
@@ -225,7 +225,7 @@ def identify_batch(
         phi=theta[6:],
         offsets=theta[:6],
         covariance=covariance,
-        identifiable=worth_stating(deviations, theta[6:]) & ~dominated,
+        identifiable=is_precise_enough(deviations, theta[6:]) & ~dominated,
         prior_dominated=dominated,
         residual_rms=np.sqrt(np.diag(residual_covariance(Z, theta)).clip(0.0)),
         method=METHODS[method].name,

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, positive
+from drake_teleop.common.numeric import Array, finite_array, positive_array
 from drake_teleop.load.contact.noise_floor import (
     HELD_A,
     HELD_ALPHA,
@@ -121,7 +121,7 @@ def statistics(
     """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations."""
     rows = checked_samples(*samples)
     out = np.empty((len(rows[0]), 3))
-    sums = float(positive("slack", slack)), float(following), END_LEVEL
+    sums = float(positive_array("slack", slack)), float(following), END_LEVEL
     _statistics(tuple(rows), floor.parameters, *sums, out)
     return out
 
@@ -198,14 +198,17 @@ class ContactDetector:
         following: float = 0.0,
     ) -> None:
         column = statistic_index(statistic)
-        enter, exit_level = float(positive("threshold", threshold)), float(positive("leave", leave))
+        enter, exit_level = (
+            float(positive_array("threshold", threshold)),
+            float(positive_array("leave", leave)),
+        )
         if not 0.0 <= following < 1.0:
             raise DrakeTeleopError(
                 f"{following} is not at least 0 and below 1",
                 where="following",
                 remedy="give 0 for no following",
             )
-        sums = float(positive("slack", slack)), float(following)
+        sums = float(positive_array("slack", slack)), float(following)
         decision = column, enter, exit_level, int(hold)
         #: Last arguments of `flag_update`.
         self.settings = (floor.parameters, (*sums, *decision))
@@ -217,7 +220,7 @@ class ContactDetector:
 
     def update(self, *sample: ArrayLike) -> bool:
         named = zip(Samples._fields, sample, strict=True)
-        arrays = [checked(name, x, 6 if name == "contact" else 3) for name, x in named]
+        arrays = [finite_array(name, x, 6 if name == "contact" else 3) for name, x in named]
         return bool(flag_update(self._memory, *arrays, *self.settings))
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
@@ -230,7 +233,7 @@ class ContactDetector:
 
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
     """Return direction, point nearest to So and pitch [m] of the central axis of wrenches in S."""
-    w = checked("wrench", wrench, 6, leading=True)
+    w = finite_array("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
     square = np.sum(f * f, axis=-1)
     square = np.where(square > 0.0, square, np.nan)
@@ -263,7 +266,7 @@ def fit_noise_floor(
             where="contact",
             remedy="give 100 samples of free motion or more",
         )
-    P = checked("covariance", covariance, 16, 16)
+    P = finite_array("covariance", covariance, 16, 16)
     parameter_std, no_growth = np.empty_like(rows[0]), np.zeros((6, 2))
     write_sigmas(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)
     held = np.empty((2, *rows[0].shape))

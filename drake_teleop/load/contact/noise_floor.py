@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, checked_rows, positive
+from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import regressor_into
 
@@ -88,12 +88,12 @@ class NoiseFloor:
     reached: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        positive("noise", self.noise, 6)
-        checked("covariance", self.covariance, 16, 16)
-        checked("per_acceleration", self.per_acceleration, 6, 2)
+        positive_array("noise", self.noise, 6)
+        finite_array("covariance", self.covariance, 16, 16)
+        finite_array("per_acceleration", self.per_acceleration, 6, 2)
         correlation, rho = (
-            checked("correlation", self.correlation, 6, 6),
-            checked("rho", self.rho, 6),
+            finite_array("correlation", self.correlation, 6, 6),
+            finite_array("rho", self.rho, 6),
         )
         if (np.abs(rho) >= 1.0).any():
             raise DrakeTeleopError(
@@ -101,8 +101,8 @@ class NoiseFloor:
                 where="rho",
                 remedy="call fit_noise_floor",
             )
-        positive("widths", self.widths, LENGTHS)
-        checked("reached", self.reached, 3)
+        positive_array("widths", self.widths, LENGTHS)
+        finite_array("reached", self.reached, 3)
         if not 0.0 <= self.fade < 1.0:
             raise DrakeTeleopError(
                 f"{self.fade} is not at least 0 and below 1",
@@ -116,7 +116,9 @@ class NoiseFloor:
 
     def threshold(self, statistic: str, margin: float = MARGIN) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
-        return margin * float(positive("reached", self.reached, 3)[statistic_index(statistic)])
+        return margin * float(
+            positive_array("reached", self.reached, 3)[statistic_index(statistic)]
+        )
 
     @property
     def parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
@@ -174,7 +176,7 @@ def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out)
 
 def checked_samples(*arrays: ArrayLike) -> list[Array]:
     named = zip(Samples._fields[-len(arrays) :], arrays, strict=True)
-    return checked_rows(**{name: (x, 6 if name == "contact" else 3) for name, x in named})[1]
+    return broadcast_to_rows(**{name: (x, 6 if name == "contact" else 3) for name, x in named})[1]
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, checked_rows, positive
-from drake_teleop.common.vectors import cholesky, put
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
+from drake_teleop.common.vectors import cholesky, copy_into
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import (
@@ -144,7 +144,7 @@ def _update_filter(memory, place, block, noise):
     before = memory[place : place + 272].copy()
     chi = update_estimate(before, V, wrench, whitening(motion, phi, noise, noise[15], block))
     if noise[15] == 0.0:
-        put(memory, place, before, 0, 272)
+        copy_into(memory, place, before, 0, 272)
     else:
         long_term_root = whitening(motion, phi, noise, noise[15] * noise[16], block)
         update_estimate(memory[place : place + 272], V, wrench, long_term_root)
@@ -153,7 +153,7 @@ def _update_filter(memory, place, block, noise):
 
 @njit(cache=True)
 def _restart(memory, place):
-    put(memory, place, memory, _KNOWN, 272)
+    copy_into(memory, place, memory, _KNOWN, 272)
     if place == _NEW:
         for j in range(10):
             memory[place + 16 + 17 * (6 + j)] += OBJECT_STD[j] ** 2
@@ -219,7 +219,7 @@ def _test_block(memory, block, noise, window, hold, bound):
             _restart(memory, _NEW)
         return
     # Return to the known load if it explains the blocks without an update.
-    put(memory, _WATCH, memory, _KNOWN, 272)
+    copy_into(memory, _WATCH, memory, _KNOWN, 272)
     chi = _update_filter(memory, _WATCH, block, noise)
     memory[_RETURN_SUM] = min(0.0, memory[_RETURN_SUM] + chi - _SLACK)
     if memory[_RETURN_SUM] < _RETURN:
@@ -247,7 +247,7 @@ def _test_block(memory, block, noise, window, hold, bound):
     elif memory[_STATE] == CHANGED and _is_identified(memory, bound):
         memory[_STATE] = memory[_BASE] = IDENTIFIED
         _inflate_inertia_variances(memory, noise, block)
-        put(memory, _KNOWN, memory, _NEW, 272)
+        copy_into(memory, _KNOWN, memory, _NEW, 272)
         memory[_NEW_COUNT] = memory[_AGE] * block
         for i in range(_SQUARES - _RESIDUAL):
             memory[_RESIDUAL + i] = memory[_SQUARES + i] * (block / memory[_AGE])
@@ -280,7 +280,7 @@ def change_parameters(
         model_error: relative error of the load's wrench.
         bound: required standard deviation of a new load's mass, relative to the change of mass.
     """
-    positive("period", period)
+    positive_array("period", period)
     if not 0.0 <= model_error < 1.0:
         raise DrakeTeleopError(
             f"{model_error} is not at least 0 and below 1",
@@ -288,13 +288,15 @@ def change_parameters(
             remedy="give the relative error of the model",
         )
     bound = (
-        max(DEFAULT_BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
+        max(DEFAULT_BOUND, 2.0 * model_error)
+        if bound is None
+        else float(positive_array("bound", bound))
     )
     block = max(1, round(BLOCK_S / period))
     window, hold, memory = (
         max(1, round(x / (block * period))) for x in (WINDOW_S, HOLD_S, MODEL_ERROR_S)
     )
-    std = positive("wrench_std", wrench_std, 6), checked("motion_std", motion_std, 9)
+    std = positive_array("wrench_std", wrench_std, 6), finite_array("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
     return block, np.append(noise, memory), window, hold, bound
 
@@ -309,7 +311,7 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     unknown = np.diag(P) > prior
     P[unknown, :] = P[:, unknown] = 0.0
     P[unknown, unknown] = prior[unknown]
-    P[range(6), range(6)] += np.square(checked("offset_drift", offset_drift, 6))
+    P[range(6), range(6)] += np.square(finite_array("offset_drift", offset_drift, 6))
     # Undetermined inertias: those of a point mass, as in `logs.processing.usable_phi`.
     phi = theta[6:].copy()
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
@@ -317,7 +319,7 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     memory = np.zeros(SIZE)
     memory[_KNOWN : _KNOWN + 16] = np.concatenate([theta[:6], phi])
     memory[_KNOWN + 16 : _WATCH] = P.ravel()
-    put(memory, _WATCH, memory, _KNOWN, 272)
+    copy_into(memory, _WATCH, memory, _KNOWN, 272)
     return memory
 
 
@@ -352,7 +354,7 @@ def watch_load(
     alpha: ArrayLike,
 ) -> NDArray[np.int_]:
     """Return the detector's states (N,) for N samples of a log, as indices into `STATES`."""
-    _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
     _watch(memory, np.concatenate(rows, axis=1), states, *parameters)
     return states
@@ -369,7 +371,7 @@ def identified_load(memory: Array, known: Identification) -> Identification:
         phi=phi,
         offsets=memory[_KNOWN : _KNOWN + 6].copy(),
         covariance=covariance,
-        identifiable=worth_stating(np.sqrt(np.diag(covariance)), phi),
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), phi),
         residual_rms=np.sqrt(memory[_RESIDUAL:_SQUARES]),
         method="recursive least squares",
         samples=int(memory[_NEW_COUNT]),

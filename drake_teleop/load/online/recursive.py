@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked_rows, positive
+from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
 from drake_teleop.load.batch.uncertainty import prior_dominated
-from drake_teleop.load.identification import WORTH_STATING, Identification, worth_stating
+from drake_teleop.load.identification import WORTH_STATING, Identification, is_precise_enough
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
@@ -117,9 +117,9 @@ class RecursiveEstimator(ABC):
             raise DrakeTeleopError(
                 f"{bound} is not positive", where="bound", remedy="give a number above 0"
             )
-        self._noise_std = positive("noise_std", noise_std, 6)
+        self._noise_std = positive_array("noise_std", noise_std, 6)
         self._forgetting, self._bound = float(forgetting), float(bound)
-        self._prior = positive("prior_std", prior_std, 16) ** 2
+        self._prior = positive_array("prior_std", prior_std, 16) ** 2
         self._theta, self._samples = np.zeros(16), 0
         self._memory = self.initial_memory(self._theta)
 
@@ -187,7 +187,9 @@ class RecursiveEstimator(ABC):
 
     def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
         """Process N samples of a free motion, (N, 6) and (N, 3); faster than `update`."""
-        _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+        _, rows = broadcast_to_rows(
+            wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
+        )
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
@@ -213,7 +215,7 @@ class RecursiveEstimator(ABC):
 
     def _is_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
         certain = ~prior_dominated(deviations, np.sqrt(self._prior))
-        return certain & worth_stating(deviations * (WORTH_STATING / bound), theta[6:])
+        return certain & is_precise_enough(deviations * (WORTH_STATING / bound), theta[6:])
 
     def _condition_number(self) -> float:
         information = np.linalg.inv(self.covariance)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked
+from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.moments import coefficients
 from drake_teleop.load.online.recursive import (
@@ -331,7 +331,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         prior_std: ArrayLike = PRIOR_STD,
         bound: float = MAX_SETTLED_STD,
     ) -> None:
-        self._motion_std = checked("motion_std", motion_std, 9)
+        self._motion_std = finite_array("motion_std", motion_std, 9)
         if (self._motion_std < 0.0).any():
             raise DrakeTeleopError(
                 f"has the negative value {self._motion_std.min():g}",

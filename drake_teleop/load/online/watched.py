@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.load.online import change
 from drake_teleop.load.online.change import (
     CHANGED,
@@ -82,7 +82,7 @@ def _is_at_rest(memory, sample, period):
         rate += memory[_OMEGA + i] ** 2
     if shift > _MAX_SHIFT**2 or rate > _MAX_RATE**2:
         memory[_REST_SAMPLES] = 0.0
-        put(memory, _REST_S, memory, _S, 3)
+        copy_into(memory, _REST_S, memory, _S, 3)
     memory[_REST_SAMPLES] += 1.0
     return memory[_REST_SAMPLES] * period > MIN_REST_S
 
@@ -95,10 +95,10 @@ def _force_has_changed(memory, residual, age, period):
     for i in range(_RESIDUAL, _RESIDUAL + 6):
         memory[i] += share * (residual[i - _RESIDUAL] - memory[i])
     if age * period < 2.0 * _LOW_PASS_S:
-        put(lowest, 0, low_passed, 0, 3)
-        put(highest, 0, low_passed, 0, 3)
-    put(lowest, 0, np.minimum(lowest, low_passed), 0, 3)
-    put(highest, 0, np.maximum(highest, low_passed), 0, 3)
+        copy_into(lowest, 0, low_passed, 0, 3)
+        copy_into(highest, 0, low_passed, 0, 3)
+    copy_into(lowest, 0, np.minimum(lowest, low_passed), 0, 3)
+    copy_into(highest, 0, np.maximum(highest, low_passed), 0, 3)
     differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
     memory[_CHANGED_SAMPLES] = memory[_CHANGED_SAMPLES] + 1.0 if differs else 0.0
     return memory[_CHANGED_SAMPLES] * period > MIN_EXPLAINED_S
@@ -135,7 +135,7 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
     elif memory[_STATE] != OTHER_LOAD:
         other = verdict == CHANGED and force_changed and _is_within_reach(known, new_load(watch))
         memory[_STATE] = OTHER_LOAD if other else DISTURBED
-    put(target, 0, known, 0, 16)
+    copy_into(target, 0, known, 0, 16)
     if memory[_STATE] == OTHER_LOAD:
-        put(target, 6, fallback, 0, 10)
+        copy_into(target, 6, fallback, 0, 10)
     out += period / (FADE_TIME_S + period) * (target - out)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.identification import worth_stating
+from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.candidates import similar_factors
 from drake_teleop.logs.causes.state import State
@@ -53,7 +53,7 @@ class Stretch:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
+        return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:

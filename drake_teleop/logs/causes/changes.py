@@ -9,7 +9,7 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, runs
+from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import DELAY, Step
 from drake_teleop.logs.causes.state import (
@@ -244,7 +244,7 @@ def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     out = np.zeros(len(flags), bool)
-    for a, b in runs(closed):
+    for a, b in find_runs_of_true(closed):
         out[a:b] = b - a >= shortest
     return out
 
@@ -420,5 +420,5 @@ def _spans(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> Spans:
     last = len(t) - 1
     return tuple(
         (float(t[a * rows]) - half, float(t[min(b * rows - 1, last)]) + half)
-        for a, b in runs(contact_blocks)
+        for a, b in find_runs_of_true(contact_blocks)
     )

@@ -24,7 +24,7 @@ from drake_teleop.common.files import (
     write_json,
     write_text,
 )
-from drake_teleop.common.html import render
+from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import show_progress
 from drake_teleop.common.texts import read_yaml, yaml_text
@@ -120,7 +120,9 @@ def dataset_command(
         write_text(out / "description.yaml", yaml_text(streams))
         shared.identification.save(out / "identification.json")
         summary = plain(_summary(dataset, copied, shared, rows))
-        report = render("drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary)
+        report = render_page(
+            "drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary
+        )
         write_text(out / "report.html", report)
         shutil.rmtree(work)
         write_json(out / "summary.json", summary)

@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.contact.detection import MAX_NOISE_LEVEL, fit_noise_floor
 from drake_teleop.load.contact.noise_floor import NoiseFloor, Samples, finite_covariance
-from drake_teleop.load.identification import Identification, worth_stating
+from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.dataset.episode_verdict import (
     CALM_WIDTH,
     STEPS,
@@ -167,7 +167,7 @@ def _pooled(
         phi=fitted,
         offsets=np.median(offsets, axis=0),
         covariance=covariance,
-        identifiable=worth_stating(np.sqrt(np.diag(covariance)), fitted),
+        identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), fitted),
         condition_number=float(np.linalg.cond(gram / np.outer(size, size))),
         delay_s=0.0,
         residual_rms=noise,

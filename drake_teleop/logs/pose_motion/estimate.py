@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, one_blas_thread
+from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.linear_model import (
@@ -241,9 +241,9 @@ def _find_motion(
     fewest: int,
     load: Array | None = None,
 ) -> tuple[PoseMotion, Spectra, Window]:
-    t = checked("t", t, np.size(t))
-    wrench = checked("wrench", wrench, len(t), 6)
-    gravity = checked("gravity_W", gravity_W, 3)
+    t = finite_array("t", t, np.size(t))
+    wrench = finite_array("wrench", wrench, len(t), 6)
+    gravity = finite_array("gravity_W", gravity_W, 3)
     grid, poses = Grid.of(t, wrench, load), poses.continued()
     known, guess = delay is not None, delay or 0.0
     taper = _base_taper(grid, poses, lost, guess)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, checked, number
+from drake_teleop.common.numeric import Array, finite_array, to_float
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
@@ -266,7 +266,7 @@ def delay_of(
     if log.static:
         return 0.0, "static"
     if not isinstance(delay, str):
-        return float(checked("delay", number("delay", delay))), "given"
+        return float(finite_array("delay", to_float("delay", delay))), "given"
     if delay != "auto":
         raise DrakeTeleopError(
             f"{delay!r} is neither seconds nor auto", where="delay", remedy="give a number or auto"

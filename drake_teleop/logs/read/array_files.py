@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 
 _MAX_VALUES, _MAX_ROW = 2**28, 64  # numbers of an array, and of one row: wider ones are images
 
@@ -71,7 +71,7 @@ def import_optional(name: str, path: Path) -> Any:
         raise DrakeTeleopError(
             f"reading {path.suffix} files needs {name}",
             where=str(path),
-            remedy=install_extra("formats"),
+            remedy=remedy_to_install_extra("formats"),
         ) from None
 
 

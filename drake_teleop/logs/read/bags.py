@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 from drake_teleop.logs.read.description import Imu, Pose, Static, Wrench
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -165,7 +165,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
         raise DrakeTeleopError(
             "bags are read by the library rosbags, which is not installed",
             where=str(path),
-            remedy=install_extra("ros"),
+            remedy=remedy_to_install_extra("ros"),
         ) from error
     try:
         for file in path.iterdir() if path.is_dir() else [path]:

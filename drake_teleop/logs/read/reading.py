@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
-from drake_teleop.common.numeric import Array, number
-from drake_teleop.common.rotations import nearest_rotation, quaternions, rotation_matrices
+from drake_teleop.common.numeric import Array, to_float
+from drake_teleop.common.rotations import nearest_rotation, quaternions_of, rotation_matrices
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
@@ -83,7 +83,7 @@ def read_log(
         DrakeTeleopError: naming file, field and remedy.
     """
     expect((str, Path), path, "log", "give the file's name")
-    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
+    if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
             f"{bandwidth_hz:g} Hz is too low", where="bandwidth_hz", remedy="give more, or None"
         )
@@ -261,7 +261,7 @@ class _Reader:
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
                     R_WS = R_WS @ stream.R_SP.T
-                    q = quaternions(R_WS)
+                    q = quaternions_of(R_WS)
                 if position is not None:  # from Po to So
                     position[part] -= R_WS @ origin
             quaternion[part] = q

@@ -13,7 +13,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import (
     WIDTHS,
     nearest_rotation,
-    quaternions,
+    quaternions_of,
     rotation_error,
     rotation_matrices,
 )
@@ -122,7 +122,7 @@ class Orientations:
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
         """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z]."""
         if not self._orientation.form.startswith("quaternion"):
-            return quaternions(self.rotations(rows))
+            return quaternions_of(self.rotations(rows))
         q = self._columns[rows]
         if self._orientation.form == "quaternion_xyzw":
             q = np.roll(q, 1, axis=1)

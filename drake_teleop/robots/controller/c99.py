@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from drake_teleop.common.html import render
+from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.version import __version__
 from drake_teleop.load.identification import Identification
@@ -136,7 +136,7 @@ def rendered(name: str, **values: Any) -> str:
         return [plain(each) for each in value] if isinstance(value, (list, tuple)) else value
 
     values = {key: plain(value) for key, value in ({"version": __version__} | values).items()}
-    return render(PACKAGE, f"templates/{name}.j2", **values) + "\n"
+    return render_page(PACKAGE, f"templates/{name}.j2", **values) + "\n"
 
 
 def _test_vector(target: Target) -> str:

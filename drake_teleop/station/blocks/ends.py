@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_teleop.common.blocks import DoubleOnly, weak_callback
-from drake_teleop.common.numeric import checked
+from drake_teleop.common.numeric import finite_array
 from drake_teleop.station.channel.channel import (
     PORTS,
     SHORTEST_TIMEOUT,
@@ -57,8 +57,8 @@ class _PassivityEnd(DoubleOnly, LeafSystem):
         timeout: float = SHORTEST_TIMEOUT,
     ) -> None:
         super().__init__()
-        start, scales = checked("start", start, 7), checked("scales", scales, 2)
-        rotation = np.eye(3) if R_WB is None else checked("R_WB", R_WB, 3, 3)
+        start, scales = finite_array("start", start, 7), finite_array("scales", scales, 2)
+        rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
         parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
         frame = np.concatenate([rotation.ravel(), scales])
         self._method = methods.steps_of(passivity.method)

@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_teleop.common.blocks import DoubleOnly, weak_callback
-from drake_teleop.common.numeric import Array, checked
+from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import DISPLAYED, display_into, initial_display_state
 
@@ -44,7 +44,7 @@ class ForceDisplay(DoubleOnly, LeafSystem):
     def __init__(self, device: DisplayDevice, period: float, start: ArrayLike = (0.0,) * 6) -> None:
         super().__init__()
         self._period, self._numbers, self._jacobian = period, device.numbers, np.zeros((6, 6))
-        memory = initial_display_state(checked("start", start, 6), device.numbers)
+        memory = initial_display_state(finite_array("start", start, 6), device.numbers)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self._position = self.DeclareVectorInputPort("joint_position", 6)
         self.DeclareDiscreteState(memory)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, LeafSystem
 
 from drake_teleop.common.blocks import DoubleOnly
-from drake_teleop.common.numeric import Array, checked
+from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.regressor import BEFORE_JOINTS, SPECIFIC_FORCE, sample_parts
 from drake_teleop.station.estimation import contact_detection, load_estimator
@@ -69,11 +69,11 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
     ) -> None:
         super().__init__(
             load_estimator.LoadEstimatorConfig(enabled=True) if config is None else config,
-            checked("noise_std", noise_std, 6),
-            np.zeros(9) if motion_std is None else checked("motion_std", motion_std, 9),
+            finite_array("noise_std", noise_std, 6),
+            np.zeros(9) if motion_std is None else finite_array("motion_std", motion_std, 9),
             period,
             BEFORE_JOINTS,
-            np.zeros(16) if initial is None else checked("initial", initial, 16),
+            np.zeros(16) if initial is None else finite_array("initial", initial, 16),
         )
 
     def _declare_sample(self, size: int) -> Any:
@@ -115,7 +115,7 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
     ) -> None:
         config = contact_detection.ContactDetectionConfig() if config is None else config
         super().__init__(config, floor, None, period)
-        self._gravity_W = checked("gravity_W", gravity_W, 3)
+        self._gravity_W = finite_array("gravity_W", gravity_W, 3)
         self._orientation = self.DeclareVectorInputPort("R_WS", 9)
 
     def _declare_sample(self, arm: Any) -> Any:

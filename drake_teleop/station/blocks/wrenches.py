@@ -12,7 +12,7 @@ from pydrake.systems.scalar_conversion import TemplateSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import checked
+from drake_teleop.common.numeric import finite_array
 from drake_teleop.load.compensation import (
     add_weight_into,
     scaled_wrench_into,
@@ -58,7 +58,7 @@ def NonContactWrench_(T: Any) -> Any:
 
         def _construct(self, phi: ArrayLike | None = None, converter: Any = None) -> None:
             LeafSystem_[T].__init__(self, converter)
-            self._phi = np.zeros(10) if phi is None else checked("phi", phi, 10)
+            self._phi = np.zeros(10) if phi is None else finite_array("phi", phi, 10)
             self._parameter = self.DeclareNumericParameter(BasicVector_[T](self._phi))
             self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION]
             self._load = self.DeclareVectorInputPort("load", 10)
@@ -122,8 +122,8 @@ def WrenchScaling_(T: Any) -> Any:
         ) -> None:
             LeafSystem_[T].__init__(self, converter)
             self._config = config = ForceScalingConfig() if config is None else config
-            self._R_WB = np.eye(3) if R_WB is None else checked("R_WB", R_WB, 3, 3)
-            self._gravity_W, self._scales = checked("gravity_W", gravity_W, 3), config.scales()
+            self._R_WB = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
+            self._gravity_W, self._scales = finite_array("gravity_W", gravity_W, 3), config.scales()
             ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION)]
             ports += [("load_estimate", 16), ("R_WS", 9)]
             inputs = [self.DeclareVectorInputPort(*port) for port in ports]

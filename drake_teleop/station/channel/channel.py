@@ -14,11 +14,11 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import methods
@@ -212,7 +212,7 @@ def master_end(
     for g in range(2):
         work[g] -= dot(held, dx, g)
     hand[:] = 0.0
-    if sound(hand_B):
+    if all_in_range(hand_B):
         _wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
@@ -245,7 +245,7 @@ def slave_end(
     for g in range(2):
         work[g] += dot(held, dx, g)
     load = memory[LOAD_WRENCH]
-    if not (sound(wrench_B) and sound(load_B)):
+    if not (all_in_range(wrench_B) and all_in_range(load_B)):
         valid = False
         ends[_VALID_TIME] = 0.0
     elif saturated:
@@ -260,7 +260,7 @@ def slave_end(
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_VALID_TIME] += T
-    put(wrench, 0, held, 0, 6)
+    copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[INPUTS_FINITE] > 0.5
     methods.slave_step(
         steps, received, fresh, before[:7], twist, dx, wrench, T, parameters, memory, command,
@@ -280,10 +280,10 @@ def slave_end(
 @njit(cache=True)
 def _increment_into(pose, before, dx):
     """Write the increment `dx` (6,) since the last finite pose; return whether `pose` is finite."""
-    valid = sound(pose)
+    valid = all_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)
-        put(before, 0, pose, 0, 7)
+        copy_into(before, 0, pose, 0, 7)
     if not valid or before[7] > 0.0:
         dx[:] = 0.0
     before[7] = 0.0 if valid else 1.0

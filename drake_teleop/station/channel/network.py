@@ -15,7 +15,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import check_ranges, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.packet import (
     LOAD,
     POSE,
@@ -267,7 +267,7 @@ def send(p, state, k, packet):
             # The previous content of the slot is older.
             in_transit[(k + travel) % slots] = k
     # A lost packet is written too, because a later redundant packet may contain it.
-    put(in_transit, slots + size * (k % slots), packet, 0, size)
+    copy_into(in_transit, slots + size * (k % slots), packet, 0, size)
 
 
 @njit(cache=True)
@@ -286,10 +286,10 @@ def receive(p, state, k, packet):
     fresh = newest > receiver[_NEWEST_READ]
     if fresh:
         receiver[_NEWEST_READ], receiver[_SILENT_STEPS] = newest, 0.0
-        put(receiver, _LAST_PACKET, in_transit, slots + size * (int(newest) % slots), size)
+        copy_into(receiver, _LAST_PACKET, in_transit, slots + size * (int(newest) % slots), size)
     else:
         receiver[_SILENT_STEPS] += 1.0
-    put(packet, 0, receiver, _LAST_PACKET, size)
+    copy_into(packet, 0, receiver, _LAST_PACKET, size)
     if not fresh:
         _fill_silence(p[_POLICY], receiver[_SILENT_STEPS] * p[_PERIOD], packet)
     return int(receiver[_NEWEST_READ]), fresh

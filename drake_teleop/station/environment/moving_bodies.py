@@ -24,14 +24,14 @@ from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import (
-    conjugate,
+    conjugate_quaternion,
     cross,
-    multiply,
-    normalized,
+    normalized_quaternion,
     plus,
-    rotate,
-    three,
-    times,
+    quaternion_product,
+    rotate_vector,
+    scale_vector,
+    vector_at,
 )
 
 Array = NDArray[np.float64]
@@ -113,34 +113,36 @@ def bodies_into(joints, state, out):
         turn, place, spin, speed = (1.0, 0.0, 0.0, 0.0), still, still, still
         if row[_PARENT] >= 0.0:
             above = out[int(row[_PARENT])]
-            turn, place = _quaternion(above, 0), three(above, 4)
-            spin, speed = three(above, 7), three(above, 10)
+            turn, place = _quaternion(above, 0), vector_at(above, 4)
+            spin, speed = vector_at(above, 7), vector_at(above, 10)
         # From parent to F.
-        lever = rotate(turn, three(row, _F + 4))
+        lever = rotate_vector(turn, vector_at(row, _F + 4))
         place, speed = plus(place, lever), plus(speed, cross(spin, lever))
-        turn = multiply(turn, _quaternion(row, _F))
+        turn = quaternion_product(turn, _quaternion(row, _F))
         # From F to M.
-        q, v, kind, axis = int(row[_Q]), int(row[_V]), row[_KIND], three(row, _AXIS)
+        q, v, kind, axis = int(row[_Q]), int(row[_V]), row[_KIND], vector_at(row, _AXIS)
         if kind == _REVOLUTE:
-            spin = plus(spin, times(state[v], rotate(turn, axis)))
+            spin = plus(spin, scale_vector(state[v], rotate_vector(turn, axis)))
             half = 0.5 * state[q]
-            x, y, z = times(sin(half), axis)
-            turn = multiply(turn, (cos(half), x, y, z))
+            x, y, z = scale_vector(sin(half), axis)
+            turn = quaternion_product(turn, (cos(half), x, y, z))
         elif kind == _PRISMATIC:
-            axis = rotate(turn, axis)
-            lever = times(state[q], axis)
+            axis = rotate_vector(turn, axis)
+            lever = scale_vector(state[q], axis)
             place = plus(place, lever)
-            speed = plus(plus(speed, cross(spin, lever)), times(state[v], axis))
+            speed = plus(plus(speed, cross(spin, lever)), scale_vector(state[v], axis))
         elif kind == _FREE:
-            lever = rotate(turn, three(state, q + 4))
+            lever = rotate_vector(turn, vector_at(state, q + 4))
             place = plus(place, lever)
-            speed = plus(plus(speed, cross(spin, lever)), rotate(turn, three(state, v + 3)))
-            spin = plus(spin, rotate(turn, three(state, v)))
-            turn = multiply(turn, normalized(_quaternion(state, q)))
+            speed = plus(
+                plus(speed, cross(spin, lever)), rotate_vector(turn, vector_at(state, v + 3))
+            )
+            spin = plus(spin, rotate_vector(turn, vector_at(state, v)))
+            turn = quaternion_product(turn, normalized_quaternion(_quaternion(state, q)))
         # From M to B.
-        lever = rotate(turn, three(row, _M + 4))
+        lever = rotate_vector(turn, vector_at(row, _M + 4))
         place, speed = plus(place, lever), plus(speed, cross(spin, lever))
-        turn = multiply(turn, _quaternion(row, _M))
+        turn = quaternion_product(turn, _quaternion(row, _M))
         out[k, 0], out[k, 1], out[k, 2], out[k, 3] = turn
         out[k, 4], out[k, 5], out[k, 6] = place
         out[k, 7], out[k, 8], out[k, 9] = spin
@@ -157,7 +159,7 @@ def _interpolate_hermite(h, u, a, a_dot, b, b_dot):
 
 @njit(cache=True)
 def _quaternion_rate(spin, turn):
-    return multiply((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
+    return quaternion_product((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
 
 
 @njit(cache=True)
@@ -176,12 +178,17 @@ def interpolate_bodies(joints, h, u, start, end, out):
                     h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
                 )
             a, b = _quaternion(start, q), _quaternion(end, q)
-            a_dot, b_dot = _quaternion_rate(three(start, v), a), _quaternion_rate(three(end, v), b)
+            a_dot, b_dot = (
+                _quaternion_rate(vector_at(start, v), a),
+                _quaternion_rate(vector_at(end, v), b),
+            )
             w, w_dot = _interpolate_hermite(h, u, a[0], a_dot[0], b[0], b_dot[0])
             x, x_dot = _interpolate_hermite(h, u, a[1], a_dot[1], b[1], b_dot[1])
             y, y_dot = _interpolate_hermite(h, u, a[2], a_dot[2], b[2], b_dot[2])
             z, z_dot = _interpolate_hermite(h, u, a[3], a_dot[3], b[3], b_dot[3])
             out[q], out[q + 1], out[q + 2], out[q + 3] = w, x, y, z
-            spin = multiply((w_dot, x_dot, y_dot, z_dot), conjugate((w, x, y, z)))
+            spin = quaternion_product(
+                (w_dot, x_dot, y_dot, z_dot), conjugate_quaternion((w, x, y, z))
+            )
             scale = 2.0 / (w * w + x * x + y * y + z * z)
             out[v], out[v + 1], out[v + 2] = scale * spin[1], scale * spin[2], scale * spin[3]

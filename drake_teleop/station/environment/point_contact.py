@@ -21,15 +21,15 @@ from pydrake.systems.framework import Context
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import (
-    apply,
+    apply_matrix,
     dot,
+    matrix_as_tuple,
+    matrix_at,
     minus,
-    nine,
     plus,
-    rows,
-    three,
-    times,
+    scale_vector,
     transposed,
+    vector_at,
 )
 
 Array = NDArray[np.float64]
@@ -192,8 +192,8 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
     w0 -= pair[13] + deflection * pair[19]
     w1 -= pair[14] + deflection * pair[20]
     w2 -= pair[15] + deflection * pair[21]
-    R_WBox, w = nine(pair, 4), (w0, w1, w2)
-    d = apply(transposed(R_WBox), w)
+    R_WBox, w = matrix_at(pair, 4), (w0, w1, w2)
+    d = apply_matrix(transposed(R_WBox), w)
     outside, deepest, face = 0.0, -np.inf, 0
     for i in range(3):
         beyond = abs(d[i]) - pair[16 + i]
@@ -212,7 +212,7 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
         beyond = abs(d[i]) - pair[16 + i]
         if (outside > 0.0 and beyond > 0.0) or (outside == 0.0 and i == face):
             normal[3 + i] = np.copysign(beyond / distance if outside > 0.0 else 1.0, d[i])
-    n_W = apply(R_WBox, three(normal, 3))
+    n_W = apply_matrix(R_WBox, vector_at(normal, 3))
     # Halfway between the sphere's deepest point and the box's surface.
     inwards = (radius + distance) / 2
     for i in range(3):
@@ -229,21 +229,21 @@ def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: fl
     `pair` (40,) is a row of `Pairs.watched`, for the tool's box; `box` (28,) is this row with the
     present pose of the other box. The bound is the largest gap along an edge of either box.
     """
-    R, between = rows(R_WS), minus(three(p_WS, 0), three(box, 13))
-    between = plus(between, apply(R, three(pair, 0)))
-    between = minus(between, times(deflection, three(box, 19)))
+    R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
+    between = plus(between, apply_matrix(R, vector_at(pair, 0)))
+    between = minus(between, scale_vector(deflection, vector_at(box, 19)))
     edges, halves, largest = np.empty((6, 3)), np.empty(6), -np.inf
     for i in range(3):
         k = WIDTH + i  # columns of R_SBox: directions of the edges
-        edge = apply(R, (pair[k], pair[k + 3], pair[k + 6]))
+        edge = apply_matrix(R, (pair[k], pair[k + 3], pair[k + 6]))
         edges[i, 0], edges[i, 1], edges[i, 2] = edge
         edges[3 + i, 0], edges[3 + i, 1], edges[3 + i, 2] = box[4 + i], box[7 + i], box[10 + i]
         halves[i], halves[3 + i] = pair[WIDTH + 9 + i], box[16 + i]
     for i in range(6):
-        axis = three(edges[i], 0)
+        axis = vector_at(edges[i], 0)
         gap = abs(dot(between, axis))
         for j in range(6):
-            gap -= halves[j] * abs(dot(three(edges[j], 0), axis))
+            gap -= halves[j] * abs(dot(vector_at(edges[j], 0), axis))
         largest = max(largest, gap)
     return largest
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, sound
+from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
@@ -59,7 +59,7 @@ def update_flag(memory, sample, estimate, acceleration, settings):
     `acceleration` (3,) is the acceleration of So, in S [m/s^2]; `settings` are those of a
     `ContactDetector`.
     """
-    if not (sound(sample) and sound(estimate)):
+    if not (all_in_range(sample) and all_in_range(estimate)):
         return memory[FLAG] != 0.0
     contact = np.empty(6)
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]

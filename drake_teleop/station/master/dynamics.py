@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
 from drake_teleop.station.master.numbers import (
     COULOMB,
@@ -66,10 +66,10 @@ def step(state, hand_wrench, motor, device, period, work, stages):
     torques or forces at the joints.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
-    put(stage, 0, state, 0, 12)
+    copy_into(stage, 0, state, 0, 12)
     total[:] = 0.0
     for i in range(4):
-        put(slope, 0, stage, 6, 6)
+        copy_into(slope, 0, stage, 6, 6)
         if device[IN_TASK_SPACE] != 0.0:
             task_space.acceleration_into(
                 stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]

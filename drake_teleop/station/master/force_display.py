@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.passivity.memory import Slots
@@ -89,12 +89,12 @@ def display_into(wrench, device, numbers, period, J, drive):
     `device` (27,) is the port `for_display` of `MasterDevice`; `drive` (27,) is written.
     """
     q, fault = device[_POSITIONS], _NO_FAULT
-    put(drive, 6, device, 6, _WATCH.stop - 6)
-    if sound(q):
-        put(drive, _LAST_POSITIONS.start, q, 0, 6)
+    copy_into(drive, 6, device, 6, _WATCH.stop - 6)
+    if all_in_range(q):
+        copy_into(drive, _LAST_POSITIONS.start, q, 0, 6)
     else:
         q, fault = device[_LAST_POSITIONS], _HAND_FAULT
-    if not sound(wrench):
+    if not all_in_range(wrench):
         fault = _WRENCH_FAULT
     displayed, drive[_FAULT] = drive[DISPLAYED], fault
     jacobian_into(q, numbers, J)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context
 
-from drake_teleop.common.blocks import sound
+from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import cross, put, quaternion_of, three
+from drake_teleop.common.vectors import copy_into, cross, quaternion_of, vector_at
 from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, display_into
 from drake_teleop.station.master.numbers import HAND_MASS
@@ -61,8 +61,8 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
     forward_kinematics(arm, q, R_BE, p_BE)
-    put(wrench, 0, applied, 0, 6)  # becomes the wrench about the origin of B
-    moment = cross(three(p_BE, 0), three(applied, 0))
+    copy_into(wrench, 0, applied, 0, 6)  # becomes the wrench about the origin of B
+    moment = cross(vector_at(p_BE, 0), vector_at(applied, 0))
     for i in range(3):
         wrench[3 + i] += moment[i]
     for i in range(n):
@@ -124,12 +124,12 @@ def step_leader(
     the operator carries.
     """
     n = joints.shape[1]
-    put(display, 6, drive, 6, drive.shape[0] - 6)
-    if sound(hand_wrench) and sound(drive[:6]) and sound(state):
+    copy_into(display, 6, drive, 6, drive.shape[0] - 6)
+    if all_in_range(hand_wrench) and all_in_range(drive[:6]) and all_in_range(state):
         F, applied, motor = np.empty(6), np.empty(6), np.empty(n)
         for i in range(3):
             F[i], F[3 + i] = drive[i], drive[5 - i]
-        put(applied, 0, hand_wrench, 0, 6)
+        copy_into(applied, 0, hand_wrench, 0, 6)
         # The arm's own gravity vector may have any direction.
         g = arm[n, GRAVITY : GRAVITY + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
@@ -137,9 +137,9 @@ def step_leader(
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
         motors_into(bare, arm, joints, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
-        put(stage, 0, state, 0, 2 * n)
+        copy_into(stage, 0, state, 0, 2 * n)
         for i in range(4):
-            put(slope, 0, stage, n, n)
+            copy_into(slope, 0, stage, n, n)
             leader_acceleration(arm, joints, stage[:n], stage[n:], applied, motor, slope[n:])
             weight = 1.0 / 6.0 if i in (0, 3) else 1.0 / 3.0
             ahead = 1.0 if i == 2 else 0.5
@@ -150,7 +150,7 @@ def step_leader(
             state[k] += period * total[k]
         _pose_and_twist(arm, state[:n], state[n:], pose, twist)
     for i in range(3):  # position for the display
-        display[i] = pose[4 + i] if sound(state) else math.nan
+        display[i] = pose[4 + i] if all_in_range(state) else math.nan
 
 
 @njit(cache=True)

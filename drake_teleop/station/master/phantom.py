@@ -21,7 +21,14 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import cross, dot, multiply, plus, solve, times
+from drake_teleop.common.vectors import (
+    cross,
+    dot,
+    plus,
+    quaternion_product,
+    scale_vector,
+    solve_by_cholesky,
+)
 from drake_teleop.station.master.numbers import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
 
 GRAVITY = 9.81  # m/s^2, along -z_B
@@ -173,7 +180,7 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
     # moments of inertia give no gyroscopic moment.
     omega, alpha = (0.0, 0.0, v[0]), (0.0, 0.0, 0.0)
     for k in range(2, 6):
-        turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
+        turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
         alpha = plus(alpha, cross(omega, turn))
         omega = plus(omega, turn)
         if k >= 3:
@@ -226,7 +233,7 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
             vdot[i] += J[k, i] * hand_wrench[k]
     _subtract_coriolis(q, v, J, device[HAND_MASS], device[HAND_INERTIA], vdot)
     _add_friction_and_stops(q, v, device[COULOMB], device[VISCOUS], vdot)
-    solve(M, vdot, 6)
+    solve_by_cholesky(M, vdot, 6)
 
 
 @njit(cache=True)
@@ -239,7 +246,7 @@ def pose_into(q, pose):
     # Rz(q1) Ry(-q3), then Rz(q4) Ry(q5), their product, then Rx(q6).
     a = c1 * c3, -s1 * s3, c1 * s3, s1 * c3
     b = c4 * c5, -s4 * s5, c4 * s5, s4 * c5
-    w, x, y, z = multiply(a, b)
+    w, x, y, z = quaternion_product(a, b)
     pose[0] = w * c6 - x * s6
     pose[1] = x * c6 + w * s6
     pose[2] = y * c6 + z * s6

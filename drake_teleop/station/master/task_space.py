@@ -14,7 +14,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import cross, plus, times
+from drake_teleop.common.vectors import cross, plus, scale_vector
 from drake_teleop.station.master.numbers import (
     CENTRE,
     COULOMB,
@@ -92,7 +92,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     inertia = device[INERTIA] + device[HAND_INERTIA]
     omega, bias = (0.0, 0.0, v[3]), (0.0, 0.0, 0.0)
     for k in range(4, 6):
-        turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
+        turn = scale_vector(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
     drag = _friction_factor(

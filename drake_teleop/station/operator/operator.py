@@ -18,7 +18,14 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply, put, rotate
+from drake_teleop.common.vectors import (
+    conjugate_quaternion,
+    copy_into,
+    quaternion_exponential,
+    quaternion_logarithm,
+    quaternion_product,
+    rotate_vector,
+)
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import Training
@@ -141,7 +148,7 @@ def intent_into(packed, start, t, pose, twist):
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
-    put(pose, 4, start, 4, 3)
+    copy_into(pose, 4, start, 4, 3)
     twist[:3] = 0.0
     for n in range(packed.shape[0]):
         row = packed[n]
@@ -154,9 +161,9 @@ def intent_into(packed, start, t, pose, twist):
         for k in range(3):
             pose[4 + k] += level * row[6 + k]
             twist[k] += rate * row[6 + k]
-        turn = exponential((level * row[9], level * row[10], level * row[11]))
-        orientation = multiply(turn, orientation)
-        omega = rotate(turn, omega)
+        turn = quaternion_exponential((level * row[9], level * row[10], level * row[11]))
+        orientation = quaternion_product(turn, orientation)
+        omega = rotate_vector(turn, omega)
         omega = (omega[0] + rate * row[9], omega[1] + rate * row[10], omega[2] + rate * row[11])
     for k in range(4):
         pose[k] = orientation[k]
@@ -198,7 +205,9 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     rotational B].
     """
     intended = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
-    error = logarithm(multiply(intended, conjugate((pose[0], pose[1], pose[2], pose[3]))))
+    error = quaternion_logarithm(
+        quaternion_product(intended, conjugate_quaternion((pose[0], pose[1], pose[2], pose[3])))
+    )
     for k in range(3):
         wrench[k] = impedance[0] * (intent_pose[4 + k] - pose[4 + k])
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import checked, checked_rows
+from drake_teleop.common.numeric import broadcast_to_rows, finite_array
 
 Array = NDArray[np.float64]
 
@@ -167,8 +167,8 @@ def perceive(
             detected.
     """
     rows = {"hand_force": (hand_force, 3), "velocity": (velocity, 3)}
-    _, (force, speed) = checked_rows(**rows)
-    times = checked("t", t, len(force))
+    _, (force, speed) = broadcast_to_rows(**rows)
+    times = finite_array("t", t, len(force))
     steps = np.diff(times)
     if not len(steps) or steps.min() <= 0.0:
         raise DrakeTeleopError(

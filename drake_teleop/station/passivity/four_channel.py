@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -91,7 +91,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             wrench[i] += p[_DAMPER][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
         limit(wrench, g, limits[g])
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, hand, packet)
 
 
@@ -106,7 +106,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             ]
             shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
         moved_pose_into(received[POSE], shift, memory[COMMAND_POSE])
-        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
-    put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+        copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    copy_into(command, 0, memory, COMMAND.start, 13)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)

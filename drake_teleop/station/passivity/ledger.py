@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import ledger_slave
 from drake_teleop.station.passivity.ledger_slave import (
     ANGLE_PER_LENGTH,
@@ -201,7 +201,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         _add_drag_force(g, received, dx, T, p, memory, wrench)
         limit(wrench, g, limits[g])
         packet[ENERGY][g], packet[LEDGER_LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
     packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
 
@@ -258,13 +258,13 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         if same and (near or memory[_WALL_DEPTH] < 0.0):
             offset[:] = 0.0
         else:
-            put(offset, 0, offset_to_slave, 0, 6)
+            copy_into(offset, 0, offset_to_slave, 0, 6)
         memory[IN_CONTACT] = 1.0
         memory[_FRICTION_CONE][:] = 0.0
         memory[_RETREAT_DISTANCE] = 0.0
         for friction in (_FRICTION_AT_HAND, _FRICTION_AT_SLAVE, _FRICTION_REST):
             memory[friction] = 0.0
-        put(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
+        copy_into(memory, _LAST_SLAVE_POSE.start, received, POSE.start, 7)
     fade = 1.0 - min(T / _OFFSET_FADE_S, 1.0)
     for i in range(6):
         offset[i] *= fade
@@ -295,7 +295,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 def _find_slave_step(received, memory):
     last = memory[_LAST_SLAVE_POSE]
     pose_difference_into(received[POSE], last, memory[_SLAVE_STEP])
-    put(last, 0, received, POSE.start, 7)
+    copy_into(last, 0, received, POSE.start, 7)
 
 
 @njit(cache=True)
@@ -308,7 +308,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
     normal = memory[NORMAL]
     step, far_step = work_along(normal, dx), work_along(normal, slave_step)
-    put(wrench, 0, received, WRENCH.start, 6)
+    copy_into(wrench, 0, received, WRENCH.start, 6)
     _remove_normal_component(wrench, p, memory)
     decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
     for g in range(2):

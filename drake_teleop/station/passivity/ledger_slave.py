@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.contact_fit import (
     NUM_SUMS,
     force_change_by_slip,
@@ -190,7 +190,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
     _identify_contact(received, in_contact, dx, contact, T, p, memory)
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     error[:] = 0.0
     if connected:
         pose_difference_into(received[POSE], now, error)
@@ -201,13 +201,13 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     moved_pose_into(now, error, now)
     _limit_motor_energy(now, pose, twist, p, memory)
     _step_servo_model(received, connected, T, p, memory, error)
-    put(command, 0, memory, COMMAND.start, 13)
+    copy_into(command, 0, memory, COMMAND.start, 13)
     fill_packet(memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST], contact, packet)
     if memory[IN_CONTACT] > 0.0:
         correction = memory[_DISPLAYED_FORCE] - wrench_component_along(contact, memory[NORMAL], p)
         for i in range(6):
             packet[WRENCH][i] += correction * memory[NORMAL][i]
-    put(packet, LOAD.start, filtered_load, 0, 6)
+    copy_into(packet, LOAD.start, filtered_load, 0, 6)
     k, compliance = memory[_CONTACT_STIFFNESS], 0.0
     for g in range(2):
         size = length(memory[NORMAL], g)
@@ -458,5 +458,5 @@ def record_command(requested, command, pose, twist, p, memory):
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_motor_energy(command, pose, twist, p, memory):
-                put(memory, COMMAND_POSE.start, command, 0, 7)
+                copy_into(memory, COMMAND_POSE.start, command, 0, 7)
             return

@@ -26,7 +26,7 @@ from drake_teleop.common.config import (
 )
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import Registry
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import (
     force_limit,
     four_channel,
@@ -298,9 +298,9 @@ def _write_packet_number(healthy, memory, packet):
     """Write the packet's number; repeat the last good packet if the inputs are not finite."""
     if healthy:
         packet[INPUTS_FINITE] = 1.0
-        put(memory, PACKET.start, packet, 0, PACKET_SIZE)
+        copy_into(memory, PACKET.start, packet, 0, PACKET_SIZE)
     else:
-        put(packet, 0, memory, PACKET.start, PACKET_SIZE)
+        copy_into(packet, 0, memory, PACKET.start, PACKET_SIZE)
         packet[INPUTS_FINITE] = 0.0
     packet[PACKET_NUMBER] = memory[STEPS]
     memory[STEPS] += 1.0
@@ -353,7 +353,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
     if not healthy:
         memory[COMMAND_TWIST] = 0.0
-        put(command, 0, memory, COMMAND.start, 13)
+        copy_into(command, 0, memory, COMMAND.start, 13)
     else:
         _slave_step(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, HELD_WRENCH
 from drake_teleop.station.passivity.packet import (
     POSE,
@@ -22,15 +22,15 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         wrench[i] = requested[i]
     for g in range(2):
         limit(wrench, g, limits[g])
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     if has_arrived(received):
-        put(memory, COMMAND_POSE.start, received, POSE.start, 7)
-        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
-    put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+        copy_into(memory, COMMAND_POSE.start, received, POSE.start, 7)
+        copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    copy_into(command, 0, memory, COMMAND.start, 13)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)

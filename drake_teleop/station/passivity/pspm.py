@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -118,7 +118,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         limit(wrench, g, limits[g])
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -128,16 +128,16 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
     pose_difference_into(now, pose, offset)
-    put(requested, 0, offset, 0, 6)
+    copy_into(requested, 0, offset, 0, 6)
     if has_arrived(received):
         pose_difference_into(received[POSE], pose, requested)
-        put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
+        copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     for g in range(2):
         _modulate_set_position(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             held[i] = K[g] * offset[i] - D[g] * twist[i]
     moved_pose_into(pose, offset, now)
-    put(command, 0, memory, COMMAND.start, 13)
+    copy_into(command, 0, memory, COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -149,7 +149,7 @@ def record_command(requested, command, pose, twist, p, memory):
     pose_difference_into(requested, pose, other)
     for i in range(6):
         held[i] = K[i // 3] * offset[i] - D[i // 3] * twist[i]
-    put(memory, COMMAND_POSE.start, command, 0, 7)
+    copy_into(memory, COMMAND_POSE.start, command, 0, 7)
     for g in range(2):
         increase = dot(offset, offset, g) - dot(other, other, g)
         memory[LEDGER][g] -= 0.5 * K[g] * increase

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     HAND_VELOCITY,
     HELD_WRENCH,
@@ -123,10 +123,10 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
         pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
-        put(start, 0, last, 0, 7)
+        copy_into(start, 0, last, 0, 7)
         watch[_STOPPING_TIME] = watch[_RESUMING_TIME] = 0.0
     if watch[_RESUMING_TIME] == RESUME_TIME:
-        put(command, 0, requested, 0, 7)
+        copy_into(command, 0, requested, 0, 7)
     else:
         # A blend from the stopping motion to the requested command keeps the velocity continuous
         # even if the end resumes before it has stopped.
@@ -141,8 +141,8 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
             for i in range(6):
                 step[i] *= u * u * u * (10.0 + u * (6.0 * u - 15.0))
             moved_pose_into(command, step, command)
-    put(before, 0, last, 0, 7)
-    put(last, 0, command, 0, 7)
+    copy_into(before, 0, last, 0, 7)
+    copy_into(last, 0, command, 0, 7)
 
 
 @njit(cache=True)
@@ -161,4 +161,4 @@ def retreat(twist, T, p, memory, wrench):
             slowing = (along - dot(wrench, twist, g) / size) / _RETREAT_FILTER_S
             share = max(2.0 - along / p[MAX_RETREAT][g], p[MASS][g] * slowing / size, 0.0)
             scale(wrench, g, min(share, 1.0))
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)

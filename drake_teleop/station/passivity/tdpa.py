@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -166,7 +166,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if p[_DRAG][g] > 0.0:
             _send_surplus(g, p, memory)
         packet[ENERGY][g] = memory[SENT][g]
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
     packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
 
@@ -214,7 +214,7 @@ def _balance_hand_work(g, drained, p, memory):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     for g in range(2):
         memory[LEDGER][g] += credit_new_energy(g, received, memory)
-    put(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
+    copy_into(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
         work = dot(wrench, dx, g)
         memory[_INPUT][g] += max(work, 0.0)
@@ -230,8 +230,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         packet[ENERGY][g] = memory[SENT][g]
         packet[_SLAVE_LEDGER][g] = memory[LEDGER][g]
         _filter_wrench(g, received, dx, wrench, T, p, memory)
-    put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(command, 0, memory, COMMAND.start, 13)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, memory[_FILTERED_WRENCH], packet)
 
 
@@ -315,5 +315,5 @@ def record_command(requested, command, pose, twist, p, memory):
         if command[i] != requested[i]:
             _add_command_work(requested, -1.0, memory)
             _add_command_work(command, 1.0, memory)
-            put(memory, COMMAND_POSE.start, command, 0, 7)
+            copy_into(memory, COMMAND_POSE.start, command, 0, 7)
             return

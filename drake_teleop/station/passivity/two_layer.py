@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -134,7 +134,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         if drained > drainable:
             scale(wrench, g, drainable / drained)
         _limit_to_tank(wrench, dx, g, p[MAX_ACCELERATION][g], T, memory)
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -168,8 +168,8 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
     moved_pose_into(pose, spring, memory[COMMAND_POSE])
-    put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
-    put(command, 0, memory, COMMAND.start, 13)
+    copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
+    copy_into(command, 0, memory, COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
@@ -135,7 +135,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         left = energy - dot(wrench, dx, g)
         memory[SENT][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT][g]
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 
@@ -173,10 +173,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     else:
         step[:] = 0.0
         _output_wave_at_rest(wrench, T, p, memory)
-    put(packet, INTEGRAL.start, memory, _SENT_INTEGRAL.start, 6)
-    put(packet, ENERGY.start, memory, SENT.start, 2)
-    put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    copy_into(packet, INTEGRAL.start, memory, _SENT_INTEGRAL.start, 6)
+    copy_into(packet, ENERGY.start, memory, SENT.start, 2)
+    copy_into(command, 0, memory, COMMAND.start, 13)
+    copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
 

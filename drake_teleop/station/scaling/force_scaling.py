@@ -8,11 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import apply, rows, three, times, transposed
+from drake_teleop.common.vectors import (
+    apply_matrix,
+    matrix_as_tuple,
+    scale_vector,
+    transposed,
+    vector_at,
+)
 from drake_teleop.load.compensation import (
     add_weight_into,
     scaled_wrench_into,
@@ -105,8 +111,8 @@ def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
     for part in range(2):
         scale = torque_scale if part == 1 else force_scale
         base = 3 * part
-        in_W = apply(rows(R_WS), three(wrench_S, base))
-        in_B = times(-scale, apply(transposed(rows(R_WB)), in_W))
+        in_W = apply_matrix(matrix_as_tuple(R_WS), vector_at(wrench_S, base))
+        in_B = scale_vector(-scale, apply_matrix(transposed(matrix_as_tuple(R_WB)), in_W))
         out[base], out[base + 1], out[base + 2] = in_B
 
 
@@ -171,14 +177,14 @@ def find_fault(sample, estimate, time, valid_range):
     """
     if not abs(time - sample[TIME]) <= valid_range[6]:
         return _STALE
-    reading = sample[SATURATED] < LOST and sound(sample[MOTION])
+    reading = sample[SATURATED] < LOST and all_in_range(sample[MOTION])
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
         return _READING
-    if not sound(sample[BEFORE_JOINTS:TIME]):
+    if not all_in_range(sample[BEFORE_JOINTS:TIME]):
         return _JOINTS
-    return _NONE if sound(estimate) else _LOAD
+    return _NONE if all_in_range(estimate) else _LOAD
 
 
 @njit(cache=True)

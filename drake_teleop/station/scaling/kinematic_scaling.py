@@ -12,13 +12,13 @@ from drake_teleop.common.blocks import ONE_DICT, DoubleOnly, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import (
-    conjugate,
-    exponential,
-    logarithm,
-    multiply,
-    normalized,
-    put,
-    rotate,
+    conjugate_quaternion,
+    copy_into,
+    normalized_quaternion,
+    quaternion_exponential,
+    quaternion_logarithm,
+    quaternion_product,
+    rotate_vector,
 )
 
 
@@ -37,8 +37,8 @@ class KinematicScalingConfig:
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
     """Return the quaternion of the rotation about the same axis by `scale` times the angle."""
-    v = logarithm(rotation)
-    return exponential((scale * v[0], scale * v[1], scale * v[2]))
+    v = quaternion_logarithm(rotation)
+    return quaternion_exponential((scale * v[0], scale * v[1], scale * v[2]))
 
 
 @njit(cache=True)
@@ -52,12 +52,18 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
     clutch was closed, `alignment` is the quaternion of R_WB.
     """
     R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
-    offset = rotate(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
+    offset = rotate_vector(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
     now = (pose[0], pose[1], pose[2], pose[3])
     reference = (master[0], master[1], master[2], master[3])
-    rotation_B = scaled_rotation(multiply(now, conjugate(reference)), rotation_scale)
-    rotation_W = multiply(multiply(R_WB, rotation_B), conjugate(R_WB))
-    orientation = normalized(multiply(rotation_W, (command[0], command[1], command[2], command[3])))
+    rotation_B = scaled_rotation(
+        quaternion_product(now, conjugate_quaternion(reference)), rotation_scale
+    )
+    rotation_W = quaternion_product(
+        quaternion_product(R_WB, rotation_B), conjugate_quaternion(R_WB)
+    )
+    orientation = normalized_quaternion(
+        quaternion_product(rotation_W, (command[0], command[1], command[2], command[3]))
+    )
     for k in range(4):
         out[k] = orientation[k]
     for k in range(3):
@@ -70,7 +76,7 @@ def _command_into(pose, references, alignment, translation_scale, rotation_scale
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
     else:
-        put(out, 0, references, 0, 7)
+        copy_into(out, 0, references, 0, 7)
 
 
 class KinematicScaling(DoubleOnly, LeafSystem):

@@ -16,15 +16,15 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import (
-    apply,
+    add_cross_product,
+    apply_matrix,
+    copy_into,
     cross,
+    matrix_at,
     minus,
-    nine,
     plus,
-    plus_cross,
-    put,
-    three,
     transposed,
+    vector_at,
 )
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
@@ -284,7 +284,7 @@ def estimate_into(constants, memory, arm, reading, sample):
     _differentiate(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
     if constants[_ENCODERS] != 0.0:
-        put(sample, MOTION.start, motion, 0, 9)
+        copy_into(sample, MOTION.start, motion, 0, 9)
     else:
         _convert_accelerometer(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
@@ -299,7 +299,7 @@ def estimate_with_gyroscope_into(constants, memory, reading, sample):
     n = sample.shape[0] - JOINT_POSITION.start
     motion = memory[_MOTION:_JOINTS]
     _align_paths(constants, memory, n, reading, sample)
-    put(motion, 3, sample, JOINT_POSITION.start, 3)
+    copy_into(motion, 3, sample, JOINT_POSITION.start, 3)
     _convert_accelerometer(constants, memory, motion[:3], motion, sample)
     memory[0] += 1.0
 
@@ -308,7 +308,7 @@ def estimate_with_gyroscope_into(constants, memory, reading, sample):
 def _align_paths(constants, memory, n, reading, sample):
     sections, angles = constants[_LOW_PASSES:_ANGULAR_GAINS], sample[JOINT_POSITION]
     filtered = memory[_JOINTS:][: _PER_JOINT * n][5 * n :]
-    put(angles, 0, reading, READ_ANGLES.start, n)
+    copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass(sections, filtered, angles)
@@ -327,7 +327,7 @@ def _delay_paths(constants, memory, n, reading, sample):
         line[12 + i] = angles[i]
     if memory[0] == 0.0:
         for k in range(1, rows):
-            put(line, k * width, line, 0, width)
+            copy_into(line, k * width, line, 0, width)
     wrench = int(constants[_DELAYS]) * width
     acceleration = int(constants[_DELAYS + 1]) * width
     waited, read = sample[WRENCH], sample[MOTION]
@@ -360,19 +360,19 @@ def _differentiate(constants, joints, angles):
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
-    R_SA, R = nine(constants, _ORIENTATION), motion[12:21]
-    alpha[0], alpha[1], alpha[2] = apply(R_SA, three(omega, 0))
-    s[0], s[1], s[2] = apply(R_SA, three(s, 0))
+    R_SA, R = matrix_at(constants, _ORIENTATION), motion[12:21]
+    alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
+    s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
     for i in range(3):
         omega[i] = motion[3 + i]
 
     angular, linear = memory[_ANGULAR:_LINEAR], memory[_LINEAR:_MOTION]
     if fused:
         if starts:
-            put(angular, 3, omega, 0, 3)
-            put(angular, 15, R, 0, 9)
+            copy_into(angular, 3, omega, 0, 3)
+            copy_into(angular, 15, R, 0, 9)
         _rotation_vector_into(angular[15:], R, motion)
-        put(angular, 15, R, 0, 9)
+        copy_into(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
         _update_filters(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
@@ -383,19 +383,19 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
             omega[i] = angular[3 + i] + 0.5 * period * alpha[i]
 
     # From Ao to So, with r = p_SoAo_S.
-    r, w = three(constants, _POSITION), three(omega, 0)
-    s[0], s[1], s[2] = minus(s, plus_cross(cross(alpha, r), w, cross(w, r)))
+    r, w = vector_at(constants, _POSITION), vector_at(omega, 0)
+    s[0], s[1], s[2] = minus(s, add_cross_product(cross(alpha, r), w, cross(w, r)))
     if fused:
         if starts:
-            put(linear, 15, motion, 9, 3)
+            copy_into(linear, 15, motion, 9, 3)
         for i in range(3):
             motion[i] = motion[9 + i] - linear[15 + i]
             linear[15 + i] = motion[9 + i]
             s[i] -= linear[12 + i]
         a_W = motion[3:6]  # reuses the encoders' omega
-        a_W[0], a_W[1], a_W[2] = plus(apply(R, s), gravity)
+        a_W[0], a_W[1], a_W[2] = plus(apply_matrix(R, s), gravity)
         _update_filters(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
-        correction = apply(transposed(R), motion)
+        correction = apply_matrix(transposed(R), motion)
         for i in range(3):
             linear[12 + i] -= correction[i]
             s[i] += correction[i]

@@ -29,15 +29,15 @@ from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.vectors import (
-    apply,
+    add_cross_product,
+    apply_matrix,
+    copy_into,
     cross,
+    matrix_at,
     minus,
-    nine,
     plus,
-    plus_cross,
-    put,
-    three,
     transposed,
+    vector_at,
 )
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
@@ -260,23 +260,29 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 
 @njit(cache=True)
 def _true_values_into(geometry, configuration, acceleration, reaction, truth):
-    R_WB, omega = nine(configuration, 0), three(configuration, 9)
-    alpha, a_Bo = three(acceleration, 0), three(acceleration, 3)
-    r = apply(R_WB, three(geometry, _POSITION))
-    a = plus_cross(plus_cross(a_Bo, alpha, r), omega, cross(omega, r))
-    R_SB, R_BW = transposed(nine(geometry, _ORIENTATION)), transposed(R_WB)
-    s = apply(R_SB, apply(R_BW, minus(a, three(geometry, _GRAVITY))))
-    omega, alpha = apply(R_SB, apply(R_BW, omega)), apply(R_SB, apply(R_BW, alpha))
-    R_SJc = nine(geometry, _JOINT_ORIENTATION)
-    f, tau = apply(R_SJc, three(reaction, 3)), apply(R_SJc, three(reaction, 0))
-    tau = plus(tau, cross(three(geometry, _JOINT_POSITION), f))
+    R_WB, omega = matrix_at(configuration, 0), vector_at(configuration, 9)
+    alpha, a_Bo = vector_at(acceleration, 0), vector_at(acceleration, 3)
+    r = apply_matrix(R_WB, vector_at(geometry, _POSITION))
+    a = add_cross_product(add_cross_product(a_Bo, alpha, r), omega, cross(omega, r))
+    R_SB, R_BW = transposed(matrix_at(geometry, _ORIENTATION)), transposed(R_WB)
+    s = apply_matrix(R_SB, apply_matrix(R_BW, minus(a, vector_at(geometry, _GRAVITY))))
+    omega, alpha = (
+        apply_matrix(R_SB, apply_matrix(R_BW, omega)),
+        apply_matrix(R_SB, apply_matrix(R_BW, alpha)),
+    )
+    R_SJc = matrix_at(geometry, _JOINT_ORIENTATION)
+    f, tau = (
+        apply_matrix(R_SJc, vector_at(reaction, 3)),
+        apply_matrix(R_SJc, vector_at(reaction, 0)),
+    )
+    tau = plus(tau, cross(vector_at(geometry, _JOINT_POSITION), f))
     for i in range(3):
         truth[WRENCH.start + i] = geometry[_SIGN] * f[i]
         truth[WRENCH.start + 3 + i] = geometry[_SIGN] * tau[i]
         truth[SPECIFIC_FORCE.start + i] = s[i]
         truth[ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
         truth[ANGULAR_ACCELERATION.start + i] = alpha[i]
-    put(
+    copy_into(
         truth, TRUE_ANGLES.start + 3, configuration, _POSE_SIZE, configuration.shape[0] - _POSE_SIZE
     )
 
@@ -291,15 +297,15 @@ def _sample_into(sensor, truth, noise, memory, sample):
         return
     lost = sample[SATURATED] - 1.0
     if ideal:
-        put(sample, 0, truth, 0, WRENCH_AND_MOTION.stop)
+        copy_into(sample, 0, truth, 0, WRENCH_AND_MOTION.stop)
         sample[SATURATED] = 0.0
-        put(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
+        copy_into(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
     else:
         reading, estimate = np.empty(truth.shape[0] - 2), np.empty(truth.shape[0] + 1)
         read_into(constants, memory[:end], noise, truth, reading)
         estimate_with_gyroscope_into(motion_constants, memory[end:], reading, estimate)
-        put(sample, 0, estimate, 0, JOINT_POSITION.start)
-        put(sample, JOINT_POSITION.start, estimate, JOINT_POSITION.start + 3, n)
+        copy_into(sample, 0, estimate, 0, JOINT_POSITION.start)
+        copy_into(sample, JOINT_POSITION.start, estimate, JOINT_POSITION.start + 3, n)
     if lost >= LOST:
         sample[SATURATED] = lost
 

@@ -22,7 +22,15 @@ from drake_teleop.common.blocks import LARGEST
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import apply, cross, cross_matrix, nine, plus_cross, put, three
+from drake_teleop.common.vectors import (
+    add_cross_product,
+    apply_matrix,
+    copy_into,
+    cross,
+    cross_matrix,
+    matrix_at,
+    vector_at,
+)
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
@@ -386,11 +394,11 @@ def read_into(constants, memory, noise, truth, reading):
     """
     angles = truth[TRUE_ANGLES]
     if constants[_IDEAL] != 0.0:
-        put(reading, READ_WRENCH.start, truth, WRENCH.start, 6)
-        put(reading, READ_ACCELERATION.start, truth, SPECIFIC_FORCE.start, 3)
-        put(reading, READ_ACCELERATION.start + 3, truth, ANGULAR_ACCELERATION.start, 3)
+        copy_into(reading, READ_WRENCH.start, truth, WRENCH.start, 6)
+        copy_into(reading, READ_ACCELERATION.start, truth, SPECIFIC_FORCE.start, 3)
+        copy_into(reading, READ_ACCELERATION.start + 3, truth, ANGULAR_ACCELERATION.start, 3)
         reading[READ_SATURATED] = 0.0
-        put(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
+        copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
     count = int(memory[0])
     width = _ROW + angles.shape[0]
@@ -427,7 +435,7 @@ def read_into(constants, memory, noise, truth, reading):
 
     if count == 0:
         for k in range(1, rows):
-            put(memory, _LINE + k * width, row, 0, width)
+            copy_into(memory, _LINE + k * width, row, 0, width)
     memory[0] += 1.0
     late = constants[_LATENCIES:_ENCODER]
     force = _LINE + int(late[0]) * width
@@ -458,10 +466,10 @@ def _apply_calibration_errors(constants, truth, out):
         for j in range(6):
             value += constants[_WRENCH + 6 * i + j] * wrench[j]
         out[i] = value
-    r = three(constants, _POSITION)
-    at_Ao = plus_cross(plus_cross(s, alpha, r), omega, cross(omega, r))
-    out[6], out[7], out[8] = apply(nine(constants, _MOTION), at_Ao)
-    out[9], out[10], out[11] = apply(nine(constants, _MOTION + 9), alpha)
+    r = vector_at(constants, _POSITION)
+    at_Ao = add_cross_product(add_cross_product(s, alpha, r), omega, cross(omega, r))
+    out[6], out[7], out[8] = apply_matrix(matrix_at(constants, _MOTION), at_Ao)
+    out[9], out[10], out[11] = apply_matrix(matrix_at(constants, _MOTION + 9), alpha)
 
 
 @njit(cache=True)

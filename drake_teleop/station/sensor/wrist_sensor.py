@@ -27,7 +27,15 @@ from pydrake.systems.primitives import Demultiplexer, RandomSource
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import apply, cross, minus, nine, put, three, transposed
+from drake_teleop.common.vectors import (
+    apply_matrix,
+    copy_into,
+    cross,
+    matrix_at,
+    minus,
+    transposed,
+    vector_at,
+)
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
@@ -101,15 +109,15 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     `phi` (10,) are the tool's inertial parameters.
     """
     sensor_motion(arm, q, v, vdot, motion)
-    put(out, MOTION.start, motion, 0, 9)
+    copy_into(out, MOTION.start, motion, 0, 9)
     s, omega, alpha = out[SPECIFIC_FORCE], out[ANGULAR_VELOCITY], out[ANGULAR_ACCELERATION]
     wrench = out[WRENCH]
     non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
-    f, p_WS, R_SW = three(contact_W, 0), three(motion, 9), transposed(nine(motion, 12))
-    tau = minus(three(contact_W, 3), cross(p_WS, f))
-    wrench[0], wrench[1], wrench[2] = minus(three(wrench, 0), apply(R_SW, f))
-    wrench[3], wrench[4], wrench[5] = minus(three(wrench, 3), apply(R_SW, tau))
+    f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
+    tau = minus(vector_at(contact_W, 3), cross(p_WS, f))
+    wrench[0], wrench[1], wrench[2] = minus(vector_at(wrench, 0), apply_matrix(R_SW, f))
+    wrench[3], wrench[4], wrench[5] = minus(vector_at(wrench, 3), apply_matrix(R_SW, tau))
 
 
 @njit(cache=True)
@@ -138,18 +146,20 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     v, vdot = x[half : half + n], xdot[half : half + n]
     rigid = truth[WRENCH_AND_MOTION]
     true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), rigid)
-    put(truth, TRUE_ANGLES.start, x, 0, n)
+    copy_into(truth, TRUE_ANGLES.start, x, 0, n)
     size = BEFORE_JOINTS + n
     sample = memory[:size]
-    put(memory, size, memory, 0, size)
+    copy_into(memory, size, memory, 0, size)
     if not is_plausible(constants, truth):  # keeps it out of the filters
         sample[SATURATED] = LOST + LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATED] - 1.0
     if ideal:
-        put(sample, WRENCH_AND_MOTION.start, truth, WRENCH_AND_MOTION.start, WRENCH_AND_MOTION.stop)
+        copy_into(
+            sample, WRENCH_AND_MOTION.start, truth, WRENCH_AND_MOTION.start, WRENCH_AND_MOTION.stop
+        )
         sample[SATURATED] = 0.0
-        put(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
+        copy_into(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
     else:
         reading = np.empty(13 + n)
         read_into(constants, memory[2 * size : middle], noise, truth, reading)
@@ -179,7 +189,7 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 @njit(cache=True)
 def _torque_at(held, after, torque):
     """Write the motor torque (n,) at the time now + `after` [s]."""
-    put(torque, 0, held[0], 0, torque.shape[0])
+    copy_into(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
 
@@ -213,7 +223,7 @@ def sample_step(
     full = 2 * half + extra
     width = 1 + full
     after = result[size + 1 :]
-    put(after, 0, memory, 0, memory.shape[0])
+    copy_into(after, 0, memory, 0, memory.shape[0])
     tail = after[sensor[3] :]
     count, queued = tail[0], int(tail[1])
     now, between = scratch[0, :full], scratch[1, :full]
@@ -221,7 +231,7 @@ def sample_step(
     start_dot, end_dot = scratch[4, : 2 * half], now_dot
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     assemble_state(state, around, now)
-    put(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
+    copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
     _torque_at(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
@@ -258,7 +268,7 @@ def sample_step(
             count += 1.0
     # A step of rounding length may have ended just before and have taken this sample.
     taken = (count - 1.0 + _TIME_TOLERANCE) * period > time
-    put(result, 0, after, size if taken else 0, size)
+    copy_into(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
     if until_now and (count - _TIME_TOLERANCE) * period < time:
         _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)

@@ -15,19 +15,19 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import (
+    add_cross_product,
     add_into,
-    apply,
+    apply_matrix,
     cross,
     dot,
+    matrix_at,
     minus,
-    nine,
     plus,
-    plus_cross,
     quaternion_of,
-    symmetric,
-    three,
-    times,
+    scale_vector,
+    symmetric_at,
     transposed,
+    vector_at,
 )
 from drake_teleop.station.slave.joint_friction import dry_friction
 
@@ -105,17 +105,17 @@ class ArmModel:
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
     """Replace the previous link's pose in the state x by that of link `row`; return p_PL_W [m]."""
     joint = table[row]
-    p_PL_P = three(joint, TRANSLATION)
+    p_PL_P = vector_at(joint, TRANSLATION)
     if joint[SLIDES] != 0.0:
-        p_PL_P = plus(p_PL_P, times(q, (joint[2], joint[5], joint[8])))
+        p_PL_P = plus(p_PL_P, scale_vector(q, (joint[2], joint[5], joint[8])))
         q = 0.0
-    p_PL_W = apply(nine(x, 12), p_PL_P)
+    p_PL_W = apply_matrix(matrix_at(x, 12), p_PL_P)
     add_into(x, 9, p_PL_W)
     c = np.cos(q)
     s = np.sin(q)
-    R_JP = transposed(nine(joint, ROTATION))
+    R_JP = transposed(matrix_at(joint, ROTATION))
     for i in range(12, 21, 3):
-        u, v, w = apply(R_JP, three(x, i))
+        u, v, w = apply_matrix(R_JP, vector_at(x, i))
         x[i], x[i + 1], x[i + 2] = c * u + s * v, c * v - s * u, w
     return p_PL_W
 
@@ -124,13 +124,13 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
     """Replace the state of the previous link in x by that of link `row`."""
     r = _advance_pose(table, row, q, x)
-    omega, alpha, z = three(x, 3), three(x, 6), (x[14], x[17], x[20])
-    add_into(x, 0, plus_cross(cross(alpha, r), omega, cross(omega, r)))
+    omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
+    add_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
     if table[row, SLIDES] != 0.0:
-        add_into(x, 0, plus(times(qdd, z), times(2.0 * qd, cross(omega, z))))
+        add_into(x, 0, plus(scale_vector(qdd, z), scale_vector(2.0 * qd, cross(omega, z))))
     else:
-        add_into(x, 3, times(qd, z))
-        add_into(x, 6, plus(times(qdd, z), times(qd, cross(omega, z))))
+        add_into(x, 3, scale_vector(qd, z))
+        add_into(x, 6, plus(scale_vector(qdd, z), scale_vector(qd, cross(omega, z))))
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
@@ -191,10 +191,10 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
             J_out[i, row] = x[9 + i]
             J_out[3 + i, row] = x[14 + 3 * i]
     _advance_pose(table, n, 0.0, x)
-    p_WS = three(x, 9)
+    p_WS = vector_at(x, 9)
     for row in range(n):
         column = J_out[:, row]
-        axis = three(column, 3)
+        axis = vector_at(column, 3)
         if table[row, SLIDES] != 0.0:
             column[0], column[1], column[2] = axis
             column[3] = column[4] = column[5] = 0.0
@@ -210,9 +210,9 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
     for row in range(n):
         _advance_state(table, row, q[row], v[row], vdot[row], out)
     _advance_state(table, n, 0.0, 0.0, 0.0, out)
-    R_SW = transposed(nine(out, 12))
+    R_SW = transposed(matrix_at(out, 12))
     for i in range(0, 9, 3):
-        out[i], out[i + 1], out[i + 2] = apply(R_SW, three(out, i))
+        out[i], out[i + 1], out[i + 2] = apply_matrix(R_SW, vector_at(out, i))
 
 
 @njit(cache=True)
@@ -231,14 +231,18 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 @njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
     """Write a link's z axis, origin, inertial force and moment about Wo, in W, to `link[row]`."""
-    phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], nine(x, 12), three(x, 9)
-    R_LW, m, h, inertia = transposed(R_WL), phi[0], three(phi, 1), symmetric(phi, 4)
-    s, omega, alpha = apply(R_LW, three(x, 0)), apply(R_LW, three(x, 3)), apply(R_LW, three(x, 6))
-    f = plus_cross(plus_cross(times(m, s), alpha, h), omega, cross(omega, h))
-    tau = plus_cross(apply(inertia, alpha), omega, apply(inertia, omega))
-    tau = plus_cross(tau, h, s)
-    f_W = apply(R_WL, f)
-    tau_W = plus(apply(R_WL, tau), cross(p_WL, f_W))
+    phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], matrix_at(x, 12), vector_at(x, 9)
+    R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_at(phi, 4)
+    s, omega, alpha = (
+        apply_matrix(R_LW, vector_at(x, 0)),
+        apply_matrix(R_LW, vector_at(x, 3)),
+        apply_matrix(R_LW, vector_at(x, 6)),
+    )
+    f = add_cross_product(add_cross_product(scale_vector(m, s), alpha, h), omega, cross(omega, h))
+    tau = add_cross_product(apply_matrix(inertia, alpha), omega, apply_matrix(inertia, omega))
+    tau = add_cross_product(tau, h, s)
+    f_W = apply_matrix(R_WL, f)
+    tau_W = plus(apply_matrix(R_WL, tau), cross(p_WL, f_W))
     for i in range(3):
         wrench[i] = x[14 + 3 * i]
         wrench[3 + i] = p_WL[i]
@@ -256,11 +260,13 @@ def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
     for row in range(n):
         x = link[row]
         if table[row, SLIDES] != 0.0:
-            tau[row] = dot(three(x, 0), three(x, 6))
+            tau[row] = dot(vector_at(x, 0), vector_at(x, 6))
         else:
             # Moment about the joint's origin.
-            moment = plus_cross(three(x, 9), times(-1.0, three(x, 3)), three(x, 6))
-            tau[row] = dot(three(x, 0), moment)
+            moment = add_cross_product(
+                vector_at(x, 9), scale_vector(-1.0, vector_at(x, 3)), vector_at(x, 6)
+            )
+            tau[row] = dot(vector_at(x, 0), moment)
 
 
 @njit(cache=True)
@@ -293,17 +299,17 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Add a link's inertial parameters phi (10,) about Wo, in W, to `inertia`."""
-    phi, p = table[row, PHI:], three(x, 9)
-    m, h, about_Lo = phi[0], apply(nine(x, 12), three(phi, 1)), symmetric(phi, 4)
+    phi, p = table[row, PHI:], vector_at(x, 9)
+    m, h, about_Lo = phi[0], apply_matrix(matrix_at(x, 12), vector_at(phi, 1)), symmetric_at(phi, 4)
     inertia[0] += m
-    add_into(inertia, 1, plus(h, times(m, p)))
+    add_into(inertia, 1, plus(h, scale_vector(m, p)))
     # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')
     diagonal = 2.0 * dot(p, h) + m * dot(p, p)
     k = 4
     for i in range(3):
-        rotated = apply(about_Lo, three(x, 12 + 3 * i))
+        rotated = apply_matrix(about_Lo, vector_at(x, 12 + 3 * i))
         for j in range(i, 3):
-            value = dot(rotated, three(x, 12 + 3 * j))
+            value = dot(rotated, vector_at(x, 12 + 3 * j))
             value -= p[i] * h[j] + h[i] * p[j] + m * p[i] * p[j]
             if i == j:
                 value += diagonal
@@ -321,23 +327,23 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
     for row in range(n):
         # Velocity at Wo and angular velocity for unit joint speed.
         x = link[row]
-        x[9], x[10], x[11] = three(x, 0)
-        x[6], x[7], x[8] = cross(three(x, 3), three(x, 9))
+        x[9], x[10], x[11] = vector_at(x, 0)
+        x[6], x[7], x[8] = cross(vector_at(x, 3), vector_at(x, 9))
         if table[row, SLIDES] != 0.0:
-            x[6], x[7], x[8] = three(x, 9)
+            x[6], x[7], x[8] = vector_at(x, 9)
             x[9] = x[10] = x[11] = 0.0
     for row in range(n - 1, -1, -1):
         for k in range(10):
             inertia[row, k] += inertia[row + 1, k]
         c = inertia[row]
-        h = three(c, 1)
-        v, w = three(link[row], 6), three(link[row], 9)
+        h = vector_at(c, 1)
+        v, w = vector_at(link[row], 6), vector_at(link[row], 9)
         # Momentum about Wo of all outboard links for unit speed of this joint.
-        linear = plus_cross(times(c[0], v), w, h)
-        angular = plus_cross(apply(symmetric(c, 4), w), h, v)
+        linear = add_cross_product(scale_vector(c[0], v), w, h)
+        angular = add_cross_product(apply_matrix(symmetric_at(c, 4), w), h, v)
         # `solve_spd` reads the lower half only.
         for i in range(row + 1):
-            v, w = three(link[i], 6), three(link[i], 9)
+            v, w = vector_at(link[i], 6), vector_at(link[i], 9)
             M[row, i] = dot(w, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
         M[row, row] += table[row, ROTOR]
 

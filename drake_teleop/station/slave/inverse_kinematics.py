@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import SLIDES, ArmModel, forward_kinematics
 
 Array = NDArray[np.float64]
@@ -149,7 +149,7 @@ def _nearest_branch(
         return _BAD_POSE
     for i in range(6):
         q[i] = min(max(reference[i], lower[i]), upper[i])
-    if not (np.isfinite(R.sum()) and sound(p)):
+    if not (np.isfinite(R.sum()) and all_in_range(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
     status = _branches(R, p, reference[0], reference[3], True, branches)
@@ -167,7 +167,7 @@ def _nearest_branch(
             best, best_distance = row, distance
     if best < 0:
         return _JOINT_LIMIT
-    put(q, 0, branches[best], 0, 6)
+    copy_into(q, 0, branches[best], 0, 6)
     if abs(np.sin(q[4])) < _SINGULAR_THRESHOLD:
         status = max(status, _WRIST_SINGULAR)
     return status

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -74,7 +74,7 @@ class JointFollower(LeafSystem):
 
     def _next(self, context: Context) -> tuple[Array, IkStatus]:
         last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
-        if not sound(leader):
+        if not all_in_range(leader):
             return last, IkStatus.BAD_POSE
         within = np.clip(leader, self._lower, self._upper)
         status = IkStatus.OK if (within == leader).all() else IkStatus.JOINT_LIMIT

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, sound
+from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import (
     ArmModel,
     forward_dynamics,
@@ -99,13 +99,13 @@ def joint_control_torque(
     ID is the inverse dynamics, `state` [q; v]. Invalid encoder readings give gravity compensation
     at the commanded posture, an invalid command the last torque.
     """
-    if not sound(command):
+    if not all_in_range(command):
         return
     n = torque.shape[0]
     q, v, acceleration = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
-    put(scratch, 0, state, 0, 2 * n)
-    if not sound(state):
-        put(q, 0, command, 0, n)
+    copy_into(scratch, 0, state, 0, 2 * n)
+    if not all_in_range(state):
+        copy_into(q, 0, command, 0, n)
         v[:] = 0.0
     for i in range(n):
         setpoint = position_gain * (command[i] - q[i])
@@ -190,7 +190,7 @@ class HeldTorque(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         torque = self._request.Eval(context)
-        if sound(torque):
+        if all_in_range(torque):
             discrete_state.set_value(0, np.clip(torque, -self._limit, self._limit))
 
 

@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import (
-    conjugate,
+    conjugate_quaternion,
+    copy_into,
     cross,
     dot,
-    logarithm,
-    multiply,
-    normalized,
-    put,
+    normalized_quaternion,
+    quaternion_logarithm,
     quaternion_of,
-    three,
+    quaternion_product,
+    vector_at,
 )
 from drake_teleop.station.slave.arm import (
     PHI,
@@ -69,12 +69,12 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 def _jacobian_and_error(table, L, pose, q, x, J, e):
     """Write Jacobian J (6, n) and pose error e (6,) at q, rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
-    a = normalized((pose[0], pose[1], pose[2], pose[3]))
+    a = normalized_quaternion((pose[0], pose[1], pose[2], pose[3]))
     R = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
             R[i, k] = x[12 + 3 * i + k]
-    turn = logarithm(multiply(a, conjugate(quaternion_of(R))))
+    turn = quaternion_logarithm(quaternion_product(a, conjugate_quaternion(quaternion_of(R))))
     squared = 0.0
     for i in range(3):
         e[i] = pose[4 + i] - x[9 + i]
@@ -176,7 +176,7 @@ def _step_alone(J, e, i):
 def _singularity_status(L, J):
     """Return WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR."""
     n = J.shape[1]
-    a, b, c = three(J[3:, n - 3], 0), three(J[3:, n - 2], 0), three(J[3:, n - 1], 0)
+    a, b, c = vector_at(J[3:, n - 3], 0), vector_at(J[3:, n - 2], 0), vector_at(J[3:, n - 1], 0)
     coplanar = abs(dot(a, cross(b, c))) < _COPLANAR_AXES * L**3
     return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
@@ -205,9 +205,9 @@ def follow_pose(
         q[i] = min(max(reference[i], lower[i]), upper[i])
         low[i], high[i] = max(q[i] - max_step[i], lower[i]), min(q[i] + max_step[i], upper[i])
     length = pose[0] * pose[0] + pose[1] * pose[1] + pose[2] * pose[2] + pose[3] * pose[3]
-    if not (sound(reference) and sound(pose) and length > 0.0):
+    if not (all_in_range(reference) and all_in_range(pose) and length > 0.0):
         for i in range(n):
-            q[i] = q[i] if sound(reference) else np.nan
+            q[i] = q[i] if all_in_range(reference) else np.nan
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
@@ -227,7 +227,7 @@ def follow_pose(
     damping = max(singular * singular - _smallest_eigenvalue(B, u), 0.0)
     before, expected_gain = np.inf, 0.0
     while True:
-        put(anchor, 0, q, 0, n)
+        copy_into(anchor, 0, q, 0, n)
         cost, relative_damping, stalled_steps, better = squared, _INITIAL_DAMPING, 0, True
         for _ in range(steps):
             if (
@@ -253,23 +253,23 @@ def follow_pose(
             if better:
                 stalled_steps = stalled_steps + 1 if total > 0.99 * cost else 0
                 squared, cost, relative_damping = found, total, 0.2 * relative_damping
-                put(q, 0, trial, 0, n)
+                copy_into(q, 0, trial, 0, n)
             else:
                 relative_damping = 10.0 * max(relative_damping, _INITIAL_DAMPING)
         _jacobian_and_error(table, L, pose, q, x, J, e)
-        p, rotation = three(e, 0), three(e, 3)
+        p, rotation = vector_at(e, 0), vector_at(e, 3)
         if dot(p, p) <= MET * MET and dot(rotation, rotation) <= L * L * MET * MET:
             return _OK
         if towards_posture:
             # The pose has priority: repeat without the posture.
             towards_posture = False
-            put(q, 0, start, 0, n)
+            copy_into(q, 0, start, 0, n)
             squared = _jacobian_and_error(table, L, pose, q, x, J, e)
             continue
         if before < np.inf:
             if squared < (1.0 - 1e-7) * before - expected_gain:
                 return _singularity_status(L, J)
-            put(q, 0, kept, 0, n)
+            copy_into(q, 0, kept, 0, n)
             far = before > _REACH_TOLERANCE_M * _REACH_TOLERANCE_M and expected_gain < 1e-3 * before
             return _OUT_OF_REACH if far else _singularity_status(L, J)
         held, free = -1, 0.0
@@ -288,7 +288,7 @@ def follow_pose(
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
         expected_gain = 4.0 * free / max(damping, _MIN_DAMPING)
-        put(kept, 0, q, 0, n)
+        copy_into(kept, 0, q, 0, n)
         # Displace along the weakest direction, in proportion to the error, so that noise does not
         # move the arm.
         _smallest_eigenvalue(H, g)
@@ -359,8 +359,8 @@ def _follow_command(
     is held if the encoder readings `position` (n,) are invalid.
     """
     n = q.shape[0]
-    put(q, 0, last, 0, n)
-    if not sound(position):
+    copy_into(q, 0, last, 0, n)
+    if not all_in_range(position):
         return _BAD_POSE
     reference, max_step, elapsed = q.copy(), np.zeros(n), max(time - last[n], 0.0)
     if elapsed > 0.0:  # inf * 0 is nan

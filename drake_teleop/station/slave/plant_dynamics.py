@@ -9,7 +9,15 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import add_into, cross, minus, plus, put, rotate, three
+from drake_teleop.common.vectors import (
+    add_into,
+    copy_into,
+    cross,
+    minus,
+    plus,
+    rotate_vector,
+    vector_at,
+)
 from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, bodies_into
 from drake_teleop.station.environment.point_contact import (
     BODY,
@@ -59,16 +67,16 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         if not has_twist:
             J = np.empty((6, q.shape[0]))
             jacobian(arm, q, J)
-            put(twist, 0, J @ v, 0, 6)
+            copy_into(twist, 0, J @ v, 0, 6)
             has_twist = True
-        lever = minus(three(normal, 3), p_WS)
-        point_velocity = plus(three(twist, 0), cross(three(twist, 3), lever))
+        lever = minus(vector_at(normal, 3), p_WS)
+        point_velocity = plus(vector_at(twist, 0), cross(vector_at(twist, 3), lever))
         for i in range(3):
             velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
         if pair[BODY] >= 0.0:
             body = bodies[int(pair[BODY])]
-            lever = minus(three(normal, 3), three(body, 4))
-            point_velocity = plus(three(body, 10), cross(three(body, 7), lever))
+            lever = minus(vector_at(normal, 3), vector_at(body, 4))
+            point_velocity = plus(vector_at(body, 10), cross(vector_at(body, 7), lever))
             for i in range(3):
                 velocity[i] -= point_velocity[i]
         contact_force(pair, depth, normal[:3], velocity, force)
@@ -79,12 +87,14 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 def _place_box(pair, bodies, placed):
     """Write the pair, with its box at the pose of its body, to `placed` (28,); return `placed`."""
     body = bodies[int(pair[BODY])]
-    put(placed, 0, pair, 0, WIDTH)
+    copy_into(placed, 0, pair, 0, WIDTH)
     turn = (body[0], body[1], body[2], body[3])
     for i in range(3):
-        column = rotate(turn, (pair[4 + i], pair[7 + i], pair[10 + i]))
+        column = rotate_vector(turn, (pair[4 + i], pair[7 + i], pair[10 + i]))
         placed[4 + i], placed[7 + i], placed[10 + i] = column
-    placed[13], placed[14], placed[15] = plus(three(body, 4), rotate(turn, three(pair, 13)))
+    placed[13], placed[14], placed[15] = plus(
+        vector_at(body, 4), rotate_vector(turn, vector_at(pair, 13))
+    )
     return placed
 
 
@@ -99,7 +109,7 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
         if pair[BODY] >= 0.0:
             _place_box(pair, bodies, placed)
         else:
-            put(placed, 0, pair, 0, WIDTH)
+            copy_into(placed, 0, pair, 0, WIDTH)
         if separation(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
             return WATCHED
     for pair in pairs:
@@ -154,10 +164,10 @@ class ToolContact(LeafSystem):
 def assemble_state(state, around, x):
     """Write the plant's state x from the arm's [q; v] and `around` [deflection, rate, others]."""
     n = state.shape[0] // 2
-    put(x, 0, state, 0, n)
-    put(x, n + 1, state, n, n)
+    copy_into(x, 0, state, 0, n)
+    copy_into(x, n + 1, state, n, n)
     x[n], x[2 * n + 1] = around[0], around[1]
-    put(x, 2 * n + 2, around, 2, around.shape[0] - 2)
+    copy_into(x, 2 * n + 2, around, 2, around.shape[0] - 2)
 
 
 @njit(cache=True)
@@ -194,10 +204,10 @@ def _take_given_wrench(given, x, wrench_W):
     number = int(given[0, 1])
     given[0, 1] += 1.0
     if number < given[0, 0]:
-        put(wrench_W, 0, given[1 + number], 0, 6)
+        copy_into(wrench_W, 0, given[1 + number], 0, 6)
         return True
     if number == given[0, 0]:
-        put(given[0], 2, x, 0, x.shape[0])
+        copy_into(given[0], 2, x, 0, x.shape[0])
     return False
 
 
@@ -208,7 +218,7 @@ def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
     forward_dynamics(arm, q, v, tau, wrench_W, xdot[half:-1])
-    put(xdot, 0, x, half, half)
+    copy_into(xdot, 0, x, half, half)
     push = 0.0
     if pairs.shape[0] > 0:  # all belong to the leaf, or none does
         for i in range(3):

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from drake_teleop.common.blocks import ONE_DICT, sound
+from drake_teleop.common.blocks import ONE_DICT, all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 
 # Memory of the servo: periods since the last command, index of the oldest command in the queue;
@@ -100,14 +100,14 @@ def _generate(command, interface, limits, memory, reference):
     period, gain, lookahead, _, every, queued = interface
     n = command.shape[0]
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
-    if memory[_COUNT] == 0.0 and sound(command):
+    if memory[_COUNT] == 0.0 and all_in_range(command):
         if queued > 0.0:
             place = 2 + 3 * n + int(memory[_OLDEST]) * n
-            put(target, 0, memory, place, n)
-            put(memory, place, command, 0, n)
+            copy_into(target, 0, memory, place, n)
+            copy_into(memory, place, command, 0, n)
             memory[_OLDEST] = (memory[_OLDEST] + 1.0) % queued
         else:
-            put(target, 0, command, 0, n)
+            copy_into(target, 0, command, 0, n)
     memory[_COUNT] = (memory[_COUNT] + 1.0) % every
     for i in range(n):
         away = target[i] - r[i]
@@ -134,14 +134,14 @@ def position_servo_torque(
     n = torque.shape[0]
     _generate(command, interface, limits, memory, scratch)
     q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
-    if sound(state):
-        put(q, 0, state, 0, n)
-        put(v, 0, state, n, n)
+    if all_in_range(state):
+        copy_into(q, 0, state, 0, n)
+        copy_into(v, 0, state, n, n)
         for i in range(n):
             wanted[i] = scratch[2, i]
             wanted[i] += 2.0 * w * (scratch[1, i] - v[i]) + w * w * (scratch[0, i] - q[i])
     else:
-        put(q, 0, scratch[0], 0, n)
+        copy_into(q, 0, scratch[0], 0, n)
         v[:] = 0.0
         wanted[:] = 0.0
     inverse_dynamics(arm, q, v, wanted, torque)

@@ -15,7 +15,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
     JointControlConfig,
@@ -66,8 +66,8 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
     now[:] = 0.0
     rate[:] = 0.0
     for k in range(samples):
-        put(predicted, 0, x, 0, n)
-        put(predicted, n, x, n + 1, n)
+        copy_into(predicted, 0, x, 0, n)
+        copy_into(predicted, n, x, n + 1, n)
         joint_control_torque(
             arm, command, predicted, servo[0], servo[1], servo[2], servo[3], scratch, torque
         )
