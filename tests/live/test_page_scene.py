@@ -61,7 +61,7 @@ def test_meshcat_is_closed_after_the_scene_is_made(scenario):
     assert ports() == before
 
 
-@pytest.mark.parametrize("broken", ["Meshcat", "ReplayScene", "_objects"])
+@pytest.mark.parametrize("broken", ["Meshcat", "ReplayScene", "_extract_objects"])
 def test_failed_scene_is_reported_without_an_error(scenario, rows, monkeypatch, capsys, broken):
     def fail(*_, **__):
         raise RuntimeError("no port is free\nfor this")
