@@ -28,7 +28,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import drake_teleop
-from drake_teleop.common.errors import install_extra
+from drake_teleop.common.errors import remedy_to_install_extra
 from drake_teleop.common.files import models_dir, scenarios_dir
 
 home = Path(drake_teleop.__file__).parent
@@ -141,7 +141,7 @@ def test_what_is_advised_installs_an_extra_that_there_is():
     advised = {
         name
         for text in texts.values()
-        for name in re.findall(r"install_extra\(\"(\w+)\"\)|install '\.\[(\w+)\]'", text)
+        for name in re.findall(r"remedy_to_install_extra\(\"(\w+)\"\)|install '\.\[(\w+)\]'", text)
         for name in name
         if name
     }
