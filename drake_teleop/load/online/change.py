@@ -1,9 +1,11 @@
-"""Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24)::
+"""Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24).
 
-known       the known load explains the mean wrench of blocks of samples
-disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
-changed     a new load explains it
-identified  mass and first moments of the new load are identified
+Its states::
+
+    known       the known load explains the mean wrench of blocks of samples
+    disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
+    changed     a new load explains it
+    identified  mass and first moments of the new load are identified
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""Monitor of a known load in use, which selects the load to eliminate, sample by sample::
+"""Monitor of a known load in use, which selects the load to eliminate, sample by sample.
 
-settled     the known load explains the wrench and is used
-disturbed   contact, or the moment of a grasp; the known load is used
-changed     another load; the fallback (gripper or nothing) is used
+Its states::
+
+    settled     the known load explains the wrench and is used
+    disturbed   contact, or the moment of a grasp; the known load is used
+    changed     another load; the fallback (gripper or nothing) is used
 """
 
 from __future__ import annotations
