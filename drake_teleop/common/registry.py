@@ -87,7 +87,8 @@ def register_from(script: Path) -> None:
         raise
     except Exception as error:
         what = f"cannot be imported: {type(error).__name__}: {error}"
-        raise DrakeTeleopError(what, where=str(script)) from error
+        remedy = "correct the file; `python FILE` prints the traceback"
+        raise DrakeTeleopError(what, where=str(script), remedy=remedy) from error
     if module.__file__ != str(script):
         what = f"has the name of the module {module.__file__ or script.stem}"
         raise DrakeTeleopError(what, where=str(script), remedy="rename the file")

@@ -215,7 +215,7 @@ class LiveHand(Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return `MakeMasterSide` with a `LiveHand`."""
+    """Return the Diagram of the master side with a `LiveHand`, which follows external targets."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)

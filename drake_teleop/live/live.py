@@ -47,7 +47,7 @@ _SLEEP_AFTER_S, _SLICES_PER_TICK = 0.25, 4
 _MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
 _RELEASED = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
-_FAILURES = (DrakeTeleopError, RuntimeError, SystemExit)
+_FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
 
 #: Largest message [bytes]; a longer one closes the connection.
 MAX_MESSAGE_BYTES = 4096
@@ -93,9 +93,9 @@ class Live:
         self._alone_since = now
         self.pace = Pace(1e-3 * self._slice_ms, now)
         self._frame_due, self._last_frame_at, self._show_now = now, now, False
-        self._start_drive(now)
+        self._start_session(now)
 
-    def _start_drive(self, now: float) -> None:
+    def _start_session(self, now: float) -> None:
         folder = None if self._record is None else _make_unused_folder(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
@@ -130,7 +130,7 @@ class Live:
         self.stopped = ""
         self._stop_on_failure(self.end)
         failure = self.stopped
-        self._stop_on_failure(lambda: self._start_drive(now))
+        self._stop_on_failure(lambda: self._start_session(now))
         self._refusal = failure
 
     def reject_scene(self, why: str, now: float) -> None:
@@ -245,7 +245,7 @@ class Live:
     def _stop_on_failure(self, action: Callable[[], None]) -> None:
         try:
             action()
-        except _FAILURES as error:
+        except _FAILURE_EXCEPTIONS as error:
             self.stopped = one_line(str(error))
 
     def _simulate_slice(self, now: float) -> None:
@@ -255,7 +255,7 @@ class Live:
         self._last_target = self._requested.target
         try:
             self._session.apply(self._limit_motion(self._requested.changed(by_device)))
-        except _FAILURES as error:
+        except _FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
             if self._requested.station == present.station:
                 self.stopped = one_line(str(error))

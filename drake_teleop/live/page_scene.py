@@ -19,7 +19,7 @@ from drake_teleop.station.scenario import Scenario
 
 Rows = dict[str, NDArray[np.float64]]
 
-_FAILURES = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
+_FAILURE_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
 
 # Commands in base64 and their files in the static page of Meshcat.
 _COMMAND = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
@@ -44,7 +44,7 @@ class PageScene:
             self._scene = ReplayScene(meshcat, scenario, recorded)
             self.objects = _extract_objects(meshcat.StaticHtml())
             self._scene.canvas = _Moves()  # only this thread may destroy Meshcat
-        except _FAILURES as error:
+        except _FAILURE_EXCEPTIONS as error:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class PageScene:
         try:
             self._scene.canvas = moves
             self._scene.show(0.0, rows, -1)
-        except _FAILURES as error:
+        except _FAILURE_EXCEPTIONS as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._fail(error)
             return {}

@@ -150,8 +150,8 @@ def aligned_log(
     """Read a log and remove the delay between motion and wrench.
 
     The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
-    `delay` and its default `usual_s` are in [s]. `weight_removed` is True if the wrench does not
-    contain the weight of the load.
+    `delay` [s] or "auto" is removed; `usual_s` [s] is used if the record does not determine it.
+    `weight_removed` is True if the wrench does not contain the weight of the load.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.free

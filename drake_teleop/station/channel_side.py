@@ -105,7 +105,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"an arm of {slave.arm.num_joints} joints has no mass in some directions",
+            f"the mass of an arm with {slave.arm.num_joints} joints is unbounded in a direction",
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )

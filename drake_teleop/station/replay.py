@@ -219,7 +219,7 @@ class ReplayScene:
         }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._add_bodies(meshcat))
-        _add_room(meshcat, scenario, with_table=self._master is not None)
+        _draw_room(meshcat, scenario, with_table=self._master is not None)
         # The replay shows the device's base parallel to W, for any alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
@@ -335,7 +335,7 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     )
 
 
-def _add_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
+def _draw_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
     def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
         meshcat.SetObject(f"/room/{name}", Box(*size), colour)
         meshcat.SetTransform(f"/room/{name}", RigidTransform(np.array(centre)))

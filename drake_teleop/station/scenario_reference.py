@@ -125,14 +125,14 @@ def _block_lines(config: Any) -> list[str]:
 
 def _inner_lines(entry: FieldInfo) -> list[str]:
     if entry.default:
-        return _named_lines(entry, entry.default)
+        return _field_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.lists:
-        return _commented_out(_named_lines(entry, blocks))
-    return [line for block in blocks for line in _commented_out(_named_lines(entry, block))]
+        return _commented_out(_field_lines(entry, blocks))
+    return [line for block in blocks for line in _commented_out(_field_lines(entry, block))]
 
 
-def _named_lines(entry: FieldInfo, value: Any) -> list[str]:
+def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
     if not entry.lists:
         head = f"{entry.name}:{_tag(entry, value)}  # {entry.meaning}"
         return [head, *_indent(_block_lines(value))]

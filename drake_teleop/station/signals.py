@@ -16,9 +16,9 @@ def _signal(name: str, components: str, units: str, description: str) -> Signal:
 #: Prefix of the pose signals of moving bodies of the surroundings.
 POSE_OF = "pose_of_"
 
-_WRENCH = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
-_POSE = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
-_TWIST = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
+_WRENCH_AXES_AND_UNITS = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
+_POSE_AXES_AND_UNITS = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
+_TWIST_AXES_AND_UNITS = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
 
 
 def _state(joints: int) -> tuple[str, str]:
@@ -40,7 +40,11 @@ _JOINT_SIGNALS = ("joint_position", "joint_torque", "joint_command")
 SIGNALS = {
     signal.name: signal
     for signal in (
-        _signal("measured_wrench_S", *_WRENCH, "of the sensor, sign of Eq. (1), at sample_time"),
+        _signal(
+            "measured_wrench_S",
+            *_WRENCH_AXES_AND_UNITS,
+            "of the sensor, sign of Eq. (1), at sample_time",
+        ),
         _signal("specific_force_S", "s_x s_y s_z", "m/s^2", "a - g at So, at sample_time"),
         _signal("angular_velocity_S", "omega_x omega_y omega_z", "rad/s", "of S, at sample_time"),
         _signal(
@@ -76,22 +80,30 @@ SIGNALS = {
         ),
         _signal(
             "true_contact_wrench_W",
-            *_WRENCH,
+            *_WRENCH_AXES_AND_UNITS,
             "environment on the tool, about Wo, in W",
         ),
         _signal("sheet_state", "z v_z", "m,m/s", "deflection of the sheet spring's end, upwards"),
-        _signal("intent", *_POSE, "intended pose of the stylus, X_BE"),
-        _signal("hand_wrench_E", *_WRENCH, "hand on the stylus at Eo, in B"),
+        _signal("intent", *_POSE_AXES_AND_UNITS, "intended pose of the stylus, X_BE"),
+        _signal("hand_wrench_E", *_WRENCH_AXES_AND_UNITS, "hand on the stylus at Eo, in B"),
         _signal("master_state", _STATE, _STATE_UNITS, "joint angles and velocities of the device"),
-        _signal("pose_master", *_POSE, "of the stylus, X_BE"),
-        _signal("twist_master", *_TWIST, "of the stylus in the device's base"),
-        _signal("pose_command", *_POSE, "setpoint of the slave, X_WS"),
+        _signal("pose_master", *_POSE_AXES_AND_UNITS, "of the stylus, X_BE"),
+        _signal("twist_master", *_TWIST_AXES_AND_UNITS, "of the stylus in the device's base"),
+        _signal("pose_command", *_POSE_AXES_AND_UNITS, "setpoint of the slave, X_WS"),
         _signal("joint_command", _JOINTS, "rad", "from the inverse kinematics"),
         _signal("ik_status", "status", "1", "of the inverse kinematics (IkStatus), 0 = OK"),
-        _signal("scaled_wrench_S", *_WRENCH, "F' of Fig. 2, before the scale to the master"),
-        _signal("contact_wrench_S", *_WRENCH, "Eq. (13), calculated contact wrench"),
+        _signal(
+            "scaled_wrench_S",
+            *_WRENCH_AXES_AND_UNITS,
+            "F' of Fig. 2, before the scale to the master",
+        ),
+        _signal("contact_wrench_S", *_WRENCH_AXES_AND_UNITS, "Eq. (13), calculated contact wrench"),
         _signal("fault", "fault", "1", "of sample or load estimate, 0 = none"),
-        _signal("force_to_master", *_WRENCH, "wrench that the device displays, within its limits"),
+        _signal(
+            "force_to_master",
+            *_WRENCH_AXES_AND_UNITS,
+            "wrench that the device displays, within its limits",
+        ),
         _signal("fault_at_hand", "fault", "1", "of the wrench command at the device, 0 = none"),
         _signal(
             "task_state",
@@ -100,7 +112,9 @@ SIGNALS = {
             "of the operator's task: phase; 1 done, -1 given up; 1 while contact is detected;"
             " smallest detected force at the hand; share of approach_speed (docs/operator.md)",
         ),
-        _signal("pose_received", *_POSE, "setpoint X_WS of the slave after the channel"),
+        _signal(
+            "pose_received", *_POSE_AXES_AND_UNITS, "setpoint X_WS of the slave after the channel"
+        ),
         _signal(
             "ports",
             "hand hand_rotation slave slave_rotation master_silent slave_silent"
@@ -118,7 +132,11 @@ SIGNALS = {
 def signal_of(name: str, size: int) -> Signal:
     """Return the description of a signal for `size` components; SI units of revolute joints."""
     if name.startswith(POSE_OF):
-        return _signal(name, *_POSE, f"where the body {name.removeprefix(POSE_OF)} is, in W, at t")
+        return _signal(
+            name,
+            *_POSE_AXES_AND_UNITS,
+            f"where the body {name.removeprefix(POSE_OF)} is, in W, at t",
+        )
     signal = SIGNALS[name]
     if size == len(signal.components):
         return signal

@@ -310,7 +310,7 @@ def random_message(rng: np.random.Generator) -> object:
 def test_all_values_stay_finite_after_10000_random_messages(scenario, load, clock):
     live, rng = make(scenario, load, clock), np.random.default_rng(0)
     live.join(1, clock())
-    live._start_drive = lambda now: None  # a thousand resets would build as many stations
+    live._start_session = lambda now: None  # a thousand resets would build as many stations
     for k in range(10_000):
         live.handle_message(1, random_message(rng), clock())
         if k % 1000 == 0:

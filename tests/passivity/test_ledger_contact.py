@@ -206,7 +206,7 @@ def test_noise_of_a_light_contact_is_no_large_friction():
 
 
 def test_friction_stays_across_the_direction_as_it_turns():
-    """Of a contact beside So, on which the hand moves in all axes; no limit is reached."""
+    """The contact is beside So, the hand moves in all axes, and no limit is reached."""
     rng = np.random.default_rng(4)
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.2, 0.0, 0.0]), 0.0)
     hand.rest(100)

@@ -168,7 +168,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 
 def leaf_displacement(scenario: Scenario) -> list[float]:
-    """Return the master's displacement [m], in B, that presses the tip 5 mm into the leaf."""
+    """Return the displacement of the master [m], in B, that bends the leaf spring by 5 mm."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:

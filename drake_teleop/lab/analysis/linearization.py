@@ -487,7 +487,7 @@ class _Period:
             np.append(q, np.zeros(len(q))),
             pose_B,
             np.zeros(6),
-            initial_display_state(self._device.display_axes(q), self._device.numbers),
+            initial_display_state(self._device.display_coordinates(q), self._device.numbers),
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)

@@ -231,7 +231,9 @@ class Scene:
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
         motions_of(self.arm.table, q, 0 * q, 0 * q, motions)
         capsules: dict[GeometryId, tuple[int, Capsule]] = {}
-        for shape in sorted({shape for pair in candidates for shape in pair}, key=_number):
+        for shape in sorted(
+            {shape for pair in candidates for shape in pair}, key=_identifier_number
+        ):
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
@@ -241,7 +243,7 @@ class Scene:
             if inspector.GetName(shape).endswith(_TABLE):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _outermost(shape, capsules) for shape in capsules}
-        outer_shapes = sorted({outer[shape] for shape in outer}, key=_number)
+        outer_shapes = sorted({outer[shape] for shape in outer}, key=_identifier_number)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
             first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
@@ -298,14 +300,14 @@ def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_Pair, Arr
             manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
 
 
-def _number(shape: GeometryId) -> int:
+def _identifier_number(shape: GeometryId) -> int:
     return int(shape.get_value())
 
 
 def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]) -> GeometryId:
     row, capsule = capsules[shape]
     holding = [
-        (other.radius, -_number(name), name)
+        (other.radius, -_identifier_number(name), name)
         for name, (other_row, other) in capsules.items()
         if other_row == row and other.contains(capsule)
     ]

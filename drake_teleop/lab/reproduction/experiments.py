@@ -31,7 +31,10 @@ _ALL_AXES = Sine(
 
 @dataclass(frozen=True, eq=False)
 class FreeMotion:
-    """Recorded free movement, with the scaled wrench (N, 6) at the slave for each sigma."""
+    """Recorded free movement.
+
+    `scaled` contains the wrench (N, 6) at the slave by sigma, the share of the load's wrench in it.
+    """
 
     scenario: Scenario
     result: SimulationResult
@@ -145,7 +148,7 @@ def ideal_values(run: IdealMotion) -> Values:
 
 
 def free_values(run: FreeMotion, component: int, unit: str) -> Values:
-    """Return the values of Fig. 6 or Fig. 7; `component`: index 0 to 5 in the wrench."""
+    """Return peak, RMS ratio and residuals of a wrench component by name, as in Fig. 6 and 7."""
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
     scale = run.scenario.force_scaling.force_scale

@@ -45,7 +45,8 @@ def scaling_figure(
             peak = float(np.abs(trace).max())
             _note(
                 axes,
-                f"peak {_number(peak)} {unit}   ·   {_number(peak / downscaling)} {unit}"
+                f"peak {_format_number(peak)} {unit}"
+                f"   ·   {_format_number(peak / downscaling)} {unit}"
                 " at the master",
             )
             axes.set_ylabel(f"{symbol} [{unit}]")
@@ -91,10 +92,11 @@ def contact_figure(
         _mark(rows[1], detected_s * per_second, "detected", VERMILION)
         for level in (-threshold, threshold):
             rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
-        _note(rows[0], f"peak {_number(np.abs(traces[0]).max())} N")
+        _note(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
         _note(
             rows[1],
-            f"peak {_number(np.abs(traces[1]).max())} N   ·   threshold {_number(threshold)} N",
+            f"peak {_format_number(np.abs(traces[1]).max())} N"
+            f"   ·   threshold {_format_number(threshold)} N",
         )
         rows[0].set_ylim(*_common_range(traces))
         rows[0].set_xlim(time[0], time[-1])
@@ -119,7 +121,7 @@ def _sigma_title(sigma: float) -> str:
     return f"σ = {sigma:g}:  {meaning.get(sigma, f'{sigma:.0%} of the non-contact part')}"
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     rounded = float(f"{value:.3g}")
     decimals = max(0, 2 - int(np.floor(np.log10(abs(rounded))))) if rounded else 0
     return f"{rounded:.{decimals}f}"

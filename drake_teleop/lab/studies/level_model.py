@@ -168,7 +168,7 @@ class LevelModel:
     def _freedom(self) -> int:
         return self.X.shape[0] - self.X.shape[1]
 
-    def _variance(self, table: Array, columns: int) -> float:
+    def _residual_variance(self, table: Array, columns: int) -> float:
         residuals = table - self.X @ (self.solve @ table)
         # Lower bound by rounding errors for exact fits.
         least = (1e-10 * np.abs(table).max()) ** 2
@@ -178,7 +178,7 @@ class LevelModel:
         return np.linalg.norm(terms @ self.solve, axis=1)
 
     def _design(self, table: Array, together: int) -> float:
-        variance = self._variance(table.mean(axis=1, keepdims=True), 1)
+        variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
         return _quantile(together, self._freedom) * float(np.sqrt(variance))
 
     def _half_width_over_seeds(self, table: Array, terms: Array) -> float:
@@ -187,7 +187,7 @@ class LevelModel:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
         moved = np.sum((terms @ self.solve @ apart) ** 2) / (seeds - 1)
-        noise = self._variance(apart, seeds - 1) * np.sum(self._spread(terms) ** 2)
+        noise = self._residual_variance(apart, seeds - 1) * np.sum(self._spread(terms) ** 2)
         deviation = np.sqrt(max(moved - noise, 0.0) / len(terms) / seeds)
         return _quantile(len(self.factors), seeds - 1) * float(deviation)
 

@@ -233,7 +233,7 @@ def free_delay(data: Instants) -> float:
     forces = data.y[rows][:, FORCES]
     total = (forces * forces).sum(axis=0)
 
-    def cost(shift: float) -> float:
+    def log_residual(shift: float) -> float:
         x = spline(data.t[rows] + shift)
         size = np.sqrt((x * x).mean(axis=0))
         x = x[:, size > 1e-9 * size.max()]
@@ -245,7 +245,7 @@ def free_delay(data: Instants) -> float:
     shifts = (
         np.arange(-round(reach / _DELAY_STEP_S), round(reach / _DELAY_STEP_S) + 1) * _DELAY_STEP_S
     )
-    costs = np.array([cost(x) for x in shifts])
+    costs = np.array([log_residual(x) for x in shifts])
     best = int(np.argmin(costs))
     if best in (0, len(shifts) - 1):
         return 0.0

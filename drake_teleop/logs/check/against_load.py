@@ -292,7 +292,7 @@ def drift_finding(description: Description, data: LogData) -> tuple[list[Finding
     offset, factor = stream.time.offset - lag, scale * stream.time.scale
     edited = edit_field(description, f"{name}.time.offset", offset)
     edited = edit_field(edited, f"{name}.time.scale", factor)
-    if _unexplained(data.thin(edited)) > _HALVED * _unexplained(log):
+    if _unexplained_without_delay(data.thin(edited)) > _HALVED * _unexplained_without_delay(log):
         return [], description
     finding = Finding(
         "clock",
@@ -323,7 +323,7 @@ def _delay_line(log: Log) -> tuple[float, float] | None:
     return float(late + slope * log.t[0]), float(slope)
 
 
-def _unexplained(log: Log) -> float:
+def _unexplained_without_delay(log: Log) -> float:
     try:
         return load_fit(undelayed(log, estimate_delay(log, 15.0) or 0.0)).unexplained
     except DrakeTeleopError:

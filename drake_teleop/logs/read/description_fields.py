@@ -169,18 +169,18 @@ class Strict(BaseModel):
         return value
 
 
-class _Quantity(Strict):
+class _VectorColumns(Strict):
     columns: tuple[Column, ...]
     scale: Scale = (1.0, 1.0, 1.0)
 
 
-class Force(_Quantity):
+class Force(_VectorColumns):
     """Columns of a force and their unit."""
 
     unit: Literal["N", "mN", "kN", "daN", "gf", "kgf", "ozf", "lbf"] = "N"
 
 
-class Torque(_Quantity):
+class Torque(_VectorColumns):
     """Columns of a torque and their unit."""
 
     unit: Literal[
@@ -189,28 +189,28 @@ class Torque(_Quantity):
     ] = "N m"  # fmt: skip
 
 
-class Acceleration(_Quantity):
+class Acceleration(_VectorColumns):
     """Columns of a linear acceleration, their unit and bias."""
 
     unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
-class AngularVelocity(_Quantity):
+class AngularVelocity(_VectorColumns):
     """Columns of an angular velocity, their unit and bias."""
 
     unit: Literal["rad/s", "deg/s"] = "rad/s"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
-class AngularAcceleration(_Quantity):
+class AngularAcceleration(_VectorColumns):
     """Columns of an angular acceleration, their unit and bias."""
 
     unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
     bias: Vector = (0.0, 0.0, 0.0)
 
 
-class Position(_Quantity):
+class Position(_VectorColumns):
     """Columns of a position and their unit."""
 
     unit: Literal["m", "cm", "mm", "in"] = "m"

@@ -326,7 +326,7 @@ class Mounting:
 
     @property
     def determined(self) -> bool:
-        """Whether the rotation is determined to 1 deg about every axis."""
+        """Whether the fit is valid and gives R_SI to 1 deg about every axis."""
         return self.fits and bool((self.deviations_deg < MAX_DEVIATION_DEG).all())
 
 

@@ -119,7 +119,7 @@ class HapticDevice(DisplayDevice):
     def friction_field(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
-    def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def display_coordinates(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         return q
 
     @property

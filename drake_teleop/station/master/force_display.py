@@ -144,7 +144,7 @@ class DeviceBlock(LeafSystem):
         self._advance, self._constants, self._period = advance, constants, period
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         # A separate port for the display's memory would cost a further call.
-        display = initial_display_state(device.display_axes(q_initial), device.numbers)
+        display = initial_display_state(device.display_coordinates(q_initial), device.numbers)
         self._drive = self.DeclareVectorInputPort("drive", len(display))
         # Pose and twist are states because they are read more often than they change.
         for name, start in (

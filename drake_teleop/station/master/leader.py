@@ -202,7 +202,7 @@ class LeaderDevice(DisplayDevice):
     def constants(self) -> tuple[Array, Array, Array]:
         return self.bare.table, self.arm.table, self.joints
 
-    def display_axes(self, q: Array) -> Array:
+    def display_coordinates(self, q: Array) -> Array:
         """Return the vector (6,) for the force display: position of E (3) [m], three zeros."""
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 

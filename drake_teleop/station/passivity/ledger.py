@@ -339,7 +339,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
 
 @njit(cache=True)
 def _friction_stiffness(g, p):
-    """Return k_h of (T68) for translation [N/m] or rotation [N m/rad]."""
+    """Return the stiffness k_h of the friction at the hand (T68) [N/m; N m/rad for g = 1]."""
     factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
     return factor * _MAX_STIFFNESS / max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
 

@@ -71,7 +71,7 @@ _DIRECTION_FILTER_S = 3.0
 _SLIP_FADE_S, _FRICTION_MEMORY_S = 0.6, 1.0
 _GAIN_RISE_S, _MIN_GAIN, _MAX_GAIN, _GAIN_FALL_S = 0.5, 0.1, 10.0, 1.0
 _COMMAND_FILTER_S, _MAX_ACCELERATION, _BRAKING_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
-_FEEDFORWARD_S = 0.02
+_MAX_FEEDFORWARD_SILENCE_S = 0.02
 _SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
 _STOP_HORIZON_S = 4e-3
 _FREE_FORCE_N = 5.0
@@ -261,7 +261,9 @@ def _max_displayed_stiffness(received, T, p, memory):
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
         level = min(max(received[LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
         fill_level += p[METRIC][g] * dot(normal, normal, g) * level
-    max_silence = max(_FEEDFORWARD_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP])
+    max_silence = max(
+        _MAX_FEEDFORWARD_SILENCE_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
+    )
     max_silence = min(max_silence, _MAX_SILENCE_S)
     goal = _MAX_GAIN * fill_level - 1.0
     if memory[_LONGEST_SILENCE] >= max_silence:
@@ -362,7 +364,7 @@ def _generate_command(received, connected, T, p, memory, error):
         beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
         if beyond_wall > 0.0:
             compliance, inward_speed = 1.0 - memory[_DISPLAYED_SHARE], -work_along(normal, feed)
-    feeds_forward = connected and memory[_SILENCE] < _FEEDFORWARD_S
+    feeds_forward = connected and memory[_SILENCE] < _MAX_FEEDFORWARD_SILENCE_S
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             error[i] += compliance * beyond_wall * p[METRIC][g] * normal[i]

@@ -22,7 +22,7 @@ from pydrake.multibody.tree import (
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.model_tree import WORLD
-from drake_teleop.station.slave.model.repair_report import listed
+from drake_teleop.station.slave.model.repair_report import join_names
 
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
@@ -93,7 +93,9 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
     for body in free:
         plant.WeldFrames(plant.world_frame(), body.body_frame())
     names = [body.name() for body in free if body.name() != WORLD]
-    return [f"not connected to the arm and welded to the world: {listed(names)}"] if names else []
+    return (
+        [f"not connected to the arm and welded to the world: {join_names(names)}"] if names else []
+    )
 
 
 def check_chain(
@@ -153,7 +155,7 @@ def weld_other_joints(
     names = sorted(joint.name() for joint in joints)
     for joint in joints:
         _weld(plant, joint)
-    return [f"held: {listed(names)}"] if names else []
+    return [f"held: {join_names(names)}"] if names else []
 
 
 def _weld(plant: MultibodyPlant, joint: Joint) -> None:
@@ -240,7 +242,7 @@ def assume_rotor_inertias(
         motor[joint.index()].set_default_rotor_inertia(_SLIDING_MOTOR_KG if slides else inertia)
         motor[joint.index()].set_default_gear_ratio(1.0)
     return [
-        f"{what}, as the model has no inertia there, for {listed(names)}"
+        f"{what}, as the model has no inertia there, for {join_names(names)}"
         for what, names in (
             (f"a rotor inertia of {inertia:.3g} kg m^2", turning),
             (f"a moved mass of {_SLIDING_MOTOR_KG:g} kg", sliding),

@@ -39,7 +39,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.station.environment.environment import Environment, Several
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.model.meshes import AddSkeleton
-from drake_teleop.station.slave.model.repair_report import listed
+from drake_teleop.station.slave.model.repair_report import join_names
 from drake_teleop.station.slave.plant import (
     HashableByValue,
     NominalSlave,
@@ -106,8 +106,9 @@ class PostureShapes:
         self._by_design = self._overlaps_by_design()
         names = [" and ".join(self.plant.get_body(k).name() for k in p) for p in self._by_design]
         if names:
+            pairs = join_names(sorted(names))
             self.assumptions.append(
-                f"overlaps left out, as they are in nearly all postures: {listed(sorted(names))}"
+                f"overlaps left out, as they are in nearly all postures: {pairs}"
             )
 
     def shapes_of(self, body: BodyIndex) -> list[GeometryId]:

@@ -26,7 +26,7 @@ from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_masses import NO_MASS
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
-from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, listed
+from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, join_names
 from drake_teleop.station.slave.model.urdf_repair import Purpose
 
 _GRAVITY, _GRAVITY_TOLERANCE = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
@@ -87,7 +87,7 @@ def _check_bodies(world: Body, report: RepairReport) -> None:
     ):
         twice = sorted(name for name, number in Counter(names).items() if number > 1)
         if twice:
-            report.refuse(f"several {kind} are named {listed(twice)}")
+            report.refuse(f"several {kind} are named {join_names(twice)}")
 
 
 def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:

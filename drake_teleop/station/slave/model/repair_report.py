@@ -59,7 +59,7 @@ class RepairReport:
     @property
     def assumptions(self) -> list[str]:
         """One text for each kind of repair."""
-        return [f"{what} {listed(names)}" for what, names in self._names.items()]
+        return [f"{what} {join_names(names)}" for what, names in self._names.items()]
 
     def raise_causes(self, file: Path) -> None:
         """Raise one DrakeTeleopError with all faults, if there are any."""
@@ -77,7 +77,7 @@ class RepairReport:
             raise DrakeTeleopError(f"{len(causes)} faults: {'; '.join(texts)}", where=str(file))
 
 
-def listed(names: Iterable[str]) -> str:
+def join_names(names: Iterable[str]) -> str:
     """Return names in one text; only the first of many."""
     each = list(names)
     more = [f"and {len(each) - _MAX_NAMES} more"] if len(each) > _MAX_NAMES else []

@@ -29,7 +29,7 @@ from drake_teleop.station.slave.model.model_tree import (
     link_of_frame,
     reduce_to_chain,
 )
-from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, listed
+from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, join_names
 
 _URDF_PARTS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
 _URDF_PARTS |= {"drake:collision_filter_group"}
@@ -113,7 +113,7 @@ def finish_repair(
     report.raise_causes(file)
     lost = remove_unusable_shapes(root, file, files, folder)
     for fault, links in lost.items():
-        report.repair("shapes are missing of", f"{listed(links)}: {fault}")
+        report.repair("shapes are missing of", f"{join_names(links)}: {fault}")
     report.raise_causes(file)
     limits = {
         joint.get("name", ""): number(limit.get("effort") or limit.findtext("effort") or "0")
