@@ -141,7 +141,9 @@ def test_what_is_advised_installs_an_extra_that_there_is():
     advised = {
         name
         for text in texts.values()
-        for name in re.findall(r"remedy_to_install_extra\(\"(\w+)\"\)|install '\.\[(\w+)\]'", text)
+        for name in re.findall(
+            r"remedy_to_install_extra\(\"(\w+)\"\)|install '\.\[([a-z]\w*)\]'", text
+        )
         for name in name
         if name
     }
