@@ -188,3 +188,17 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     gain = 2.0 * (contact.state.likelihood - state.likelihood)
     assert contact.name == "contact" and contact.state.spans == ((found_start, found_stop),)
     assert contact.score == pytest.approx(gain - price)
+
+
+@pytest.mark.parametrize("rest", [2.0, 3.0])
+def test_rest_at_both_ends_does_not_make_another_error_a_contact(rest: float) -> None:
+    """At rest any load explains the wrench, but it does not predict that of the motion."""
+    dt = 0.002
+    t = np.arange(0.0, 20.0, dt)
+    share = np.clip(2.0 * np.minimum(t - rest, 20.0 - rest - t), 0.0, 1.0)  # of the full speed
+    s, omega, *_ = moving(np.cumsum(share) * dt)
+    omega *= share[:, None]
+    motion = (s, omega, np.gradient(omega, dt, axis=0))
+    wrench = non_contact_wrench(*motion, PHI)[:, [1, 0, 2, 4, 3, 5]] + OFFSETS
+    wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
+    assert contact_spans(State.of(instants(t, wrench, motion, GRAVITY_W), Model())) == ()
