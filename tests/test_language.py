@@ -32,7 +32,6 @@ MAX_WORDS = 32
 EXCEPTIONS = {
     "felt": "name of a column or port that users read",
     "watched": "name of a module or of a state that users read",
-    "left behind": "verdict of `compare-passivity` that its page explains",
     "room": "attribute of a posture: distance to the nearest limit",
     "tell": "in a table of summary names",
 }

@@ -31,7 +31,7 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
         ({"leaked": 0.01234}, "leaks 12 mJ", "98%"),
         ({"hands_leaked": 2.345}, "leaks 2.3 J", "98%"),
         ({"hands_leaked": 1.0, "fast_force": 0.051}, "chatters", "98%"),
-        ({"fast_force": 1.0, "left_behind": 5.1e-3}, "left behind", "98%"),
+        ({"fast_force": 1.0, "left_behind": 5.1e-3}, "position error", "98%"),
         ({"stable": False, "left_behind": 1.0, "leaked": 1.0}, "unstable", ""),
         # A run that ended early.
         (

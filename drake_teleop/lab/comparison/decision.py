@@ -9,7 +9,7 @@ from typing import Any
 from drake_teleop.lab.comparison.one_dof import TIP
 from drake_teleop.station.oscillation import MAX_FAST_FORCE_N
 
-UNSTABLE, LEFT_BEHIND, CHATTERS = "unstable", "left behind", "chatters"
+UNSTABLE, POSITION_ERROR, CHATTERS = "unstable", "position error", "chatters"
 LEAKS, HOLDS = "leaks", "holds"
 MAX_DRIFT_M, MIN_LEAK_J = 5e-3, 1e-3  #: m; J
 
@@ -59,7 +59,7 @@ def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
-        return Cell(LEFT_BEHIND, forces, leaked=leaked)
+        return Cell(POSITION_ERROR, forces, leaked=leaked)
     if max(run["fast_force"] for run in runs) > MAX_FAST_FORCE_N:
         return Cell(CHATTERS, forces, leaked=leaked)
     return Cell(LEAKS if leaked > MIN_LEAK_J else HOLDS, forces, leaked=leaked)

@@ -18,7 +18,7 @@ from drake_teleop.lab.comparison.decision import (
     CHATTERS,
     HOLDS,
     LEAKS,
-    LEFT_BEHIND,
+    POSITION_ERROR,
     UNSTABLE,
     decide,
 )
@@ -27,13 +27,13 @@ from drake_teleop.station.channel.network import PRESETS
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
 COLUMNS = (
-    ("hunting", "Hunting [mm]", 1e3, 2),
-    ("turning", "Turning [deg]", 180 / np.pi, 2),
-    ("felt_force", "Felt [N]", 1.0, 2),
-    ("felt_share", "Felt share [%]", 1e2, 1),
+    ("hunting", "Oscillation [mm]", 1e3, 2),
+    ("turning", "Rotation [deg]", 180 / np.pi, 2),
+    ("felt_force", "Rendered [N]", 1.0, 2),
+    ("felt_share", "Rendered share [%]", 1e2, 1),
     ("chatter", "Chatter [N]", 1.0, 2),
     ("fast_force", "Above 5 Hz [N]", 1.0, 3),
-    ("left_behind", "Left behind [mm]", 1e3, 2),
+    ("left_behind", "Position error [mm]", 1e3, 2),
     ("free_force", "Free force [N]", 1.0, 2),
     ("rise_delay", "Rise delay [ms]", 1e3, 0),
     ("leaked", "Leaked [mJ]", 1e3, 1),
@@ -44,7 +44,7 @@ VERDICTS = {
     HOLDS: ("✓", "#CBE4F4", BLACK),
     LEAKS: ("⚠", "#FBEBB8", BLACK),
     CHATTERS: ("≈", "#F7D39B", BLACK),
-    LEFT_BEHIND: ("↷", "#F0B878", BLACK),
+    POSITION_ERROR: ("↷", "#F0B878", BLACK),
     UNSTABLE: ("✗", "#565C66", "white"),
 }
 _MARKERS = "os^Dv"  # marks of the networks
@@ -165,7 +165,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
 
     figure = _draw_grid(summary, traces, draw, "force [N]")
-    figure.suptitle("Felt force (blue) and scaled contact force (grey)", x=0.01, ha="left")
+    figure.suptitle("Rendered force (blue) and scaled contact force (grey)", x=0.01, ha="left")
     return figure
 
 
@@ -238,7 +238,7 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.table import Table
 
     console, table = Console(), decide(summary)
-    grid = Table(title="Felt share of the contact's force", title_justify="left", box=SIMPLE_HEAD)
+    grid = Table(title="Rendered share of the contact force", title_justify="left", box=SIMPLE_HEAD)
     grid.add_column("Method", no_wrap=True)
     for network in summary["networks"]:
         grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")
