@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.geometry import Box, Cylinder
+from pydrake.geometry import Box, Cylinder, GeometryId
 from pydrake.geometry import Capsule as CapsuleShape
 
 from drake_teleop.lab.excitation.collision import (
     CLEARANCE,
     Capsule,
+    _exclude_coaxial,
     _minimum_distance,
     bounding_capsule,
 )
@@ -66,3 +68,20 @@ def test_minimum_distance_subtracts_the_quartile_of_the_excess():
     # Capsules remain free in 90 % of the free postures.
     free = np.linspace(0.06, 0.16, 101)
     assert _minimum_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_only_near_shapes_at_a_constant_distance_are_measured_in_the_first_postures():
+    shapes = [GeometryId.get_new_id() for _ in range(6)]
+    steps = np.linspace(0.0, 0.01, 40)
+    distances = {
+        (shapes[0], shapes[1]): np.full(40, -0.02) + 0.05 * steps,  # coaxial, within 1 mm
+        (shapes[2], shapes[3]): np.full(40, -0.02) + steps,  # overlaps, but moves
+        (shapes[4], shapes[5]): np.full(40, 0.02),  # apart
+    }
+    before = {pair: of_pair.copy() for pair, of_pair in distances.items()}
+    excluded = []
+    _exclude_coaxial(SimpleNamespace(Apply=excluded.append), distances)
+    coaxial, *others = distances
+    assert len(excluded) == 1 and (distances[coaxial] == -0.02).all()
+    for pair in others:
+        np.testing.assert_array_equal(distances[pair], before[pair])
