@@ -317,6 +317,16 @@ def replace_frame_causes(why: Explanation, finding: Finding) -> tuple[Cause, ...
     return why.causes
 
 
+def unexplained_finding(why: Explanation) -> Finding:
+    """Return the finding that a misfit has no known cause."""
+    ratio = why.state.residual_ratio
+    return Finding(
+        "misfit",
+        f"the residual is up to {ratio:.0f} times the sensor's noise, and no known cause explains"
+        " it; record without contact, with the same load throughout and with loose cables",
+    )
+
+
 def removed_weight_note(why: Explanation) -> str:
     if "weight" not in why.given or why.removed_weight is None:
         return ""

@@ -52,6 +52,7 @@ from drake_teleop.logs.explained_log import (
     implausible_mass_message,
     removed_weight_note,
     replace_frame_causes,
+    unexplained_finding,
 )
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
 from drake_teleop.logs.read.alignment import (
@@ -237,6 +238,8 @@ def _identified(
         findings = errors
     elif not causes and not raw.free:
         findings = question_fit(log, result, predicted, known_delay, check) or other
+        if why is not None and why.misfit and not (findings or result.identifiable[6:].any()):
+            findings = (unexplained_finding(why),)
     mass_message = implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
         findings = (*findings, Finding("units", mass_message))

@@ -94,3 +94,11 @@ def test_contact_and_the_opposite_sign_are_named_together(
     assert {cause.name for cause in found.causes} == {"axes", "contact"}
     assert found.causes[0].fields == {"wrench.sign": record.sign}
     assert found.identification.mass == pytest.approx(record.truth.loads[0][0][0], rel=0.005)
+
+
+def test_a_misfit_without_a_known_cause_is_a_finding(tmp_path: Path) -> None:
+    """Contact that is not recognised: no load is known, and the user learns why."""
+    found = identify_log(write(make_record("contact", "fourier", "poses", 22), tmp_path))
+    assert not found.causes and not found.identification.identifiable[6:].any()
+    (finding,) = found.findings
+    assert finding.name == "misfit" and "times the sensor's noise" in finding.message
