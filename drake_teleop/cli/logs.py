@@ -14,7 +14,7 @@ from drake_teleop.common.files import output_folder, write_json, write_picture, 
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification, identified_object
-from drake_teleop.logs.contact import contacts_of
+from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.figures import (
     common_figures,
     contact_figures,
@@ -201,11 +201,11 @@ def detect_command(
         "threshold": found.threshold,
         "noise": found.floor.noise,
         "per_acceleration": found.floor.per_acceleration,
-        "above_threshold": found.above.mean(),
+        "above_threshold": found.is_above_threshold.mean(),
         "in_contact": found.touched.mean(),
         "force_threshold": found.force_threshold,
         "above_force_threshold": share_above_force(eliminated, found.force_threshold),
-        "contacts": contacts_of(eliminated.log.t, eliminated.contact, found.touched),
+        "contacts": summarize_contacts(eliminated.log.t, eliminated.contact, found.touched),
     }
     summary["notes"] += found.notes
     summary = plain(summary)

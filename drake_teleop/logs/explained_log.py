@@ -16,7 +16,7 @@ from drake_teleop.common.texts import yaml_data
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
-from drake_teleop.logs.causes.instants import Instants, instants
+from drake_teleop.logs.causes.instants import Instants, block_means_of_record
 from drake_teleop.logs.causes.intervals import attenuation_bias
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -251,7 +251,9 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
-    return instants(log.t, log.wrench, motion, gravity, lost, _acceleration_noise(splines))
+    return block_means_of_record(
+        log.t, log.wrench, motion, gravity, lost, _acceleration_noise(splines)
+    )
 
 
 def _acceleration_noise(splines: PoseSplines) -> float:
@@ -300,7 +302,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
         offsets=why.theta[:6],
         covariance=why.covariance,
         identifiable=identifiable,
-        residual_rms=why.state.rows.rms(why.state.fit.residual),
+        residual_rms=why.state.rows.residual_rms(why.state.fit.residual),
         weight_removed=any(cause.name == "weight removed" for cause in why.causes)
         or "weight" in why.given,
         prior_dominated=np.zeros(16, bool),
@@ -331,7 +333,7 @@ def removed_weight_note(why: Explanation) -> str:
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
-    deviation = float(np.sqrt(why.state.extension("weight")[1][0, 0]))
+    deviation = float(np.sqrt(why.state.parameters_of_extension("weight")[1][0, 0]))
     com = ", ".join(f"{1e3 * x / mass:.3g}" for x in moment) if mass else "0, 0, 0"
     return (
         f"the weight that is removed from the wrench is that of {mass:.4g} kg"

@@ -18,8 +18,8 @@ from drake_teleop.load.identification import (
     consistency_margin,
 )
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.cause import Stretch
-from drake_teleop.logs.contact import contacts_of, noise_floor
+from drake_teleop.logs.causes.cause import RecordPartWithLoad
+from drake_teleop.logs.contact import summarize_contacts, noise_floor
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 
 
@@ -41,7 +41,7 @@ def common_figures(
     }
 
 
-def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
+def load_of_stretch(stretch: RecordPartWithLoad) -> dict[str, Any]:
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -135,7 +135,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     }
     if found.detection is not None:
         figures["threshold"] = found.detection.threshold
-        figures["contacts"] = contacts_of(found.log.t, found.contact, found.touched)
+        figures["contacts"] = summarize_contacts(found.log.t, found.contact, found.touched)
         figures["in_contact"] = found.touched.mean()
     if found.causal is not None:
         late, contact = found.causal.contact[~found.edge], found.contact[~found.edge]

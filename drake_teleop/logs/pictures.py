@@ -231,7 +231,9 @@ def draw_detection(found: DetectedLog) -> Any:
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set_ylabel(f"{found.statistic} [standard deviations]")
         below.set_xlabel("time [s]")
-        below.set_title(f"above the threshold {100 * found.above.mean():.2g} % of the time")
+        below.set_title(
+            f"above the threshold {100 * found.is_above_threshold.mean():.2g} % of the time"
+        )
         for axis in (top, below):
             shade_contact(axis, t, found.touched[inner])
         figure.legend(loc="outside lower center", ncols=3)

@@ -14,7 +14,11 @@ from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.aligned_log import clock_note, motion_and_load, use_spline_motion
+from drake_teleop.logs.aligned_log import (
+    clock_rate_notes,
+    estimate_motion_and_load,
+    use_spline_motion,
+)
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -57,7 +61,7 @@ def fit_posed(
     """
     if log.posed is None or method not in ROBUST or not has_usable_poses(log):
         return None, ()
-    found, source = motion_and_load(log, delay)
+    found, source = estimate_motion_and_load(log, delay)
     finding = None if log.free else pose_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.turned and not found.frame.shifted
@@ -134,7 +138,7 @@ def _consistent(found: PoseEstimate) -> Array:
 
 
 def _note(found: PoseEstimate, stated: float) -> str:
-    notes = [*([found.note] if found.note else []), *clock_note(found)]
+    notes = [*([found.note] if found.note else []), *clock_rate_notes(found)]
     if not found.fit.explained:
         gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
         notes.append(

@@ -28,20 +28,20 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.causes.cause import EVENTS, Cause, Stretch
+from drake_teleop.logs.causes.cause import TEMPORARY_CAUSES, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     Conventions,
     check_file,
-    errors_of_motion,
-    question_fit,
+    findings_about_motion,
+    check_suspicious_load,
 )
-from drake_teleop.logs.check.corrections import EFFECTS, Finding
+from drake_teleop.logs.check.corrections import POSSIBLE_EFFECTS_OF_CAUSES, Finding
 from drake_teleop.logs.contact import (
     MIN_SAMPLES,
     Detection,
     detect_contact,
-    detector_samples,
+    samples_for_detector,
     noise_floor,
     offset_shift_note,
     robust_offsets,
@@ -98,7 +98,7 @@ class IdentifiedLog:
     base: BaseParameters
     findings: tuple[Finding, ...] = ()
     causes: tuple[Cause, ...] = ()
-    loads: tuple[Stretch, ...] = ()
+    loads: tuple[RecordPartWithLoad, ...] = ()
     delay_deviation_s: float = float("nan")
 
     def __repr__(self) -> str:
@@ -219,7 +219,7 @@ def _identified(
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.misfit:
-        errors = errors_of_motion(check)
+        errors = findings_about_motion(check)
     if errors:
         why = None
         known = result.identifiable & np.repeat([True, False], [6, 10])
@@ -237,7 +237,7 @@ def _identified(
     if errors:
         findings = errors
     elif not causes and not raw.free:
-        findings = question_fit(log, result, predicted, known_delay, check) or other
+        findings = check_suspicious_load(log, result, predicted, known_delay, check) or other
         if why is not None and why.misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
     mass_message = implausible_mass_message(result.mass, causes, raw)
@@ -283,7 +283,9 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
         return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
-    if identified.causes and all(finding.name in EFFECTS for finding in findings):
+    if identified.causes and all(
+        finding.name in POSSIBLE_EFFECTS_OF_CAUSES for finding in findings
+    ):
         causes = tuple(
             Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
         )
@@ -386,10 +388,10 @@ def eliminate_log(
         )
     if found.log.static:
         return found
-    samples = detector_samples(found.log, found.contact, cutoff_hz)
+    samples = samples_for_detector(found.log, found.contact, cutoff_hz)
     reference = None
     if free_motion is not None:
-        free_samples = detector_samples(free_motion.log, free_motion.contact, cutoff_hz)
+        free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
         reference = free_samples.at(~free_motion.edge), free_motion.log.dt
     covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
     options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
@@ -545,7 +547,7 @@ def _suspected_errors(
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
     if sizes[1] < 0.3 * sizes[0]:
         return ()
-    ignored = {"lag", "payload", *EVENTS}
+    ignored = {"lag", "payload", *TEMPORARY_CAUSES}
     if load.weight_removed:
         ignored |= {"weight removed", "payload configured"}
     return tuple(x for x in check_log(path).findings if x.name not in ignored)

@@ -17,7 +17,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass
-from drake_teleop.logs.contact import contacts_of
+from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.pose_motion.estimate import motion_of_load
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
@@ -164,7 +164,7 @@ def test_contacts_at_the_rate_of_a_camera_are_those_at_the_full_rate(sample, tmp
     off = (found.contact - contact)[~found.edge, :3]
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.17
     for one, begin in ((found, 0.05), (full, 0.0)):
-        starts = contacts_of(one.log.t, one.contact, one.touched)
+        starts = summarize_contacts(one.log.t, one.contact, one.touched)
         assert [round(x["start_s"] + begin, 1) for x in starts] == pytest.approx(
             [touch.start_s for touch in TOUCHES_OF_SAMPLE], abs=0.11
         )

@@ -11,7 +11,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.explain import explain
-from drake_teleop.logs.causes.instants import Instants, free_delay, instants
+from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit, block_means_of_record
 from drake_teleop.logs.read.alignment import resample, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
@@ -203,7 +203,7 @@ def log_instants(log: Log) -> Instants:
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:
         gravity, motion = log.gravity_W, (*log.motion, log.R_WS)
-    return instants(log.t, log.wrench, motion, gravity, log.bridged)
+    return block_means_of_record(log.t, log.wrench, motion, gravity, log.bridged)
 
 
 def weight_wrench(weight: Array, gravity: Array) -> Array:
@@ -217,7 +217,9 @@ def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     The delay is estimated from `motion_log`, the same log with motion, and removed.
     """
     assert motion_log.gravity is not None
-    at = np.clip(log.t + free_delay(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1])
+    at = np.clip(
+        log.t + delay_of_free_fit(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1]
+    )
     return replace(
         log,
         wrench=log.wrench + weight_wrench(weight, resample(at, motion_log.t, motion_log.gravity)),
@@ -237,7 +239,7 @@ def describe_gravity(
         log_instants(log), lambda delay_s: log_instants(undelayed(log, delay_s)), ("gravity",)
     )
     if explanation.theta[6] > 0.0:
-        change, covariance = explanation.state.extension("gravity")
+        change, covariance = explanation.state.parameters_of_extension("gravity")
         estimated = description.gravity_W - change
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
         across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
