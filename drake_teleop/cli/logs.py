@@ -19,10 +19,10 @@ from drake_teleop.logs.figures import (
     common_figures,
     contact_figures,
     load_figures,
-    load_of_stretch,
-    object_figures,
-    object_notes,
-    plain,
+    figures_of_record_part,
+    figures_of_object_alone,
+    notes_on_object_alone,
+    to_plain_values,
     rms_figures,
     share_above_force,
 )
@@ -67,13 +67,13 @@ def identify_command(
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
         "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
         "causes": [asdict(cause) for cause in found.causes],
-        "loads": [load_of_stretch(stretch) for stretch in found.loads],
+        "loads": [figures_of_record_part(stretch) for stretch in found.loads],
     }
     if alone is not None:
-        summary |= {"gripper": str(gripper), "object": object_figures(alone)}
-        summary["notes"] += object_notes(alone)
-    summary = plain(summary)
-    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, stack_pictures
+        summary |= {"gripper": str(gripper), "object": figures_of_object_alone(alone)}
+        summary["notes"] += notes_on_object_alone(alone)
+    summary = to_plain_values(summary)
+    from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, stack_pictures
     from drake_teleop.logs.report import write_report
 
     with output_folder(out):
@@ -81,7 +81,7 @@ def identify_command(
         if alone is not None:
             alone.save(out / "object.json")
         write_picture(out / "fit.png", draw_fit(found))
-        write_picture(out / "knowledge.png", draw_knowledge(found))
+        write_picture(out / "knowledge.png", draw_spectrum_and_intervals(found))
         stack_pictures(out / "fit.png", out / "knowledge.png", out / "report.png")
         write_report(out / "report.html", found, summary, alone)
         write_json(out / "summary.json", summary)
@@ -152,7 +152,7 @@ def eliminate_command(
         summary["notes"] += found.detection.notes
     elif not found.log.static:
         summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
-    summary = plain(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
+    summary = to_plain_values(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
     from drake_teleop.logs.pictures import draw_elimination
 
     with output_folder(out):
@@ -208,7 +208,7 @@ def detect_command(
         "contacts": summarize_contacts(eliminated.log.t, eliminated.contact, found.touched),
     }
     summary["notes"] += found.notes
-    summary = plain(summary)
+    summary = to_plain_values(summary)
     from drake_teleop.logs.pictures import draw_detection
 
     with output_folder(out):

@@ -41,7 +41,7 @@ def common_figures(
     }
 
 
-def load_of_stretch(stretch: RecordPartWithLoad) -> dict[str, Any]:
+def figures_of_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -69,13 +69,13 @@ def load_figures(load: Identification) -> dict[str, Any]:
         "phi_std": deviations[6:],
         "phi_interval": np.stack(ends, axis=1)[6:],
         "verdicts": dict(zip(PARAMETERS, load.verdicts, strict=True)),
-        "identifiable": _named(load, True),
-        "not_identifiable": _named(load, False),
+        "identifiable": _parameter_names(load, True),
+        "not_identifiable": _parameter_names(load, False),
         "physically_consistent": load.physically_consistent,
     }
 
 
-def object_figures(alone: Identification) -> dict[str, Any]:
+def figures_of_object_alone(alone: Identification) -> dict[str, Any]:
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -83,7 +83,7 @@ def object_figures(alone: Identification) -> dict[str, Any]:
     return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
 
 
-def object_notes(alone: Identification) -> list[str]:
+def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
@@ -101,7 +101,7 @@ def object_notes(alone: Identification) -> list[str]:
     return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
-def _named(result: Identification, identifiable: bool) -> list[str]:
+def _parameter_names(result: Identification, identifiable: bool) -> list[str]:
     pairs = zip(PARAMETERS, result.identifiable, strict=True)
     return [name for name, flag in pairs if bool(flag) == identifiable]
 
@@ -109,18 +109,23 @@ def _named(result: Identification, identifiable: bool) -> list[str]:
 def rms_figures(found: EliminatedLog) -> dict[str, Any]:
     """Return RMS and peak values of the wrenches, without samples near ends and gaps."""
 
-    def rms(x: Array) -> Array:
+    def rms_over_samples(x: Array) -> Array:
         return np.sqrt(np.mean(x**2, axis=0))
 
-    def peak(x: Array) -> Array:
+    def peak_over_samples(x: Array) -> Array:
         return np.abs(x).max(axis=0)
 
     inner, weightless = ~found.edge, found.gravity_only
     return (
-        _reduced("raw", "rms", found.measured[inner], rms)
-        | _reduced("gravity_only", "rms", None if weightless is None else weightless[inner], rms)
-        | _reduced("residual", "rms", found.contact[inner], rms)
-        | _reduced("residual", "peak", found.contact[inner], peak)
+        _force_and_torque_figures("raw", "rms", found.measured[inner], rms_over_samples)
+        | _force_and_torque_figures(
+            "gravity_only",
+            "rms",
+            None if weightless is None else weightless[inner],
+            rms_over_samples,
+        )
+        | _force_and_torque_figures("residual", "rms", found.contact[inner], rms_over_samples)
+        | _force_and_torque_figures("residual", "peak", found.contact[inner], peak_over_samples)
     )
 
 
@@ -140,7 +145,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     if found.causal is not None:
         late, contact = found.causal.contact[~found.edge], found.contact[~found.edge]
 
-        def rms(name: str, wrench: Array) -> dict[str, float]:
+        def rms_of_wrench(name: str, wrench: Array) -> dict[str, float]:
             force, torque = np.sqrt(np.mean(wrench**2, axis=0).reshape(2, 3).sum(axis=1))
             return {f"{name}_rms": float(force), f"{name}_torque_rms": float(torque)}
 
@@ -149,9 +154,9 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
             "lag_s": found.causal.lag_s,
             "tare_s": causal_tare_s,
             "offsets": found.causal.offsets,
-            **rms("residual", late),
+            **rms_of_wrench("residual", late),
             "noise_floor": noise_floor(late),
-            **rms("difference", late - contact),
+            **rms_of_wrench("difference", late - contact),
         }
     return figures
 
@@ -171,7 +176,7 @@ def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     }
 
 
-def _reduced(
+def _force_and_torque_figures(
     name: str, suffix: str, wrench: Array | None, reduce: Callable[[Array], Array]
 ) -> dict[str, Any]:
     keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
@@ -181,12 +186,12 @@ def _reduced(
     return dict(zip(keys, [*norms, reduce(wrench)], strict=True))
 
 
-def plain(value: Any) -> Any:
+def to_plain_values(value: Any) -> Any:
     """Convert NumPy values to plain Python values, and infinity to None."""
     if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
+        return {key: to_plain_values(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
+        return [to_plain_values(entry) for entry in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
+        return to_plain_values(value.tolist())
     return None if value in (float("inf"), float("-inf")) else value

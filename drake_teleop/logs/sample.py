@@ -18,7 +18,7 @@ from drake_teleop.common.texts import yaml_text
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.logs.figures import plain
+from drake_teleop.logs.figures import to_plain_values
 from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY, UNITS
 
 MASS, COM = 0.95, np.array([0.004, -0.011, 0.058])
@@ -123,7 +123,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
             _write_wrench(out / f"{name}_wrench.csv", _motion(row), touches, OFFSETS[row], random)
             _write_pose(out / f"{name}_pose.csv", _motion(row), random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
-        write_json(out / "truth.json", plain(_truth()))
+        write_json(out / "truth.json", to_plain_values(_truth()))
         summary = {
             "seed": seed,
             "files": [*files, "truth.json"],

@@ -23,8 +23,8 @@ from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_chan
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     find_hypothesis,
-    offset_step,
-    unexplained,
+    find_offset_step,
+    unexplained_reading,
 )
 from drake_teleop.logs.pose_motion.poses import Posed, Poses
 from drake_teleop.logs.read.canonical import Log
@@ -45,10 +45,12 @@ def log_of(x: SampleEpisode) -> Log:
 def verdict(x: SampleEpisode) -> set[str]:
     fps = 1.0 / (x.t[1] - x.t[0])
     signals = EpisodeSignals(log_of(x), max(2.0, 0.12 * fps))
-    predict = signals.predictor(PHI)
-    found = find_hypothesis(predict, signals.regress, 0.0, 0.8 * NOISE)
+    predict = signals.reading_predictor(PHI)
+    found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * NOISE)
     names = {f.name for f in name_faults(found, 0.0, PHI, fps) + saturated_channels(x.wrench)}
-    step = offset_step(unexplained(found, predict, signals.regress), found.spread)
+    step = find_offset_step(
+        unexplained_reading(found, predict, signals.regressor_at_lag), found.spread
+    )
     return names | ({"tared"} if step is not None else set())
 
 
@@ -108,7 +110,7 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
     squares = []
     for number in range(6):
         x = sample_episode(number, phi=phi, contacts=0)
-        reading, load_wrench = EpisodeSignals(log_of(x), 4.0).predictor(phi)("sensor", 0.0)
+        reading, load_wrench = EpisodeSignals(log_of(x), 4.0).reading_predictor(phi)("sensor", 0.0)
         rest = reading - load_wrench
         squares.append(((rest - np.median(rest, axis=0)) / NOISE) ** 2)
     assert np.sqrt(np.mean(squares)) < 1.2
@@ -124,7 +126,9 @@ def test_any_large_rotation_of_the_wrench_is_found(
     R = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     x = mapped(R)(sample_episode(number, contacts=1))
     signals = EpisodeSignals(log_of(x), 3.6)
-    found = find_hypothesis(signals.predictor(PHI), signals.regress, 0.0, 0.8 * NOISE)
+    found = find_hypothesis(
+        signals.reading_predictor(PHI), signals.regressor_at_lag, 0.0, 0.8 * NOISE
+    )
     assert np.degrees(Rotation.from_matrix(found.force @ R.T).magnitude()) < 3.0
 
 
@@ -173,7 +177,7 @@ def test_a_killed_run_continues_to_the_same_bytes(
     source = tmp_path / "demo"
     write_sample_dataset(source, episodes=2)
     dataset_command(source, tmp_path / "whole", identify=True, quiet=True)
-    judged, left = [], command._judge
+    judged, left = [], command._judge_episode
 
     def judge(task: Any, work: Path, number: int) -> None:
         if len(judged) == 1:
@@ -181,7 +185,7 @@ def test_a_killed_run_continues_to_the_same_bytes(
         judged.append(number)
         left(task, work, number)
 
-    monkeypatch.setattr(command, "_judge", judge)
+    monkeypatch.setattr(command, "_judge_episode", judge)
     out = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
         dataset_command(source, out, identify=True, quiet=True)

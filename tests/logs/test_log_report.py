@@ -17,7 +17,7 @@ from drake_teleop.load.identification import PARAMETERS
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.pictures import draw_fit, draw_knowledge, spectrum
+from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, spectrum
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
@@ -108,7 +108,7 @@ def test_static_poses_have_a_page_too(tmp_path: Path) -> None:
 
 def test_the_page_of_pictures_shows_all_channels_and_parameters(tmp_path: Path) -> None:
     found = identify_log(record(tmp_path / "log.parquet"), delay=0.0)
-    axes = [*_all_axes(draw_fit(found)), *_all_axes(draw_knowledge(found))]
+    axes = [*_all_axes(draw_fit(found)), *_all_axes(draw_spectrum_and_intervals(found))]
     # Six channels, two spectra, intervals, deviations.
     assert len(axes) == 10
     (intervals_axis,) = [axis for axis in axes if "intervals" in axis.get_title("left")]

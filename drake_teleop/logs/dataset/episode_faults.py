@@ -16,7 +16,7 @@ _UNITS = (
     ("torque", "N m", set(TORQUE_UNITS) - {"N m", "N mm"}),  # N mm equals mN m
 )
 _UNIT_TOLERANCE, _SMALLEST_GAIN = 0.04, 0.06
-_SMALLEST_TURN_DEG = 4.0
+_MIN_ROTATION_DEG = 4.0
 _SMALLEST_LAG = 0.6  # frames
 _FEWEST_SATURATED = 4
 
@@ -44,11 +44,11 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(Finding("weight removed", text, None))
-    found += _turn_findings(
+    found += _rotation_findings(
         x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force"
     )
     if not np.allclose(x.force, x.torque):
-        found += _turn_findings(x.torque, "the torque")
+        found += _rotation_findings(x.torque, "the torque")
     found += _unit_findings(x.gain)
     late = x.lag - usual_lag
     if abs(late) >= _SMALLEST_LAG:
@@ -58,7 +58,7 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     return found
 
 
-def _turn_findings(M: Array, what: str) -> list[Finding]:
+def _rotation_findings(M: Array, what: str) -> list[Finding]:
     from scipy.spatial.transform import Rotation
 
     single = np.flatnonzero(np.diag(M) < 0)
@@ -71,7 +71,7 @@ def _turn_findings(M: Array, what: str) -> list[Finding]:
         M = -M
     turn = Rotation.from_matrix(M).as_rotvec(degrees=True)
     angle = float(np.linalg.norm(turn))
-    if angle > _SMALLEST_TURN_DEG:
+    if angle > _MIN_ROTATION_DEG:
         axis = ", ".join(f"{a:.2g}" for a in turn / angle)
         text = f"{what} is turned by {angle:.3g} deg about [{axis}] of S"
         found.append(Finding("frame", text, M.tolist()))
