@@ -269,8 +269,10 @@ def _acceleration_noise(splines: PoseSplines) -> float:
     f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
     share = passed_noise_share(f, splines.spacing)
     if splines.imu_rows is not None:
-        share = share * splines.imu_rows.share(f)[0]
-    power = 2.0 * splines.noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
+        share = share * splines.imu_rows.remaining_noise_shares(f)[0]
+    power = (
+        2.0 * splines.estimate_pose_noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
+    )
     return float(np.sqrt(np.trapezoid(power, f)))
 
 

@@ -54,7 +54,7 @@ from drake_teleop.logs.explained_log import (
     replace_frame_causes,
     unexplained_finding,
 )
-from drake_teleop.logs.posed_fit import ROBUST, fit_posed
+from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_posed
 from drake_teleop.logs.read.alignment import (
     delay_of,
     far_from_gaps,
@@ -65,13 +65,13 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
-_GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
+_CAUSES_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
 _CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
 _SIGNIFICANT_DELAY = 5.0  # standard deviations
 _LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
-_NOT_WITH_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
+_SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
 
 @dataclass(frozen=True, repr=False)
@@ -181,17 +181,17 @@ def identify_log(
     METHODS.check(method, "method")
     with one_blas_thread():
         check = partial(check_file, Path(path)) if checks is None else lambda: checks
-        return _identified(path, method, cutoff_hz, delay, check)
+        return _identify_read_log(path, method, cutoff_hz, delay, check)
 
 
-def _identified(
+def _identify_read_log(
     path: str | Path,
     method: str,
     cutoff_hz: float | None,
     delay: str | float,
     check: Callable[[], Conventions],
 ) -> IdentifiedLog:
-    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
+    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
     posed, other = fit_posed(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
@@ -213,8 +213,16 @@ def _identified(
         )
     result = fit.identification
     motion = None if posed is None else posed.motion
-    why = explain_log(raw, delay_s, motion) if _can_be_explained(raw, posed is not None) else None
-    if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _GAIN_CAUSES:
+    why = (
+        explain_log(raw, delay_s, motion)
+        if _is_explanation_possible(raw, posed is not None)
+        else None
+    )
+    if (
+        why is not None
+        and log.gain_std > 0.0
+        and {x.name for x in why.causes} <= _CAUSES_BY_GAIN_ERRORS
+    ):
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
@@ -263,7 +271,7 @@ def _identified(
     )
 
 
-def _can_be_explained(log: Log, by_splines: bool) -> bool:
+def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
     if log.static or (high - low <= _CONSTANT_SHARE * np.maximum(high, -low)).any():
         return False
@@ -354,7 +362,7 @@ def eliminate_log(
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
     separate = {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
-    scales = _scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
+    scales = _check_scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
@@ -363,7 +371,7 @@ def eliminate_log(
         identified_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = usable_phi(alone)[0]
     eliminated = partial(
-        _eliminated,
+        _eliminate_read_log,
         identification=identification,
         phi_gripper=phi_gripper,
         scales=scales,
@@ -403,7 +411,7 @@ def eliminate_log(
     return replace(found, detection=detection)
 
 
-def _eliminated(
+def _eliminate_read_log(
     path: str | Path,
     identification: Identification,
     phi_gripper: Array,
@@ -441,18 +449,18 @@ def _eliminated(
     known = far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
-    def smooth(wrench: Array) -> Array:
+    def low_pass_wrench(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
     span = slice(None) if untouched_s is None else _rows_between(log.only(known), *untouched_s)
 
-    def offsets_of(residual: Array) -> tuple[Array, float]:
+    def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
             return residual[span].mean(axis=0), 1.0
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
-    offsets, fraction = offsets_of(smooth(residual))
+    offsets, fraction = choose_offsets(low_pass_wrench(residual))
     motion = log.motion
     gravity_only = None
     removed = identification.weight_removed or "weight" in log.free
@@ -461,8 +469,8 @@ def _eliminated(
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
-        weightless = smooth(weightless)
-        gravity_only = weightless - offsets_of(weightless)[0]
+        weightless = low_pass_wrench(weightless)
+        gravity_only = weightless - choose_offsets(weightless)[0]
     contact = contact_wrench(log.wrench, offsets, *motion, phi)
     parts = phi_gripper, phi_object
     scales = scales | {"gravity": log.gravity}
@@ -472,7 +480,9 @@ def _eliminated(
         causal_offsets, motion = identification.offsets, aligned.differentiated.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            causal_offsets = _start_samples(log, causal_tare_s, untouched).mean(axis=0)
+            causal_offsets = _samples_of_contact_free_start(log, causal_tare_s, untouched).mean(
+                axis=0
+            )
         causal_wrench = causal_wrenches(
             contact_wrench(log.wrench, causal_offsets, *motion, phi),
             scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
@@ -487,7 +497,7 @@ def _eliminated(
             contact=causal_wrench.contact[known],
             scaled=causal_wrench.scaled[known],
         )
-    contact = smooth(contact)
+    contact = low_pass_wrench(contact)
     return EliminatedLog(
         log=log.only(known),
         phi=phi,
@@ -496,10 +506,10 @@ def _eliminated(
         tare_fraction=fraction,
         delay_s=delay_s,
         delay_source=source,
-        measured=smooth(log.wrench - offsets),
-        non_contact=smooth(non_contact_wrench(*log.motion, phi)),
+        measured=low_pass_wrench(log.wrench - offsets),
+        non_contact=low_pass_wrench(non_contact_wrench(*log.motion, phi)),
         contact=contact,
-        scaled=smooth(scaled),
+        scaled=low_pass_wrench(scaled),
         gravity_only=gravity_only,
         noise_floor=noise_floor(contact[~edge]),
         causal=causal_wrench,
@@ -521,7 +531,7 @@ def _rows_between(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     return rows
 
 
-def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
+def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> Array:
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
@@ -574,7 +584,7 @@ def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
         )
 
 
-def _scales(
+def _check_scales(
     sigma: float,
     sigma_object: float | None,
     gamma: float,
@@ -599,7 +609,7 @@ def _scales(
     if eta is None:
         kept = sigma if sigma_object is None else sigma_object
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
-    if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _NOT_WITH_ETA):
+    if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
         raise DrakeTeleopError(
             "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
             where="eta",

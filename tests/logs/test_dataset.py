@@ -26,7 +26,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
     find_offset_step,
     unexplained_reading,
 )
-from drake_teleop.logs.pose_motion.poses import Posed, Poses
+from drake_teleop.logs.pose_motion.poses import PosesOfLog, Poses
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.sample import NOISE, PHI, SampleEpisode, sample_episode
 
@@ -38,8 +38,11 @@ QUARTER_Z = Rotation.from_euler("z", 90, degrees=True).as_matrix()
 
 
 def log_of(x: SampleEpisode) -> Log:
-    poses, none = Poses(x.t, x.position, x.quaternion).continued(), np.zeros((len(x.t), 3))
-    return Log(x.t, x.wrench, none, none, none, posed=Posed(poses, GRAVITY_W))
+    poses, none = (
+        Poses(x.t, x.position, x.quaternion).with_continuous_quaternions(),
+        np.zeros((len(x.t), 3)),
+    )
+    return Log(x.t, x.wrench, none, none, none, posed=PosesOfLog(poses, GRAVITY_W))
 
 
 def verdict(x: SampleEpisode) -> set[str]:

@@ -322,7 +322,7 @@ def test_the_clock_of_the_poses_is_corrected_with_a_known_load_too(rate):
 def test_the_coefficients_of_a_load_give_its_wrench():
     rng = np.random.default_rng(2)
     _, _, poses = record(Kind(seed=15))
-    splines, t = PoseSplines(poses.continued(), 0.1), np.linspace(1.0, 19.0, 50)
+    splines, t = PoseSplines(poses.with_continuous_quaternions(), 0.1), np.linspace(1.0, 19.0, 50)
     weight = rng.normal(size=4)
     s, omega, alpha = splines.motion(t, GRAVITY_W)
     rest, zeta = np.zeros_like(s), splines.signals(t, GRAVITY_W)

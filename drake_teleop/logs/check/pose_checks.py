@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
-from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.alignment import low_pass, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
@@ -136,14 +136,14 @@ def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
     seen = found.seen
-    if pose is not None and pose.position is not None and seen.usable and not seen.mirrored:
+    if pose is not None and pose.position is not None and seen.is_usable and not seen.is_mirrored:
         unit = _position_unit_finding(pose.position.unit, seen.kappa, seen.kappa_deviation)
         if unit is not None:
             return unit
     return frame_finding(found, log.posed)
 
 
-def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
+def frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
     """Return a finding for a displaced or rotated pose frame, unless another error is likely."""
     frame, seen, phi = found.frame, found.seen, found.free.state.theta[6:]
     if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
@@ -151,7 +151,7 @@ def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
     unit = abs(seen.kappa - 1.0) > max(_UNIT_TOLERANCE, 5.0 * seen.kappa_deviation)
     if (
         unit
-        or (seen.usable and seen.mirrored)
+        or (seen.is_usable and seen.is_mirrored)
         or _is_torque_unit_wrong(phi[1:4] / phi[0], frame.p_SoPo_S)
     ):
         return None

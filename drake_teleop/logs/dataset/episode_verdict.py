@@ -417,7 +417,7 @@ class EpisodeSignals:
         """Return reading and wrench of a load phi (10,) as a function of kind and lag [frames]."""
 
         @cache
-        def predict(kind: str, lag: float) -> tuple[Array, Array]:
+        def predict_reading(kind: str, lag: float) -> tuple[Array, Array]:
             at = self.motion_at_lag(lag)
             s = at.s + at.gravity if kind == "weight removed" else at.s
             wrench = self.log.wrench
@@ -425,4 +425,4 @@ class EpisodeSignals:
                 wrench = (wrench.reshape(-1, 2, 3) @ at.R_WS).reshape(-1, 6)
             return wrench, non_contact_wrench(s, at.omega, at.alpha, phi)
 
-        return predict
+        return predict_reading

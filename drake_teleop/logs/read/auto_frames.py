@@ -165,14 +165,14 @@ def describe_pose_frame(
     notes: list[str] = []
     if pose.position_in_sensor == "auto":
         _require_determined(
-            frame.position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
+            frame.is_position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
         )
         changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
         deviation = 1e3 * float(frame.position_deviations.max())
         notes.append(_result_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
     if pose.rotation_in_sensor == "auto":
         _require_determined(
-            frame.rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
+            frame.is_rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
         )
         changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
         deviation = float(frame.turn_deviations_deg.max())

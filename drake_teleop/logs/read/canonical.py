@@ -15,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.clocks import MIN_RATE_HZ
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.tables import Table
@@ -84,7 +84,7 @@ class Log:
     bridged: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
     source: str = "log"
-    posed: Posed | None = None
+    posed: PosesOfLog | None = None
     gain_std: float = 0.0
     R_WS: Array | None = None
     gravity_W: Array | None = None
@@ -134,7 +134,7 @@ class Log:
 
     def earlier(self, start: float) -> Log:
         """Return the log with times relative to `start` [s]."""
-        posed = None if self.posed is None else self.posed.earlier(start)
+        posed = None if self.posed is None else self.posed.with_times_from(start)
         return replace(self, t=self.t - start, posed=posed)
 
     def only(self, rows: slice | NDArray[np.bool_]) -> Log:

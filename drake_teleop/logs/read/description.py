@@ -23,7 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import EULER_AXES
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, PosesOfLog, Poses
 from drake_teleop.logs.read.description_fields import (
     STANDARD_GRAVITY,
     UNITS,
@@ -328,11 +328,11 @@ class Description(Strict):
         """Gravity (3,) in the world [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
-    def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
+    def posed(self, poses: Poses, imu: ImuData | None = None) -> PosesOfLog:
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
-        return Posed(poses, self.gravity_W, np.array(origin), rotation, imu)
+        return PosesOfLog(poses, self.gravity_W, np.array(origin), rotation, imu)
 
     def scale(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""

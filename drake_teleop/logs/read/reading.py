@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.common.rotations import nearest_rotation, quaternions_of, rotation_matrices
-from drake_teleop.logs.pose_motion.poses import Inertial, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,
     angular_motion,
@@ -221,7 +221,7 @@ class _Reader:
         t, raw = uniform_times(clock.t), None
         quaternion, position = self._poses_of_S(stream, table, clock)
         if position is not None:
-            raw = Poses(clock.t, position, quaternion).continued()
+            raw = Poses(clock.t, position, quaternion).with_continuous_quaternions()
             wrench, imu = self._description.wrench, self._description.imu
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, raw=raw)
@@ -292,7 +292,7 @@ class _Reader:
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
         outside_gaps = raw_t[at] - raw_t[at - 1] < _GAP_RATIO * dt  # outside of gaps
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, inertial=Inertial(t[outside_gaps], *both))
+        return Stream("imu", t, s, omega, alpha, inertial=ImuData(t[outside_gaps], *both))
 
     def _to_S(
         self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None

@@ -17,7 +17,7 @@ from drake_teleop.common.rotations import (
     rotation_error,
     rotation_matrices,
 )
-from drake_teleop.logs.pose_motion.poses import Inertial, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.read.alignment import low_pass, resample, spacing, uniform_times
 from drake_teleop.logs.read.description import Description, Orientation
 from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
@@ -50,7 +50,7 @@ class Stream:
     angular_acceleration: Array | None = None
     R_WS: Array | None = None
     raw: Poses | None = None
-    inertial: Inertial | None = None
+    inertial: ImuData | None = None
 
     @property
     def dt(self) -> float:
