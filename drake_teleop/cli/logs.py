@@ -18,13 +18,13 @@ from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.figures import (
     common_figures,
     contact_figures,
-    load_figures,
-    figures_of_record_part,
     figures_of_object_alone,
+    figures_of_record_part,
+    load_figures,
     notes_on_object_alone,
-    to_plain_values,
     rms_figures,
     share_above_force,
+    to_plain_values,
 )
 from drake_teleop.logs.processing import (
     DetectedLog,

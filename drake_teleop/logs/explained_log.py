@@ -71,8 +71,8 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
     text = _yaml_value(_TORQUE_SCALE_FIELD, ratio)
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
-        f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of the file"
-        f" (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
+        f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
+        f" the file (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
         f" and {_TORQUE_SCALE_FIELD} to {text} times that{_no_yaml_note(log)}"
     )
 

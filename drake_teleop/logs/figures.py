@@ -19,7 +19,7 @@ from drake_teleop.load.identification import (
 )
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.cause import RecordPartWithLoad
-from drake_teleop.logs.contact import summarize_contacts, noise_floor
+from drake_teleop.logs.contact import noise_floor, summarize_contacts
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 
 

@@ -33,18 +33,18 @@ from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     Conventions,
     check_file,
-    findings_about_motion,
     check_suspicious_load,
+    findings_about_motion,
 )
 from drake_teleop.logs.check.corrections import POSSIBLE_EFFECTS_OF_CAUSES, Finding
 from drake_teleop.logs.contact import (
     MIN_SAMPLES,
     Detection,
     detect_contact,
-    samples_for_detector,
     noise_floor,
     offset_shift_note,
     robust_offsets,
+    samples_for_detector,
 )
 from drake_teleop.logs.explained_log import (
     explain_log,

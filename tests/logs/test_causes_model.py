@@ -13,8 +13,8 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.instants import (
     FORCES,
     Instants,
-    delay_of_free_fit,
     block_means_of_record,
+    delay_of_free_fit,
 )
 from drake_teleop.logs.causes.intervals import misfit_factor
 from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, Step

@@ -26,7 +26,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
     find_offset_step,
     unexplained_reading,
 )
-from drake_teleop.logs.pose_motion.poses import PosesOfLog, Poses
+from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.sample import NOISE, PHI, SampleEpisode, sample_episode
 

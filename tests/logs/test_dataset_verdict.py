@@ -15,9 +15,9 @@ from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     Hypothesis,
     _weighted_number_of_deviations,
+    find_offset_step,
     hypothesis_without_fault,
     spread_and_centre_of_calm_half,
-    find_offset_step,
 )
 from drake_teleop.logs.sample import PHI, sample_episode
 

@@ -9,9 +9,9 @@ from scipy.signal import lfilter
 from drake_teleop.logs.contact import (
     Detection,
     Samples,
-    summarize_contacts,
     detect_contact,
     noise_floor,
+    summarize_contacts,
 )
 from drake_teleop.logs.read.alignment import low_pass
 

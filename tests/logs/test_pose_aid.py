@@ -17,8 +17,8 @@ from drake_teleop.logs.pose_motion.imu_rows import _least_squares, compare_imu
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.spectra import (
     WrenchGrid,
-    frequency_bands,
     end_taper,
+    frequency_bands,
     noise_moments,
     signal_spectrum,
 )

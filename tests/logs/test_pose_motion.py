@@ -34,18 +34,18 @@ from drake_teleop.logs.pose_motion.estimate import PoseEstimate, _base_taper, es
 from drake_teleop.logs.pose_motion.linear_model import (
     FitWindow,
     best_delay,
-    fit_noise_levels,
     fit_linear_model,
+    fit_noise_levels,
 )
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.rejection import NOTHING_REJECTED_NOTE, find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
-    UnitsAndAxes,
     RigidParameters,
+    UnitsAndAxes,
     _apply_step,
-    _residual_derivative,
-    _gain_effects,
     _FitData,
+    _gain_effects,
+    _residual_derivative,
     _solve_rigid_fit,
     fit_rigid,
     motion_transformation_matrix,
@@ -53,12 +53,12 @@ from drake_teleop.logs.pose_motion.rigid import (
 )
 from drake_teleop.logs.pose_motion.spectra import (
     SIGNAL_RATE_COLUMNS,
-    WrenchGrid,
     NoiseLevels,
-    frequency_bands,
+    WrenchGrid,
     end_taper,
-    second_moments,
+    frequency_bands,
     noise_moments,
+    second_moments,
     signal_spectrum,
 )
 from drake_teleop.logs.pose_motion.spectra import exclude_from_taper as exclude_from_taper

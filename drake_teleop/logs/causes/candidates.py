@@ -11,7 +11,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import signed_permutations
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.changes import add_step, find_contact_spans
-from drake_teleop.logs.causes.instants import FORCES, CONSTANT_COLUMN, G, R, S
+from drake_teleop.logs.causes.instants import CONSTANT_COLUMN, FORCES, G, R, S
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.state import State
 

@@ -148,8 +148,8 @@ def _removed_weight_cause(state: State) -> Cause:
     return Cause(
         "payload configured",
         f"the weight of a payload of {removed[0]:.4g} kg (+- {1.96 * deviation:.2g}) at"
-        f" {_format_vector(1e3 * com, 'mm in S')} is already removed from the wrench, but the inertia is"
-        f" that of {mass:.4g} kg: the payload in the robot's controller is not that of the load",
+        f" {_format_vector(1e3 * com, 'mm in S')} is already removed from the wrench, but the"
+        f" inertia is that of {mass:.4g} kg: the payload in the robot's controller is not that of the load",
         values=values,
     )
 
@@ -182,8 +182,8 @@ def _pose_frame_cause(state: State) -> Cause:
     wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
     return Cause(
         "pose frame",
-        f"the pose is that of a point at {_format_vector(-1e3 * r, 'mm in S')} (+- {wide.max():.2g} mm),"
-        " not of the sensor",
+        f"the pose is that of a point at {_format_vector(-1e3 * r, 'mm in S')}"
+        f" (+- {wide.max():.2g} mm), not of the sensor",
         values={"position_in_sensor": (-r).tolist()},
     )
 
@@ -230,8 +230,8 @@ def _step_cause(state: State, i: int) -> Cause:
         return Cause(
             "zero change",
             f"{when} the sensor has another zero: {_format_vector(values[:3], 'N')},"
-            f" {_format_vector(values[3:], 'N m')} are added (a tare in the record); the stated offsets"
-            " are those before it",
+            f" {_format_vector(values[3:], 'N m')} are added (a tare in the record); the stated"
+            " offsets are those before it",
             start_s=step.time,
             values={"change": values.tolist()},
         )

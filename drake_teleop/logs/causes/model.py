@@ -14,14 +14,14 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.moments import centripetal_matrix, coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA,
+    CONSTANT_COLUMN,
     FORCES,
     MOTION,
-    CONSTANT_COLUMN,
+    NUM_SIGNALS,
     PRODUCTS,
     RATES,
     RP,
     TIME,
-    NUM_SIGNALS,
     G,
     R,
     S,

@@ -19,8 +19,8 @@ from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Finding,
     edit_field,
-    wrench_and_motion_edits,
     try_edit,
+    wrench_and_motion_edits,
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (

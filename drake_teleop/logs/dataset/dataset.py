@@ -33,9 +33,9 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description
 from drake_teleop.logs.dataset.dataset_files import (
-    NewColumns,
     Dataset,
     Episode,
+    NewColumns,
     open_dataset,
     write_copy,
 )
@@ -44,16 +44,16 @@ from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
     Hypothesis,
-    spread_and_centre_of_calm_half,
     find_hypothesis,
     find_offset_step,
+    spread_and_centre_of_calm_half,
     unexplained_reading,
 )
 from drake_teleop.logs.dataset.shared_load import (
     SharedLoad,
-    samples_for_detector,
-    load_of_episode,
     find_shared_load,
+    load_of_episode,
+    samples_for_detector,
 )
 from drake_teleop.logs.figures import load_figures, to_plain_values
 from drake_teleop.logs.read.alignment import widened

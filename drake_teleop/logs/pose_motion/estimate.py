@@ -14,16 +14,16 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
-    Spectra,
     FitWindow,
-    splines_of_averaged_poses,
+    Spectra,
     choose_knot_spacing,
-    estimate_clock_rate_error,
     correct_clock_rate,
     delay_deviation,
-    fit_noise_levels,
+    estimate_clock_rate_error,
     fit_linear_model,
+    fit_noise_levels,
     guess_knot_spacing,
+    splines_of_averaged_poses,
 )
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
@@ -32,9 +32,9 @@ from drake_teleop.logs.pose_motion.rigid import (
     LOAD_PARAMETERS,
     NUM_PARAMETERS,
     ROTATION_PARAMETERS,
-    UnitsAndAxes,
     RigidFit,
     RigidParameters,
+    UnitsAndAxes,
     fit_rigid,
     read_units_and_axes,
 )

@@ -53,7 +53,7 @@ def compare_imu(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSpli
     t = rows.t + fitted[-1].tau  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
-        None if sensor is None or y is None else sensor.corrected(y[inside])
+        None if sensor is None or y is None else sensor.corrected_data(y[inside])
         for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
     )
     own = [0.0 if sensor is None else sensor.power for sensor in sensors]

@@ -12,14 +12,14 @@ from drake_teleop.common.numeric import Array, parabola_minimum
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FORCE_COLUMNS,
-    FrequencyBands,
     Complex,
-    WrenchGrid,
+    FrequencyBands,
     NoiseLevels,
-    frequency_bands,
+    WrenchGrid,
     end_taper,
-    second_moments,
+    frequency_bands,
     random_walk_shape,
+    second_moments,
     shift_spectrum,
     shift_taper,
     signal_spectrum,

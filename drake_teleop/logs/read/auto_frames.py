@@ -11,7 +11,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.explain import explain
-from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit, block_means_of_record
+from drake_teleop.logs.causes.instants import Instants, block_means_of_record, delay_of_free_fit
 from drake_teleop.logs.read.alignment import resample, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description

@@ -23,7 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import EULER_AXES
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.logs.pose_motion.poses import ImuData, PosesOfLog, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
 from drake_teleop.logs.read.description_fields import (
     STANDARD_GRAVITY,
     UNITS,
