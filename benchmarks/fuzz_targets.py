@@ -44,7 +44,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.read.bags import read_topic, topics_of
+from drake_teleop.logs.read.bags import list_topics, read_topic
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots import udp
 from drake_teleop.robots.compensator import Compensator
@@ -313,7 +313,7 @@ def _messages(types: Any, old: bool) -> Any:
 
 
 def _bag(path: Path) -> None:
-    topics = topics_of(path)
+    topics = list_topics(path)
     for topic in topics[:5]:
         read_topic(path, topic.name)
 

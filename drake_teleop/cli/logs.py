@@ -33,7 +33,7 @@ from drake_teleop.logs.processing import (
     eliminate_log,
     identify_log,
 )
-from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 
 if TYPE_CHECKING:
     import polars as pl
@@ -170,11 +170,11 @@ def _wrenches(found: EliminatedLog) -> pl.DataFrame:
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
     for name in ("contact", "scaled", "non_contact", "measured"):
         values = getattr(found, name)
-        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     if found.causal is not None:
         for name in ("contact", "scaled"):
             values = getattr(found.causal, name)
-            columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+            columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     columns |= {"in_contact": found.touched, "edge": found.edge}
     return pl.DataFrame(columns)
 
@@ -225,5 +225,7 @@ def _detection_table(found: DetectedLog) -> pl.DataFrame:
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
     columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
-    columns |= {f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH)}
+    columns |= {
+        f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH_COLUMNS)
+    }
     return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})

@@ -21,7 +21,7 @@ from drake_teleop.logs.pose_motion.estimate import (
     motion_of_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
-from drake_teleop.logs.read.alignment import delay_of, low_pass, near_ends, undelayed
+from drake_teleop.logs.read.alignment import choose_delay, is_near_ends, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
@@ -66,7 +66,7 @@ def _fit_with_delay_or_usual(
     usual_s: float,
     usual: str,
 ) -> tuple[_Motion, str]:
-    known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
+    known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
     found = motion(known)
     if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
@@ -90,7 +90,7 @@ def _estimate_load_and_motion(log: Log, delay: float | None) -> PoseEstimate:
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
     """Return the log with spline motion and without delay, and (N,) True near ends and gaps."""
     assert log.posed is not None
-    moved, splines = undelayed(log, found.delay_s), found.splines
+    moved, splines = remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
     s, omega, alpha = splines.motion(t, gravity_W)
     moved = replace(
@@ -165,22 +165,22 @@ def aligned_log(
         motion, source = found
         moved, one_sided = use_spline_motion(log, motion)
         moved = replace(moved, notes=(*moved.notes, *clock_rate_notes(motion)))
-        plain = undelayed(log, motion.delay_s) if differentiate else None
+        plain = remove_delay(log, motion.delay_s) if differentiate else None
         if weight_removed:
             moved = replace_force_by_acceleration(moved)
             plain = None if plain is None else replace_force_by_acceleration(plain)
-        edge = one_sided | near_ends(moved, 0.0, cutoff_hz)
+        edge = one_sided | is_near_ends(moved, 0.0, cutoff_hz)
         smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
         if log.posed is None or log.posed.imu is None:
             return smooth
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
     log = replace_force_by_acceleration(log) if weight_removed else log
-    delay_s, source = delay_of(log, cutoff_hz, delay, phi)
+    delay_s, source = choose_delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = usual_s, "load"
-    log = undelayed(log, delay_s)
-    other = AlignedLog(log, delay_s, source, log, near_ends(log, log.one_sided_s, cutoff_hz))
+    log = remove_delay(log, delay_s)
+    other = AlignedLog(log, delay_s, source, log, is_near_ends(log, log.one_sided_s, cutoff_hz))
     if smooth is None or _residual_spread(other, phi, cutoff_hz) < _residual_spread(
         smooth, phi, cutoff_hz
     ):

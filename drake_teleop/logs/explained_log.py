@@ -21,12 +21,12 @@ from drake_teleop.logs.causes.intervals import attenuation_bias
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_share
-from drake_teleop.logs.read.alignment import undelayed
-from drake_teleop.logs.read.auto_frames import log_instants
+from drake_teleop.logs.read.alignment import remove_delay
+from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML, Description
-from drake_teleop.logs.read.description_fields import UNITS
-from drake_teleop.logs.read.table_files import FORMATS
+from drake_teleop.logs.read.description import CANONICAL_HAS_NO_LINE, Description
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
+from drake_teleop.logs.read.table_files import READER_BY_SUFFIX
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
@@ -72,7 +72,8 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
         f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
-        f" the file (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
+        " the file (a power of ten that gives a load of a few kg:"
+        f" {10.0 ** -round(np.log10(abs(mass))):g})"
         f" and {_TORQUE_SCALE_FIELD} to {text} times that{_no_yaml_note(log)}"
     )
 
@@ -102,7 +103,9 @@ def _correct_fields(
 
 
 def _no_yaml_note(log: Log) -> str:
-    return f" ({NO_YAML})" if Path(log.source).suffix.lower() in FORMATS else ""
+    return (
+        f" ({CANONICAL_HAS_NO_LINE})" if Path(log.source).suffix.lower() in READER_BY_SUFFIX else ""
+    )
 
 
 def _described_fields(description: Description, by_pose: bool) -> DescriptionFields:
@@ -179,9 +182,12 @@ def _correct_removed_weight(fields: DescriptionFields, values: dict[str, Any]) -
 
 
 def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
-    force, torque = UNITS[fields[_FORCE_UNIT_FIELD]], UNITS[fields[_TORQUE_UNIT_FIELD]]
-    ratios = [(torque / UNITS[unit], _TORQUE_UNIT_FIELD, unit) for unit in _TORQUE_UNITS]
-    ratios += [(UNITS[unit] / force, _FORCE_UNIT_FIELD, unit) for unit in _FORCE_UNITS]
+    force, torque = (
+        SI_VALUE_OF_UNIT[fields[_FORCE_UNIT_FIELD]],
+        SI_VALUE_OF_UNIT[fields[_TORQUE_UNIT_FIELD]],
+    )
+    ratios = [(torque / SI_VALUE_OF_UNIT[unit], _TORQUE_UNIT_FIELD, unit) for unit in _TORQUE_UNITS]
+    ratios += [(SI_VALUE_OF_UNIT[unit] / force, _FORCE_UNIT_FIELD, unit) for unit in _FORCE_UNITS]
     for ratio, name, unit in ratios:
         if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _SAME_RATIO:
             fields[name] = unit
@@ -231,7 +237,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
         late = delay_s + more
         if found is not None:
             return _spline_instants(log, found, late)
-        return log_instants(undelayed(log, late))
+        return block_means_of_log(remove_delay(log, late))
 
     data = instants_at_delay(0.0)
     if data.used.sum() < _MIN_ROWS:

@@ -19,9 +19,9 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise
-from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
+from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import shortest_gap, time_stamps_s
+from drake_teleop.logs.read.clocks import min_gap_length, time_stamps_s
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -78,7 +78,7 @@ def _describe_canonical(log: Path, table: Table) -> Description:
 
 def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
     if is_bag(path):
-        topics = topics_of(path)
+        topics = list_topics(path)
         summary["kind"] = "bag"
         summary["topics"] |= {
             topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
@@ -153,7 +153,7 @@ def _inspect_described_log(
             continue
         if stream.source not in tables:
             tables[stream.source] = read_stream(stream)
-        table = tables[stream.source].filled(stream.columns)
+        table = tables[stream.source].select_rows_with_numbers(stream.columns)
         figures, more, rows = _inspect_stream(name, stream, table, description, source)
         summary["streams"][name] = figures
         findings += more
@@ -170,7 +170,7 @@ def _inspect_described_log(
         if found.mounting is not None:
             summary["mounting"] = {
                 "R_SI": found.mounting.R_SI.tolist(),
-                "angle_deg": found.mounting.angle_deg,
+                "angle_deg": found.mounting.rotation_angle_deg,
                 "right_angled": found.mounting.is_right_angled,
                 "lag_s": found.mounting.lag_s,
                 "drift": found.mounting.drift,
@@ -189,7 +189,7 @@ def _inspect_stream(
         for field in _QUANTITIES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
-    values = table.all_raw(columns, f"{source}:{name}")
+    values = table.raw_side_by_side(columns, f"{source}:{name}")
     good = np.asarray(np.isfinite(values).all(axis=1))
     findings: list[Finding] = []
     figures: dict[str, Any] = {"rows": len(values)}
@@ -200,7 +200,7 @@ def _inspect_stream(
         findings += more
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest_run(~good)
     if not good.all():
-        first = table.line(int(np.argmin(good)))
+        first = table.line_in_file(int(np.argmin(good)))
         text = (
             f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
             f" the longest block {figures['nan_longest']} rows; cut or repair them"
@@ -280,7 +280,7 @@ def _inspect_clock(
         )
     median = float(np.median(forward))
     between = figures["episodes"] - 1
-    gaps = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()) - between
+    gaps = int((steps > min_gap_length(median, BANDWIDTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
@@ -298,7 +298,9 @@ def _inspect_clock(
         )
         findings.append(Finding("gap", text))
     if back:
-        row = table.line(np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1])
+        row = table.line_in_file(
+            np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1]
+        )
         text = (
             f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
             " rows with equal stamps are omitted or spread evenly; a log with decreasing"

@@ -22,10 +22,10 @@ from drake_teleop.logs.aligned_log import (
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_passed, widened
+from drake_teleop.logs.read.alignment import is_far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML
-from drake_teleop.logs.read.table_files import FORMATS
+from drake_teleop.logs.read.description import CANONICAL_HAS_NO_LINE
+from drake_teleop.logs.read.table_files import READER_BY_SUFFIX
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
@@ -69,7 +69,9 @@ def fit_posed(
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
-    shown = low_passed(moved, cutoff_hz).only(far_from_gaps(moved, cutoff_hz) & ~one_sided)
+    shown = low_pass_log(moved, cutoff_hz).select_rows(
+        is_far_from_gaps(moved, cutoff_hz) & ~one_sided
+    )
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
@@ -78,8 +80,8 @@ def fit_posed(
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
         fit = replace(fit, note="")
-        if Path(log.source).suffix.lower() in FORMATS:
-            finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
+        if Path(log.source).suffix.lower() in READER_BY_SUFFIX:
+            finding = replace(finding, message=f"{finding.message} ({CANONICAL_HAS_NO_LINE})")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 
@@ -90,13 +92,13 @@ def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
         stride = min(stride, int(_RATE_OVER_CUTOFF / (cutoff_hz * log.dt)))
     if stride < 2:
         return log
-    few = log.only(slice(None, None, stride))
+    few = log.select_rows(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
     for start in range(0, len(few), _CHUNK):  # in chunks, to save memory
         before, stop = max(0, start - _FILTER_NEIGHBOURS), start + _CHUNK + _FILTER_NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
-    bridged = None if log.bridged is None else widened(log.bridged, stride)[::stride]
+    bridged = None if log.bridged is None else widen_flags(log.bridged, stride)[::stride]
     return replace(few, wrench=wrench, bridged=bridged)
 
 

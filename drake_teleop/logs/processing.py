@@ -56,11 +56,11 @@ from drake_teleop.logs.explained_log import (
 )
 from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_posed
 from drake_teleop.logs.read.alignment import (
-    delay_of,
-    far_from_gaps,
+    choose_delay,
+    is_far_from_gaps,
     low_pass,
-    low_passed,
-    undelayed,
+    low_pass_log,
+    remove_delay,
 )
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
@@ -199,9 +199,9 @@ def _identify_read_log(
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
     else:
-        delay_s, source = delay_of(log, cutoff_hz, delay)
-        log = undelayed(log, delay_s)
-        log = low_passed(log, cutoff_hz).only(far_from_gaps(log, cutoff_hz))
+        delay_s, source = choose_delay(log, cutoff_hz, delay)
+        log = remove_delay(log, delay_s)
+        log = low_pass_log(log, cutoff_hz).select_rows(is_far_from_gaps(log, cutoff_hz))
         fit = identify_batch(
             log.wrench,
             *log.motion,
@@ -446,13 +446,15 @@ def _eliminate_read_log(
         raise DrakeTeleopError(
             "poses at rest have no order in time", where="causal", remedy="leave it out"
         )
-    known = far_from_gaps(log, cutoff_hz)
+    known = is_far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
     def low_pass_wrench(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
-    span = slice(None) if untouched_s is None else _rows_between(log.only(known), *untouched_s)
+    span = (
+        slice(None) if untouched_s is None else _rows_between(log.select_rows(known), *untouched_s)
+    )
 
     def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
@@ -499,7 +501,7 @@ def _eliminate_read_log(
         )
     contact = low_pass_wrench(contact)
     return EliminatedLog(
-        log=log.only(known),
+        log=log.select_rows(known),
         phi=phi,
         point_mass=point_mass,
         offsets=offsets,

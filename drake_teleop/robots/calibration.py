@@ -22,7 +22,7 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
 from drake_teleop.logs.causes.cause import CHANGE_CAUSES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
-from drake_teleop.logs.read.alignment import low_passed
+from drake_teleop.logs.read.alignment import low_pass_log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.recording import Records
 from drake_teleop.robots.streams import Source
@@ -101,7 +101,7 @@ def evaluate_record(
     known = sure & (previous is not None and previous.sure)
     changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGE_CAUSES] if found else []
     with suppress(DrakeTeleopError):  # too few samples
-        log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
+        log = log or low_pass_log(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
     if log is None:
         advice = _MOTIONS[0][0].format(axis="x")
     elif sure.all():

@@ -28,11 +28,11 @@ _INVALID_FLAGS = (
     | ReadingFlag.GAP
 )
 _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
-    WRENCH: {"force": canonical.WRENCH[:3], "torque": canonical.WRENCH[3:]},
-    POSE: {"orientation": canonical.ORIENTATION, "position": canonical.POSITION},
+    WRENCH: {"force": canonical.WRENCH_COLUMNS[:3], "torque": canonical.WRENCH_COLUMNS[3:]},
+    POSE: {"orientation": canonical.QUATERNION_COLUMNS, "position": canonical.POSITION_COLUMNS},
     IMU: {
-        "specific_force": canonical.SPECIFIC_FORCE,
-        "angular_velocity": canonical.ANGULAR_VELOCITY,
+        "specific_force": canonical.SPECIFIC_FORCE_COLUMNS,
+        "angular_velocity": canonical.ANGULAR_VELOCITY_COLUMNS,
     },
 }
 _GRAVITY = 9.81  # as in `compensate`

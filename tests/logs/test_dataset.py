@@ -28,7 +28,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
 )
 from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.sample import NOISE, PHI, SampleEpisode, sample_episode
+from drake_teleop.logs.sample import NOISE_STD, TRUE_PHI, SampleEpisode, sample_episode
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from sample_dataset import write_sample_dataset
@@ -48,9 +48,9 @@ def log_of(x: SampleEpisode) -> Log:
 def verdict(x: SampleEpisode) -> set[str]:
     fps = 1.0 / (x.t[1] - x.t[0])
     signals = EpisodeSignals(log_of(x), max(2.0, 0.12 * fps))
-    predict = signals.reading_predictor(PHI)
-    found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * NOISE)
-    names = {f.name for f in name_faults(found, 0.0, PHI, fps) + saturated_channels(x.wrench)}
+    predict = signals.reading_predictor(TRUE_PHI)
+    found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD)
+    names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturated_channels(x.wrench)}
     step = find_offset_step(
         unexplained_reading(found, predict, signals.regressor_at_lag), found.spread
     )
@@ -115,7 +115,7 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
         x = sample_episode(number, phi=phi, contacts=0)
         reading, load_wrench = EpisodeSignals(log_of(x), 4.0).reading_predictor(phi)("sensor", 0.0)
         rest = reading - load_wrench
-        squares.append(((rest - np.median(rest, axis=0)) / NOISE) ** 2)
+        squares.append(((rest - np.median(rest, axis=0)) / NOISE_STD) ** 2)
     assert np.sqrt(np.mean(squares)) < 1.2
     assert np.sqrt(np.mean([x[[0, -1]] for x in squares])) < 4.0
 
@@ -130,7 +130,7 @@ def test_any_large_rotation_of_the_wrench_is_found(
     x = mapped(R)(sample_episode(number, contacts=1))
     signals = EpisodeSignals(log_of(x), 3.6)
     found = find_hypothesis(
-        signals.reading_predictor(PHI), signals.regressor_at_lag, 0.0, 0.8 * NOISE
+        signals.reading_predictor(TRUE_PHI), signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD
     )
     assert np.degrees(Rotation.from_matrix(found.force @ R.T).magnitude()) < 3.0
 
@@ -150,7 +150,7 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     assert [row["verdict"] for row in summary["episodes"]] == [
         *(["ok"], ["ok"], ["sign", "frame"], ["ok"])
     ]
-    assert summary["mass"] == pytest.approx(PHI[0], rel=5e-3)
+    assert summary["mass"] == pytest.approx(TRUE_PHI[0], rel=5e-3)
     assert files_of(source) == before
     data = "data/chunk-000/file-000.parquet"
     old, new = (pl.read_parquet(folder / data) for folder in (source, tmp_path / "out" / "demo"))
@@ -158,7 +158,7 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     contact = np.array(new["observation.contact_wrench"].to_list())
     truth = np.vstack([x.contact_wrench for x in episodes])
     free = ~truth.any(axis=1)
-    assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * NOISE).all()
+    assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * NOISE_STD).all()
     touched, true = (
         new["observation.in_contact"].to_numpy(),
         np.hstack([x.in_contact for x in episodes]),

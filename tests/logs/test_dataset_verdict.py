@@ -19,7 +19,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
     hypothesis_without_fault,
     spread_and_centre_of_calm_half,
 )
-from drake_teleop.logs.sample import PHI, sample_episode
+from drake_teleop.logs.sample import TRUE_PHI, sample_episode
 
 PLAIN, I3 = hypothesis_without_fault(2.0), np.eye(3)
 QUARTER = Rotation.from_euler("y", 90, degrees=True).as_matrix()
@@ -44,11 +44,11 @@ FLIP = np.diag([1.0, -1.0, 1.0])
         ({"gain": np.array([0.1, 1.0])}, ["the force is 0.1 times that in N: its unit is daN"]),
         ({"gain": np.array([1.0, 8.85])}, ["torque is 8.85 times that in N m: its unit is lbf in"]),
         ({"gain": np.array([1.3, 1.0])}, ["the force is 1.3 times that in N"]),
-        ({"phi": 2.0 * PHI}, ["another one: "]),
+        ({"phi": 2.0 * TRUE_PHI}, ["another one: "]),
     ],
 )  # fmt: skip
 def test_findings_contain_figures_and_units(change, expected):
-    found = name_faults(replace(PLAIN, **change), 2.0, PHI, 20.0)
+    found = name_faults(replace(PLAIN, **change), 2.0, TRUE_PHI, 20.0)
     assert len(found) == len(expected)
     for finding, words in zip(found, expected, strict=True):
         assert words in finding.message
@@ -69,7 +69,7 @@ def test_findings_contain_figures_and_units(change, expected):
         ({"gain": np.array([2.0, 1.0])}, 1.0),
         ({"gain": np.array([1.0, 3.0])}, 1.0),
         ({"gain": np.array([2.0, 3.0]), "kind": "base"}, 3.0),
-        ({"phi": PHI, "lag": 0.0}, 5.0),
+        ({"phi": TRUE_PHI, "lag": 0.0}, 5.0),
     ],
 )
 def test_each_deviation_has_its_price(change, count):
@@ -137,15 +137,15 @@ def test_signals_of_an_episode_have_the_lag_and_the_axes_of_their_kind(lag):
     x = sample_episode(3)
     signals = EpisodeSignals(log_of(x), 3.6)
     at = signals.motion(x.t + lag * (x.t[1] - x.t[0]))
-    w = signals.reading_predictor(PHI)("sensor", lag)
+    w = signals.reading_predictor(TRUE_PHI)("sensor", lag)
     np.testing.assert_array_equal(w[0], x.wrench)
-    expected = non_contact_wrench(at.s, at.omega, at.alpha, PHI)
+    expected = non_contact_wrench(at.s, at.omega, at.alpha, TRUE_PHI)
     np.testing.assert_allclose(w[1], expected, atol=1e-6)
-    np.testing.assert_allclose(signals.regressor_at_lag(lag) @ PHI, expected, atol=1e-6)
-    weightless = signals.reading_predictor(PHI)("weight removed", lag)[1]
-    weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, PHI)
+    np.testing.assert_allclose(signals.regressor_at_lag(lag) @ TRUE_PHI, expected, atol=1e-6)
+    weightless = signals.reading_predictor(TRUE_PHI)("weight removed", lag)[1]
+    weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, TRUE_PHI)
     np.testing.assert_allclose(weightless, expected - weight, atol=1e-6)
-    turned = signals.reading_predictor(PHI)("base", lag)[0]
+    turned = signals.reading_predictor(TRUE_PHI)("base", lag)[0]
     for part in (slice(0, 3), slice(3, 6)):
         back = np.einsum("nij,nj->ni", at.R_WS, turned[:, part])
         np.testing.assert_allclose(back, x.wrench[:, part], atol=2e-3)

@@ -149,7 +149,8 @@ def _removed_weight_cause(state: State) -> Cause:
         "payload configured",
         f"the weight of a payload of {removed[0]:.4g} kg (+- {1.96 * deviation:.2g}) at"
         f" {_format_vector(1e3 * com, 'mm in S')} is already removed from the wrench, but the"
-        f" inertia is that of {mass:.4g} kg: the payload in the robot's controller is not that of the load",
+        f" inertia is that of {mass:.4g} kg: the payload in the robot's controller is not that of"
+        " the load",
         values=values,
     )
 

@@ -24,12 +24,12 @@ from drake_teleop.logs.check.corrections import (
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
-    SEARCH_RANGE,
+    DELAY_SEARCH_RANGE_S,
     estimate_delay,
-    far_from_gaps,
-    low_passed,
+    is_far_from_gaps,
+    low_pass_log,
+    remove_delay,
     resample,
-    undelayed,
     white_noise,
 )
 from drake_teleop.logs.read.canonical import Log
@@ -70,7 +70,7 @@ class LoadFit:
 def load_fit(log: Log) -> LoadFit:
     """Fit a load and constant offsets to a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_passed(log, cutoff).only(far_from_gaps(log, cutoff))
+    smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
     w = wrench - wrench.mean(axis=0)
@@ -132,12 +132,12 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
     def fit_edited_description(edited: Description) -> LoadFit:
         # A wrong description may cause a wrong delay.
         log = _log_with_edited_wrench(thin, description, edited) or data.read_thinned_log(edited)
-        fits = [load_fit(undelayed(log, shift)) for shift in {0.0, delay or 0.0}]
+        fits = [load_fit(remove_delay(log, shift)) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fit_edited_description(description)
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
-    inside = delay is not None and abs(delay) < 0.9 * SEARCH_RANGE
+    inside = delay is not None and abs(delay) < 0.9 * DELAY_SEARCH_RANGE_S
     edits: list[tuple[Finding | None, Description]] = []
     if not (given.good and inside):
         edits += _clock_offset_edits(description, thin)
@@ -177,7 +177,7 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
 def _is_delay_significant(log: Log, delay: float | None) -> bool:
     if delay is None:
         return False
-    none, aligned = load_fit(log), load_fit(undelayed(log, delay))
+    none, aligned = load_fit(log), load_fit(remove_delay(log, delay))
     gain = none.independent * np.log(none.unexplained / (aligned.unexplained + 1e-30))
     return bool(gain > 25.0)
 
@@ -205,7 +205,7 @@ def _log_with_edited_wrench(log: Log, old: Description, new: Description) -> Log
 def _findings_without_remedy(
     description: Description, log: Log, given: LoadFit, delay: float | None
 ) -> tuple[list[Finding], float | None]:
-    smooth = low_passed(log, 30.0)
+    smooth = low_pass_log(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
     finding = payload_finding(load, given.unexplained - given.noise)
@@ -243,7 +243,7 @@ def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[No
     if description.wrench is None:
         return
     reach = min(2.0, 0.25 * float(log.t[-1] - log.t[0]))
-    smooth = low_passed(log, min(5.0, 0.2 / log.dt))
+    smooth = low_pass_log(log, min(5.0, 0.2 / log.dt))
     t = np.linspace(log.t[0] + reach, log.t[-1] - reach, 300)
     wrench = resample(t, smooth.t, smooth.wrench)
 
@@ -314,7 +314,7 @@ def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
     edges = np.linspace(0, len(log), _NUM_DELAY_PARTS + 1).astype(int)
     found = []
     for a, b in pairwise(edges):
-        part = log.only(slice(int(a), int(b)))
+        part = log.select_rows(slice(int(a), int(b)))
         delay = estimate_delay(part, 15.0)
         if delay is not None:
             found.append((0.5 * float(part.t[0] + part.t[-1]), delay))
@@ -331,6 +331,6 @@ def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
 
 def _unexplained_without_delay(log: Log) -> float:
     try:
-        return load_fit(undelayed(log, estimate_delay(log, 15.0) or 0.0)).unexplained
+        return load_fit(remove_delay(log, estimate_delay(log, 15.0) or 0.0)).unexplained
     except DrakeTeleopError:
         return np.inf

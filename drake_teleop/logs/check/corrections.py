@@ -79,7 +79,13 @@ def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Findi
         for unit in ("m/s^2", "g", "mm/s^2"):
             if (
                 unit != sensor.unit
-                and 0.7 < (ratio / description.scale(sensor.unit) * description.scale(unit)) < 1.43
+                and 0.7
+                < (
+                    ratio
+                    / description.si_value_of_unit(sensor.unit)
+                    * description.si_value_of_unit(unit)
+                )
+                < 1.43
             ):
                 text = f"the accelerometer reads {ratio:.3g} times gravity: it is not in"
                 found = _edit_with_finding(

@@ -17,8 +17,8 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.read.description_fields import (
     FORCE_UNITS,
     POSITION_UNITS,
+    SI_VALUE_OF_UNIT,
     TORQUE_UNITS,
-    UNITS,
 )
 from drake_teleop.logs.read.tables import Table
 
@@ -59,7 +59,7 @@ _ROBOT_NOTES = {
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
 _UNIT_NAMES = {
-    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*UNITS, "g")},
+    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g")},
     "µs": "us",
     "°": "deg",
     "°/s": "deg/s",
@@ -298,7 +298,7 @@ def _find_pose_vectors(
 
 
 def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
-    length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
+    length = np.linalg.norm(table.raw_side_by_side(quaternion, ""), axis=1)
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
 
 
@@ -438,7 +438,7 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
 
 
 def _guess_time_unit(table: Table, column: str) -> str:
-    step = float(np.median(np.abs(np.diff(table.single(column, column)))))
+    step = float(np.median(np.abs(np.diff(table.single_column(column, column)))))
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if step * scale <= 0.3:
             return unit

@@ -36,7 +36,7 @@ _GYRO_AXES_RATE_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
 def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
     """Return contradictions among the signals of an IMU, and the corrected description."""
     imu = description.imu
-    if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
+    if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
     unit = _angle_unit_finding(imu, log)
     if unit is not None:
@@ -87,7 +87,7 @@ def _angular_accelerations(log: Log) -> tuple[Array, Array]:
 
 def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
     assert imu.angular_velocity is not None
-    few = log.only(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
+    few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
     if not given > _MIN_MISFIT:
         return None
@@ -198,7 +198,7 @@ def check_imu_against_pose(
     if given is None:
         return [], None, description
     findings: list[Finding] = []
-    if given.unexplained > GOOD_SHARE or given.mirrored or given.angle_deg > 10:
+    if given.unexplained > GOOD_SHARE or given.mirrored or given.rotation_angle_deg > 10:
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
@@ -206,11 +206,11 @@ def check_imu_against_pose(
         ]
         limit = min(VALID_SHARE, given.unexplained / MIN_IMPROVEMENT)
         if given.mirrored:
-            better = [entry for entry in better if entry[3].angle_deg < 10]
-        elif given.angle_deg > 10 and given.unexplained < VALID_SHARE:
+            better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
+        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_SHARE:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
-            better = [entry for entry in better if entry[3].angle_deg < 10]
+            better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
             limit = min(VALID_SHARE, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0], default=None)
         if best and best[0] < limit:
@@ -231,15 +231,21 @@ def check_imu_against_pose(
             " has the wrong sign; correct imu.specific_force.columns"
         )
         findings.append(Finding("swapped axes", text))
-    elif given.angle_deg > 10:
+    elif given.rotation_angle_deg > 10:
         assert description.imu is not None
         old = np.eye(3)
         if isinstance(description.imu.frame, tuple):
             old = np.array(description.imu.frame)
-        frame = np.array(given.right_angled if given.is_right_angled else given.R_SI) @ old
+        frame = (
+            np.array(given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI)
+            @ old
+        )
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
-        text = f"the IMU is turned by {given.angle_deg:.0f} deg against S; set imu.frame: {shown}"
+        text = (
+            f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S; set imu.frame:"
+            f" {shown}"
+        )
         oblique = "" if given.is_right_angled else " (not a right-angled mounting)"
         findings.append(Finding(kind, text + oblique))
         description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))

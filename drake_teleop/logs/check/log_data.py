@@ -20,7 +20,7 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_s
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import read_description
-from drake_teleop.logs.read.streams import MINIMUM_SAMPLES
+from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
 _RATE_HZ = 100.0
@@ -76,11 +76,11 @@ class LogData:
             return 1
         rate = 1 / max(1e-12, float(np.median(np.diff(t))))
         # A short record keeps enough samples.
-        most = min(rate / _RATE_HZ, len(t) / MINIMUM_SAMPLES)
+        most = min(rate / _RATE_HZ, len(t) / MIN_STREAM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _table_of_stream(self, stream: Any) -> Table:
-        return self.tables[stream.source].filled(stream.columns)
+        return self.tables[stream.source].select_rows_with_numbers(stream.columns)
 
     def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
         if stream.time.column is None:

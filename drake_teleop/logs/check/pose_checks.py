@@ -15,7 +15,7 @@ from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.alignment import low_pass, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.description_fields import POSITION_UNITS, UNITS
+from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_OF_UNIT
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -31,8 +31,11 @@ MIN_POSES_DURATION_S = 4.0
 _UNIT_TOLERANCE, _NEAREST_COM, _FARTHEST_COM = 0.1, 2e-4, 1.5  # 1, m, m
 _TORQUE_UNITS = ("N m", "N mm", "lbf in")
 _UNIT_RATIOS = (
-    *(UNITS[unit] / UNITS[other] for unit, other in permutations(_TORQUE_UNITS, 2)),
-    *(UNITS["lbf"], 1.0 / UNITS["lbf"]),
+    *(
+        SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[other]
+        for unit, other in permutations(_TORQUE_UNITS, 2)
+    ),
+    *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
 _COM_TOLERANCE = 0.03
@@ -46,7 +49,7 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     imu, pose = description.imu, description.pose
     if imu is None or pose is None or imu.specific_force is None or pose.position is None:
         return []
-    if imu.automatic or pose.automatic:
+    if imu.is_mounting_auto or pose.is_frame_auto:
         return []
     sensed = data.read_thinned_log(description)
     posed = data.read_thinned_log(description.model_copy(update={"imu": None}))
@@ -91,7 +94,7 @@ def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding 
         return None
     text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
     for unit in POSITION_UNITS:
-        ratio = UNITS[unit] / UNITS[now]
+        ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[now]
         if unit != now and _UNIT_RANGE[0] < kappa / ratio < _UNIT_RANGE[1]:
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
     if 1.0 / _UNKNOWN_UNIT < abs(kappa) < _UNKNOWN_UNIT:  # noise or another error

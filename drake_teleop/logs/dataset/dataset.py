@@ -56,7 +56,7 @@ from drake_teleop.logs.dataset.shared_load import (
     samples_for_detector,
 )
 from drake_teleop.logs.figures import load_figures, to_plain_values
-from drake_teleop.logs.read.alignment import widened
+from drake_teleop.logs.read.alignment import widen_flags
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
@@ -379,7 +379,7 @@ def _contact_wrench_and_flags(
         contact = found.wrench_of_reading(residual)
         detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)
         touched = detector.detect(*samples_for_detector(signals, found.lag, contact))
-        free = ~widened(touched, _CONTACT_MARGIN_FRAMES)
+        free = ~widen_flags(touched, _CONTACT_MARGIN_FRAMES)
         if free.sum() < _MIN_FREE_FRAMES:
             break
         residual = residual - residual[free].mean(axis=0)

@@ -20,9 +20,9 @@ from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, whole_file, write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.array_files import import_optional, read_hdf5, read_zarr
-from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.table_files import expanded_columns, read_table
+from drake_teleop.logs.read.table_files import columns_with_nested, read_table
 from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH, IN_CONTACT = "observation.contact_wrench", "observation.in_contact"
@@ -73,7 +73,7 @@ class Dataset(NamedTuple):
             import polars as pl
 
             frame = pl.scan_parquet(episode.file).slice(episode.first, episode.rows)
-            return Table(episode.file, expanded_columns(frame))
+            return Table(episode.file, columns_with_nested(frame))
 
 
 def _with_element_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
@@ -240,7 +240,7 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
             remedy="convert it to Parquet",
         )
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
-    names = [f"{CONTACT_WRENCH}.{name}" for name in WRENCH] + [IN_CONTACT]
+    names = [f"{CONTACT_WRENCH}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT]
     cells = np.column_stack([new.contact_wrench, new.in_contact])
     texts = {head: names} | {
         k: [f"{x:.6g}" for x in row] for k, row in zip(rows, cells, strict=True)
@@ -280,7 +280,11 @@ def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
 
 def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewColumns]) -> None:
     info = json.loads((source / "info.json").read_text(encoding="utf-8"))
-    info["features"][CONTACT_WRENCH] = {"dtype": "float32", "shape": [6], "names": list(WRENCH)}
+    info["features"][CONTACT_WRENCH] = {
+        "dtype": "float32",
+        "shape": [6],
+        "names": list(WRENCH_COLUMNS),
+    }
     info["features"][IN_CONTACT] = {"dtype": "bool", "shape": [1], "names": None}
     make_folder(target)
     _write_json(target / "info.json", info)

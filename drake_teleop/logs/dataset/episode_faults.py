@@ -8,8 +8,8 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.dataset.episode_verdict import Hypothesis
-from drake_teleop.logs.read.canonical import WRENCH
-from drake_teleop.logs.read.description_fields import FORCE_UNITS, TORQUE_UNITS, UNITS
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
+from drake_teleop.logs.read.description_fields import FORCE_UNITS, SI_VALUE_OF_UNIT, TORQUE_UNITS
 
 _UNITS = (
     ("force", "N", set(FORCE_UNITS) - {"N"}),
@@ -83,8 +83,8 @@ def _unit_findings(gain: Array) -> list[Finding]:
     for factor, (what, si, names) in zip(gain, _UNITS, strict=True):
         if abs(factor - 1.0) < _SMALLEST_GAIN:
             continue
-        unit = min(names, key=lambda name: abs(np.log(factor * UNITS[name])))
-        near = abs(factor * UNITS[unit] - 1.0) < _UNIT_TOLERANCE
+        unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))
+        near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_TOLERANCE
         text = f"the {what} is {factor:.4g} times that in {si}"
         found.append(Finding("unit", text + (f": its unit is {unit}" if near else ""), factor))
     return found
@@ -93,7 +93,7 @@ def _unit_findings(gain: Array) -> list[Finding]:
 def saturated_channels(wrench: Array) -> list[Finding]:
     """Return a finding for channels of a wrench (N, 6) that stay at an end of their range."""
     names = []
-    for name, x in zip(WRENCH, wrench.T, strict=True):
+    for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():
             return [Finding("dead channel", f"{name} is {x[0]:.4g} in all frames", name)]
         starts = np.flatnonzero(np.diff(x, prepend=np.nan))

@@ -71,11 +71,15 @@ class ImuData:
         at = self.t[:rows].reshape(-1, count)
         whole = at[:, -1] - at[:, 0] < count / self.rate
 
-        def means(x: Array | None) -> Array | None:
+        def means_of_consecutive(x: Array | None) -> Array | None:
             return None if x is None else x[:rows].reshape(-1, count, 3).mean(axis=1)[whole]
 
         means_t = at.mean(axis=1)[whole]
-        return ImuData(means_t, means(self.specific_force), means(self.angular_velocity))
+        return ImuData(
+            means_t,
+            means_of_consecutive(self.specific_force),
+            means_of_consecutive(self.angular_velocity),
+        )
 
 
 @dataclass(frozen=True, eq=False)

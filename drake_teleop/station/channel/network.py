@@ -178,7 +178,7 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
     table = read_table(path)
     time = table.numbers(["time"], 1, str(path))[:, 0]
-    delay = table.single("delay", str(path))
+    delay = table.single_column("delay", str(path))
     if len(delay) != len(time):
         what = f"has {len(delay)} values, the column time has {len(time)}"
         raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
@@ -190,7 +190,7 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     ):
         if bad.any():
             raise DrakeTeleopError(
-                f"row {table.line(int(np.argmax(bad)))} {what}",
+                f"row {table.line_in_file(int(np.argmax(bad)))} {what}",
                 where=f"{path}:{column}",
                 remedy="give seconds, sorted by time; an empty delay is a lost packet",
             )
