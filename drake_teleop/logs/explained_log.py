@@ -24,9 +24,9 @@ from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_shar
 from drake_teleop.logs.read.alignment import remove_delay
 from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import CANONICAL_HAS_NO_LINE, Description
+from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION, Description
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
-from drake_teleop.logs.read.table_files import READER_BY_SUFFIX
+from drake_teleop.logs.read.table_files import TABLE_READERS
 
 DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
@@ -103,9 +103,7 @@ def _correct_fields(
 
 
 def _no_yaml_note(log: Log) -> str:
-    return (
-        f" ({CANONICAL_HAS_NO_LINE})" if Path(log.source).suffix.lower() in READER_BY_SUFFIX else ""
-    )
+    return f" ({ONLY_IN_DESCRIPTION})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 
 def _described_fields(description: Description, by_pose: bool) -> DescriptionFields:

@@ -153,7 +153,7 @@ def _inspect_described_log(
             continue
         if stream.source not in tables:
             tables[stream.source] = read_stream(stream)
-        table = tables[stream.source].select_rows_with_numbers(stream.columns)
+        table = tables[stream.source].rows_with_numbers(stream.columns)
         figures, more, rows = _inspect_stream(name, stream, table, description, source)
         summary["streams"][name] = figures
         findings += more

@@ -22,10 +22,10 @@ from drake_teleop.logs.aligned_log import (
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.read.alignment import is_far_from_gaps, low_pass, low_pass_log, widen_flags
+from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import CANONICAL_HAS_NO_LINE
-from drake_teleop.logs.read.table_files import READER_BY_SUFFIX
+from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION
+from drake_teleop.logs.read.table_files import TABLE_READERS
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
@@ -69,9 +69,7 @@ def fit_posed(
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
-    shown = low_pass_log(moved, cutoff_hz).select_rows(
-        is_far_from_gaps(moved, cutoff_hz) & ~one_sided
-    )
+    shown = low_pass_log(moved, cutoff_hz).select_rows(far_from_gaps(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
@@ -80,8 +78,8 @@ def fit_posed(
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
         fit = replace(fit, note="")
-        if Path(log.source).suffix.lower() in READER_BY_SUFFIX:
-            finding = replace(finding, message=f"{finding.message} ({CANONICAL_HAS_NO_LINE})")
+        if Path(log.source).suffix.lower() in TABLE_READERS:
+            finding = replace(finding, message=f"{finding.message} ({ONLY_IN_DESCRIPTION})")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 

@@ -57,7 +57,7 @@ from drake_teleop.logs.explained_log import (
 from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_posed
 from drake_teleop.logs.read.alignment import (
     choose_delay,
-    is_far_from_gaps,
+    far_from_gaps,
     low_pass,
     low_pass_log,
     remove_delay,
@@ -201,7 +201,7 @@ def _identify_read_log(
     else:
         delay_s, source = choose_delay(log, cutoff_hz, delay)
         log = remove_delay(log, delay_s)
-        log = low_pass_log(log, cutoff_hz).select_rows(is_far_from_gaps(log, cutoff_hz))
+        log = low_pass_log(log, cutoff_hz).select_rows(far_from_gaps(log, cutoff_hz))
         fit = identify_batch(
             log.wrench,
             *log.motion,
@@ -446,7 +446,7 @@ def _eliminate_read_log(
         raise DrakeTeleopError(
             "poses at rest have no order in time", where="causal", remedy="leave it out"
         )
-    known = is_far_from_gaps(log, cutoff_hz)
+    known = far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
     def low_pass_wrench(wrench: Array) -> Array:

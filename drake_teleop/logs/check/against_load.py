@@ -26,7 +26,7 @@ from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
     DELAY_SEARCH_RANGE_S,
     estimate_delay,
-    is_far_from_gaps,
+    far_from_gaps,
     low_pass_log,
     remove_delay,
     resample,
@@ -70,7 +70,7 @@ class LoadFit:
 def load_fit(log: Log) -> LoadFit:
     """Fit a load and constant offsets to a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_pass_log(log, cutoff).select_rows(is_far_from_gaps(log, cutoff))
+    smooth = low_pass_log(log, cutoff).select_rows(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
     w = wrench - wrench.mean(axis=0)

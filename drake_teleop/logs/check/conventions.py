@@ -31,9 +31,9 @@ from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu
 from drake_teleop.logs.check.log_data import LogData, channel_findings
 from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.description import CANONICAL_HAS_NO_LINE, Description, load_description
+from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
-from drake_teleop.logs.read.table_files import READER_BY_SUFFIX, read_table
+from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table
 
 _MIN_MOTION_RMS = 0.3, 0.1
@@ -62,7 +62,7 @@ class Conventions:
 
 
 def check_file(path: Path) -> Conventions:
-    if path.suffix.lower() in READER_BY_SUFFIX:
+    if path.suffix.lower() in TABLE_READERS:
         table = read_table(path)
         return check_conventions(describe_canonical(path, table), str(path), {path: table})
     return check_conventions(load_description(path), str(path))
@@ -142,7 +142,7 @@ def _require_motion(log: Log) -> None:
 
 
 def _is_suspicious(log: Log) -> bool:
-    if log.static or log.described is None or Path(log.source).suffix.lower() in READER_BY_SUFFIX:
+    if log.static or log.described is None or Path(log.source).suffix.lower() in TABLE_READERS:
         return False
     few = log.select_rows(slice(None, None, max(1, int(0.01 / log.dt))))
     if (np.ptp(few.wrench, axis=0) < 1e-9 * np.abs(few.wrench).max()).any():
@@ -157,12 +157,10 @@ def check_conventions(
 ) -> Conventions:
     with one_blas_thread():
         found = _check_description(LogData(description, source, dict(tables or {})), description)
-    if Path(source).suffix.lower() not in READER_BY_SUFFIX:
+    if Path(source).suffix.lower() not in TABLE_READERS:
         return found
     # A canonical table has no description to edit.
-    findings = (
-        replace(f, message=f"{f.message} ({CANONICAL_HAS_NO_LINE})") for f in found.findings
-    )
+    findings = (replace(f, message=f"{f.message} ({ONLY_IN_DESCRIPTION})") for f in found.findings)
     return replace(found, findings=tuple(findings))
 
 

@@ -80,7 +80,7 @@ class LogData:
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _table_of_stream(self, stream: Any) -> Table:
-        return self.tables[stream.source].select_rows_with_numbers(stream.columns)
+        return self.tables[stream.source].rows_with_numbers(stream.columns)
 
     def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
         if stream.time.column is None:

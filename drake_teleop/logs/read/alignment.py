@@ -198,7 +198,7 @@ def remove_delay(log: Log, delay_s: float) -> Log:
     )
 
 
-def is_far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
+def far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
@@ -242,7 +242,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     reach = min(DELAY_SEARCH_RANGE_S, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    gap = ~is_far_from_gaps(log, cutoff)
+    gap = ~far_from_gaps(log, cutoff)
     gap = widen_flags(gap, math.ceil(reach / log.dt)) if gap.any() else gap
     inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_DELAY_SAMPLES:

@@ -45,7 +45,7 @@ from drake_teleop.logs.read.description_fields import (
     Weight,
 )
 
-CANONICAL_HAS_NO_LINE = "in a log description of this table; the canonical form has no such line"
+ONLY_IN_DESCRIPTION = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
 
 
@@ -328,13 +328,13 @@ class Description(Strict):
         """Gravity (3,) in the world [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
-    def poses_with_described_frame(self, poses: Poses, imu: ImuData | None = None) -> PosesOfLog:
+    def add_pose_frame(self, poses: Poses, imu: ImuData | None = None) -> PosesOfLog:
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
         return PosesOfLog(poses, self.gravity_W, np.array(origin), rotation, imu)
 
-    def si_value_of_unit(self, unit: str) -> float:
+    def si_value(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else SI_VALUE_OF_UNIT[unit]
 

@@ -16,7 +16,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import (
     estimate_delay,
-    is_far_from_gaps,
+    far_from_gaps,
     low_pass,
     low_pass_log,
     remove_delay,
@@ -46,16 +46,13 @@ def lag_of_imu_clock(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Ar
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
-    def remove_lever_arm_effects(x: Array) -> Array:
+    def remove_arm(x: Array) -> Array:
         return x - U @ (U.T @ x)
 
-    expected, sensed = (
-        [remove_lever_arm_effects(y) for y, _ in pairs],
-        np.hstack([x for _, x in pairs]),
-    )
+    expected, sensed = [remove_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
 
     def unexplained_at_shift(shift: float) -> float:
-        moved = remove_lever_arm_effects(resample(t + shift, t_imu, sensed))
+        moved = remove_arm(resample(t + shift, t_imu, sensed))
         return sum(
             _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
         )
@@ -116,7 +113,7 @@ def _unexplained_share(y: Array, x: Array) -> float:
 
 _NUM_JACKKNIFE_BLOCKS = 20
 # Directions with smaller singular values, relative to the largest, are undetermined.
-RANK_TOLERANCE = 1e-5
+MIN_SINGULAR_RATIO = 1e-5
 _MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
@@ -130,14 +127,13 @@ def solve_least_squares(
     """
     linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
     rows, channels, _ = linear.shape
-    found = _minimize_weighted_residual(residual, x, linear)
-    found = _minimize_weighted_residual(residual, found.x, linear)  # with updated weights
-    return found.x, jackknife_deviations(
-        found.jac, found.fun, channels * (rows // _NUM_JACKKNIFE_BLOCKS)
-    )
+    found = _minimize_residual(residual, x, linear)
+    found = _minimize_residual(residual, found.x, linear)  # with updated weights
+    width = channels * (rows // _NUM_JACKKNIFE_BLOCKS)
+    return found.x, jackknife_deviations(found.jac, found.fun, width)
 
 
-def _minimize_weighted_residual(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
+def _minimize_residual(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
     from scipy.optimize import approx_fprime, least_squares
 
     errors, others = residual(x), len(x) - linear.shape[2]
@@ -145,23 +141,21 @@ def _minimize_weighted_residual(residual: Callable[[Array], Array], x: Array, li
     sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
     known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
 
-    def weighted_residual(z: Array) -> Array:
+    def weigh(z: Array) -> Array:
         return (residual(z) / sigma).ravel()
 
     def jacobian(z: Array) -> Array:
-        found = approx_fprime(z[:others], lambda y: weighted_residual(np.append(y, z[others:])))
+        found = approx_fprime(z[:others], lambda y: weigh(np.append(y, z[others:])))
         return np.hstack([found, known])
 
-    return least_squares(
-        weighted_residual, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_EVALUATIONS
-    )
+    return least_squares(weigh, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_EVALUATIONS)
 
 
 def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     """Return jackknife standard deviations (n,) of the parameters, for blocks of `width` rows."""
     size = np.linalg.norm(jacobian, axis=0) + 1e-300
     _, singular, Vt = np.linalg.svd(jacobian / size, full_matrices=False)
-    known = singular > RANK_TOLERANCE * singular[0]
+    known = singular > MIN_SINGULAR_RATIO * singular[0]
     basis = Vt[known].T
     J = (jacobian / size) @ basis
     gram, steps = J.T @ J, []
@@ -220,7 +214,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
         return None
     wrench = resample(t, smooth.t, smooth.wrench)
 
-    def wrench_residual(x: Array) -> Array:
+    def residual_at(x: Array) -> Array:
         s, omega, alpha = (resample(t + x[3], smooth.t, signal) for signal in smooth.motion)
         s = s - lever_matrix(omega, alpha) @ x[:3]
         return contact_wrench(wrench, x[4:10], s, omega, alpha, x[10:])
@@ -229,15 +223,11 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     V = regressor(*motion)
     size = np.linalg.norm(V - V.mean(axis=0), axis=(0, 1)) + 1e-12
     centred = ((V - V.mean(axis=0)) / size).reshape(-1, 10)
-    phi = (
-        np.linalg.lstsq(centred, (wrench - wrench.mean(axis=0)).ravel(), rcond=RANK_TOLERANCE)[0]
-        / size
-    )
+    target = (wrench - wrench.mean(axis=0)).ravel()
+    phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = solve_least_squares(
-        wrench_residual, np.concatenate([np.zeros(4), offsets, phi])
-    )
-    left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (wrench_residual(x), wrench))
+    x, deviations = solve_least_squares(residual_at, np.concatenate([np.zeros(4), offsets, phi]))
+    left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
     if (left > MAX_UNEXPLAINED * whole).any():
         return None
     observable = are_axes_observable(lever_matrix(*motion[1:]), smooth, cutoff)
@@ -246,9 +236,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
 def common_times_of_logs(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
     t = np.linspace(start, stop, MAX_COMPARED_SAMPLES)
-    known = [
-        np.interp(t, log.t, is_far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs
-    ]
+    known = [np.interp(t, log.t, far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
 
@@ -419,10 +407,8 @@ def _refine_rotation_and_lag(
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
     def pose_residual(x: Array) -> Array:
-        rotated = (
-            resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3)
-            @ _rotated_by_vector(R, x[:3]).T
-        )
+        resampled = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3)
+        rotated = resampled @ _rotated_by_vector(R, x[:3]).T
         left = rotated.reshape(known.shape) - known
         left[:, 0] -= K @ x[4:7]
         return left.reshape(len(t), -1) + x[7:]

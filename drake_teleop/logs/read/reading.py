@@ -34,7 +34,7 @@ from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
-    CANONICAL_HAS_NO_LINE,
+    ONLY_IN_DESCRIPTION,
     Description,
     Imu,
     Pose,
@@ -49,18 +49,18 @@ from drake_teleop.logs.read.streams import (
     Stream,
     common_time_of_streams,
     resample_to_clock,
-    rotate_from_world_to_S,
-    rotate_wrench_to_S,
     specific_force_at_So,
+    world_to_S,
+    wrench_world_to_S,
 )
-from drake_teleop.logs.read.table_files import READER_BY_SUFFIX, read_table
+from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table, decimal_step
 
 MIN_STATIC_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
 _CHUNK_ROWS = 2**16
 _MAX_GAP_OVER_STEP = 4.0
-_EstimateAutoFields = Callable[..., tuple[Description, tuple[str, ...]]]
+_EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
 
 
 def read_log(
@@ -68,10 +68,9 @@ def read_log(
 ) -> Log:
     """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
 
-    Signals are interpolated on the wrench's clock at its median rate; faster streams are low-passed
-    first. Angular velocity is from the gyroscope, else from the orientation; angular acceleration
-    from the file, else differentiated; specific force from the accelerometer, else from the
-    position, else it is -gravity.
+    Signals are resampled to the wrench's clock at its median rate. Angular velocity is from the
+    gyroscope, else from the orientation; angular acceleration from the file, else differentiated;
+    specific force from the accelerometer, else from the position, else it is -gravity.
 
     Args:
         path: the file.
@@ -91,7 +90,7 @@ def read_log(
     if path.suffix.lower() in (".yaml", ".yml"):
         reader = _Reader(load_description(path), str(path), bandwidth_hz)
         return reader.read_stream_log(differentiate=differentiate)
-    if path.suffix.lower() in READER_BY_SUFFIX:
+    if path.suffix.lower() in TABLE_READERS:
         table = read_table(path)
         description = describe_canonical(path, table)
         reader = _Reader(description, str(path), bandwidth_hz, {path: table})
@@ -101,7 +100,7 @@ def read_log(
     raise DrakeTeleopError(
         f"format {path.suffix!r} is not known",
         where=str(path),
-        remedy=f"give a canonical log ({', '.join(READER_BY_SUFFIX)}) or a log description (.yaml)",
+        remedy=f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)",
     )
 
 
@@ -142,16 +141,15 @@ class _Reader:
         causes = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
         free = tuple(name for name, is_free in causes.items() if is_free)
         if self._description.gravity == "auto":
-            self._replace_auto_fields(estimate_auto_gravity)
+            self._replace_auto(estimate_auto_gravity)
         if self._description.pose is not None and self._description.pose.is_frame_auto:
-            self._replace_auto_fields(estimate_auto_pose_frame, differentiate=False)
+            self._replace_auto(estimate_auto_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.is_mounting_auto:
-            self._replace_auto_fields(estimate_auto_imu_mounting)
+            self._replace_auto(estimate_auto_imu_mounting)
         table = self._table_of_stream(self._description.wrench)
         clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
-        wrench = clock.select_timed_rows(
-            self._read_wrench("wrench", self._description.wrench, table, clock.total)
-        )
+        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.total)
+        wrench = clock.select_timed_rows(wrench)
         pose = imu = None
         if self._description.pose is not None:
             pose = self._read_pose(self._description.pose, differentiate=differentiate)
@@ -160,34 +158,25 @@ class _Reader:
         streams = [stream for stream in (imu, pose) if stream is not None]
         t = common_time_of_streams(clock.t, streams, self._source)
         wrench = resample(t, clock.t, wrench)
-        log = self._assemble_log(t, wrench, imu, pose)
+        log = self._make_log(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
         log = replace(log, gain_std=gain_std, free=free, described=self._description)
         if pose is not None and pose.raw is not None:
             inertial = None if imu is None else imu.inertial
-            log = replace(
-                log, posed=self._description.poses_with_described_frame(pose.raw, inertial)
-            )
+            log = replace(log, posed=self._description.add_pose_frame(pose.raw, inertial))
         log = log if keep_origin else log.with_times_from(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
         other = self._description.model_copy(update={"wrench": without})
-        return restore_weight(log, np.array(weight), self._read_with_description(other))
+        return restore_weight(log, np.array(weight), self._read_edited(other))
 
-    def _replace_auto_fields(
-        self, describe: _EstimateAutoFields, *, differentiate: bool = True
-    ) -> None:
-        self._description, notes = describe(
-            self._description,
-            self._source,
-            partial(self._read_with_description, differentiate=differentiate),
-        )
+    def _replace_auto(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
+        read = partial(self._read_edited, differentiate=differentiate)
+        self._description, notes = describe(self._description, self._source, read)
         self._notes += notes
 
-    def _read_with_description(
-        self, description: Description, *, differentiate: bool = True
-    ) -> Log:
+    def _read_edited(self, description: Description, *, differentiate: bool = True) -> Log:
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
                 self._table_of_stream(stream)
@@ -198,9 +187,7 @@ class _Reader:
         if stream.source not in self._tables:
             self._tables[stream.source] = read_stream(stream)
         table = self._tables[stream.source]
-        return (
-            table if isinstance(stream, Static) else table.select_rows_with_numbers(stream.columns)
-        )
+        return table if isinstance(stream, Static) else table.rows_with_numbers(stream.columns)
 
     def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
@@ -218,14 +205,9 @@ class _Reader:
         where = f"{self._source}:{name}.{field}.columns"
         values = table.numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
-        values *= (
-            sign * self._description.si_value_of_unit(quantity.unit) * np.array(quantity.scale)
-        )
-        of_table = (
-            f" ({CANONICAL_HAS_NO_LINE})"
-            if Path(self._source).suffix.lower() in READER_BY_SUFFIX
-            else ""
-        )
+        values *= sign * self._description.si_value(quantity.unit) * np.array(quantity.scale)
+        is_table = Path(self._source).suffix.lower() in TABLE_READERS
+        of_table = f" ({ONLY_IN_DESCRIPTION})" if is_table else ""
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
@@ -254,7 +236,7 @@ class _Reader:
         return Stream(
             "pose",
             t,
-            rotate_from_world_to_S(R_WS, acceleration - self._description.gravity_W),
+            world_to_S(R_WS, acceleration - self._description.gravity_W),
             *angular_motion(R_WS, dt, self._bandwidth_hz),
             R_WS,
             raw,
@@ -266,10 +248,8 @@ class _Reader:
         if stream.position is not None:
             position = self._read_vectors("pose", "position", stream.position, table, clock.total)
             position = clock.select_timed_rows(position)
-        where = f"{self._source}:pose.orientation"
-        orientations = Orientations(
-            self._description, stream.orientation, table, clock.total, where
-        )
+        where, form = f"{self._source}:pose.orientation", stream.orientation
+        orientations = Orientations(self._description, form, table, clock.total, where)
         quaternion = orientations.allocate_quaternions(len(clock.rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK_ROWS):
@@ -320,12 +300,10 @@ class _Reader:
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise self._missing_orientation_error(name)
-        return rotate_from_world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+            raise self._orientation_error(name)
+        return world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
-    def _missing_orientation_error(
-        self, name: str, remedy: str = "add a pose stream"
-    ) -> DrakeTeleopError:
+    def _orientation_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         return DrakeTeleopError(
             "base axes cannot be turned to S without an orientation",
             where=f"{self._source}:{name}.frame",
@@ -339,24 +317,20 @@ class _Reader:
         if stream.gravity is not None:
             gravity = self._read_vectors("static", "gravity", stream.gravity, table, table.rows)
         elif stream.specific_force is not None:
-            s = self._read_vectors(
-                "static", "specific_force", stream.specific_force, table, table.rows
-            )
-            gravity = -s
+            quantity = stream.specific_force
+            gravity = -self._read_vectors("static", "specific_force", quantity, table, table.rows)
         else:
             assert stream.orientation is not None
-            where = f"{self._source}:static.orientation"
-            orientations = Orientations(
-                self._description, stream.orientation, table, table.rows, where
-            )
+            where, form = f"{self._source}:static.orientation", stream.orientation
+            orientations = Orientations(self._description, form, table, table.rows, where)
             R_WS = orientations.rotations(np.arange(table.rows))
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
-                raise self._missing_orientation_error("static", remedy)
-            wrench = rotate_wrench_to_S(R_SW, wrench)
+                raise self._orientation_error("static", remedy)
+            wrench = wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
             wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
@@ -381,7 +355,7 @@ class _Reader:
     def _quantization_step(self, stream: Static, table: Table) -> tuple[float, float]:
         force, torque = (
             decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
-            * (self._description.si_value_of_unit(quantity.unit) * np.abs(quantity.scale).max())
+            * (self._description.si_value(quantity.unit) * np.abs(quantity.scale).max())
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         )
         return force, torque
@@ -413,21 +387,19 @@ class _Reader:
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
         if len(found_gaps):
-            half = self._half_smoothing_window_s(float(np.median(np.diff(t))))
+            half = self._half_window_s(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half, half]))
         return clock
 
-    def _half_smoothing_window_s(self, dt: float) -> float:
+    def _half_window_s(self, dt: float) -> float:
         window = SMOOTHER_WINDOW_OVER_PERIOD / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
     def _extend_one_sided_ends(self, dt: float) -> None:
-        self._one_sided_s = max(self._one_sided_s, self._half_smoothing_window_s(dt))
+        self._one_sided_s = max(self._one_sided_s, self._half_window_s(dt))
 
-    def _assemble_log(
-        self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None
-    ) -> Log:
-        def signal_on_wrench_clock(field: str) -> Array:
+    def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
+        def signal_on_clock(field: str) -> Array:
             for stream in (imu, pose):
                 values = None if stream is None else getattr(stream, field)
                 if stream is not None and values is not None:
@@ -441,22 +413,17 @@ class _Reader:
             R_WS = nearest_rotation(resample_to_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
             if in_base:
-                wrench = rotate_wrench_to_S(np.swapaxes(R_WS, 1, 2), wrench)
+                wrench = wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
-            raise self._missing_orientation_error("wrench")
+            raise self._orientation_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
         if not accelerometer and described_pose and described_pose.position is None:
             self._notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
+        names = ("specific_force", "angular_velocity", "angular_acceleration")
         return Log(
-            *(
-                t,
-                wrench,
-                signal_on_wrench_clock("specific_force"),
-                signal_on_wrench_clock("angular_velocity"),
-            ),
-            signal_on_wrench_clock("angular_acceleration"),
+            *(t, wrench, *map(signal_on_clock, names)),
             gravity=gravity,
             R_WS=R_WS,
             gravity_W=None if R_WS is None else self._description.gravity_W,

@@ -40,14 +40,12 @@ def read_table(path: Path, *, header: bool = True) -> Table:
 
     The columns of a text file without header are named from "0" on.
     """
-    kind = READER_BY_SUFFIX.check(path.suffix.lower(), str(path))
+    kind = TABLE_READERS.check(path.suffix.lower(), str(path))
     if not (os.path.isdir if kind == ".zarr" else os.path.isfile)(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     refuse_fork()
     with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
-        columns = (
-            _read_text(path, header) if kind in _TEXT_SUFFIXES else READER_BY_SUFFIX[kind](path)
-        )
+        columns = _read_text(path, header) if kind in _TEXT_SUFFIXES else TABLE_READERS[kind](path)
         table = columns if isinstance(columns, Table) else Table(path, columns)
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
@@ -231,7 +229,7 @@ def _columns_reader(read: _Arrays) -> _Arrays:
     return lambda path: array_columns(read(path))
 
 
-READER_BY_SUFFIX: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(
+TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(
     "log format",
     {
         **dict.fromkeys(_TEXT_SUFFIXES, _read_text),

@@ -46,7 +46,7 @@ class Table:
         """Return the number in the file of a row of this table, for messages."""
         return self.first_row + int(row if self.kept is None else self.kept[row])
 
-    def select_rows_with_numbers(self, names: Sequence[str | int]) -> Table:
+    def rows_with_numbers(self, names: Sequence[str | int]) -> Table:
         """Return the rows in which at least one of the named columns has a number."""
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.raw(names[0], "")).all():
