@@ -26,7 +26,7 @@ from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.load.contact.detection import SIZE, detection_update
+from drake_teleop.load.contact.detection import MEMORY_SIZE, update_statistics
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -82,7 +82,7 @@ def reading(config: WristSensorConfig) -> tuple[float, float]:
 @njit
 def _detect_often(memory, wrenches, motion, parameters):  # type: ignore[no-untyped-def]
     for i in range(len(wrenches)):
-        detection_update(memory, wrenches[i], *motion, parameters, 1.0, 0.0, 0.0)
+        update_statistics(memory, wrenches[i], *motion, parameters, 1.0, 0.0, 0.0)
 
 
 def detection() -> tuple[float, float]:
@@ -92,9 +92,9 @@ def detection() -> tuple[float, float]:
     floor = NoiseFloor(noise, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.full(6, 0.5))
     wrenches = np.random.default_rng(0).normal(size=(20_000, 6)) * noise
     motion = (np.array([0.0, 0.0, 9.81]), still, still, still)
-    memory, parameters = np.zeros(SIZE), tuple(floor.parameters)
+    memory, parameters = np.zeros(MEMORY_SIZE), tuple(floor.compiled_parameters)
     ours = seconds(lambda: _detect_often(memory, wrenches, motion, parameters), 3) / len(wrenches)
-    update = detection_update.py_func
+    update = update_statistics.py_func
     slow = seconds(lambda: update(memory, wrenches[0], *motion, parameters, 1.0, 0.0, 0.0), 20)
     return ours, slow
 

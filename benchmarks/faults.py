@@ -36,7 +36,7 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import true_load
-from drake_teleop.load.regressor import TIME
+from drake_teleop.load.regressor import SAMPLE_TIME_INDEX
 from drake_teleop.station import master_side as master
 from drake_teleop.station import slave_side as slave
 from drake_teleop.station import station as station_module
@@ -252,7 +252,7 @@ def change_of(fault: Fault, station: Diagram) -> Change:
             held.append(x.copy())
             x[:] = held[0]
         elif fault.kind == "clock":
-            x[TIME] += fault.size
+            x[SAMPLE_TIME_INDEX] += fault.size
         else:
             x[fault.index] = fault.size
 

@@ -32,7 +32,7 @@ from drake_teleop.lab.identification import (
     sensor_samples,
     slave_arm,
 )
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
@@ -128,7 +128,7 @@ def errors_of(load: Identification) -> Array:
 
 def held(load: Identification) -> NDArray[np.bool_]:
     """(16,) whether the 95 % intervals hold what is true, the offsets at the start."""
-    low, high = intervals(load)
+    low, high = confidence_intervals(load)
     true = np.concatenate([JR3.offset, ARM.phi_load])
     return np.asarray((low <= true) & (true <= high))
 

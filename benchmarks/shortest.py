@@ -24,7 +24,12 @@ from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import shortest
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
+from drake_teleop.load.tolerance import (
+    Tolerance,
+    read_tolerance,
+    tolerances_in_units,
+    values_of_required,
+)
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.sensor.motion_estimation import estimate_into, motion_estimator
@@ -71,13 +76,13 @@ def reached(
     )
     samples, within = np.empty((len(truth), 22)), 0
     rng = np.random.default_rng(0)
-    true, sizes = values_of(tolerance, phi), sizes_of(tolerance, phi)
+    true, sizes = values_of_required(tolerance, phi), tolerances_in_units(tolerance, phi)
     for _ in range(records):
         noise = rng.standard_normal((len(truth) // NOISE_BLOCK + 1, NOISE_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         parts = (samples[:, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(*parts, noise=sensor.wrench_std())
-        within += int((np.abs(values_of(tolerance, load.phi) - true) <= sizes).all())
+        within += int((np.abs(values_of_required(tolerance, load.phi) - true) <= sizes).all())
     return within / records
 
 

@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
 from drake_teleop.lab.comparison.station_accounts import station_accounts
 from drake_teleop.load.contact.detection import NoiseFloor
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
-from drake_teleop.load.online.watched import OTHER_LOAD
+from drake_teleop.load.online.watched import STATE_OTHER_LOAD
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
@@ -515,7 +515,7 @@ def test_what_is_gripper_and_what_is_object_are_told_apart(slave):
     known = log["load_estimate"]
     np.testing.assert_allclose(known[0], np.concatenate([offsets, 0.9 * slave.arm.phi_load]))
     np.testing.assert_allclose(known[-1, 6:], gripper, rtol=1e-3)
-    assert log["load_state"][-1, 0] == OTHER_LOAD
+    assert log["load_state"][-1, 0] == STATE_OTHER_LOAD
     contact = log["measured_wrench_S"] - known[:, :6] - inertial_wrench(log, known[:, 6:])
     of_object = inertial_wrench(log, known[:, 6:] - gripper)
     np.testing.assert_allclose(log["scaled_wrench_S"], contact + eta * of_object, atol=1e-11)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
 from drake_teleop.common.files import output_folder, write_json, write_picture, write_table
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
-from drake_teleop.load.contact.noise_floor import STATISTICS
-from drake_teleop.load.identification import Identification, identified_object
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
+from drake_teleop.load.identification import Identification, load_of_object
 from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.figures import (
     common_figures,
@@ -53,13 +53,13 @@ def identify_command(
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
-    alone = None if gripper_load is None else identified_object(result, gripper_load)
+    alone = None if gripper_load is None else load_of_object(result, gripper_load)
     summary = common_figures(log, found, cutoff_hz, result.delay_s) | {
         "samples": result.samples,
         **load_figures(result),
         "offsets": result.offsets,
         "offsets_std": result.standard_deviations[:6],
-        "determined": found.base.lines(),
+        "determined": found.base.text_lines(),
         "method": result.method,
         "rejected": found.rejected.mean(),
         "condition_number": result.condition_number,
@@ -224,7 +224,7 @@ def _detection_table(found: DetectedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
-    columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
+    columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTIC_NAMES)}
     columns |= {
         f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH_COLUMNS)
     }

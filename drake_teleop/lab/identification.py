@@ -21,9 +21,9 @@ from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import fit_noise_floor
-from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
+from drake_teleop.load.contact.noise_floor import NoiseFloor, limit_covariance
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.result import SimulationResult
@@ -82,7 +82,7 @@ class LoadIdentification:
         offsets, phi = self.estimate[:6], self.estimate[6:]
         contact = contact_wrench(wrench, offsets, s, omega, alpha, phi)
         a = accelerations(arm, self.result["joint_position"][usable], s)
-        P = finite_covariance(phi, self.batch.covariance)
+        P = limit_covariance(phi, self.batch.covariance)
         return fit_noise_floor(contact, s, omega, alpha, a, P)
 
     @property
@@ -179,7 +179,7 @@ def batch_identification(
     walk = sensor.random_walk()
     if scenario.motion_estimation.source != "accelerometer":  # encoders have no random walk
         walk[6:] = 0.0
-    noise = Noise(
+    noise = NoiseStd(
         wrench=sensor.wrench_std(),
         s=motion[:3],
         omega=motion[3:6],

@@ -13,11 +13,16 @@ from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half
 from drake_teleop.load.contact.detection import (
     MAX_NOISE_LEVEL,
     ContactDetector,
+    central_axis_of_wrenches,
     fit_noise_floor,
-    statistics,
-    wrench_axis,
+    statistics_of_log,
 )
-from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, Samples, statistic_index
+from drake_teleop.load.contact.noise_floor import (
+    THRESHOLD_MARGIN,
+    DetectorSamples,
+    NoiseFloor,
+    statistic_index,
+)
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
@@ -56,7 +61,7 @@ class Detection:
     floor: NoiseFloor
     statistic: str
     threshold: float
-    statistics: Array
+    statistics_of_log: Array
     touched: NDArray[np.bool_]
     free_s: float
     force_threshold: float
@@ -68,24 +73,24 @@ class Detection:
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
-def samples_for_detector(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
+def samples_for_detector(log: Log, contact: Array, cutoff_hz: float | None) -> DetectorSamples:
     s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
     else:
         gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_CUTOFF_HZ)
-    return Samples(contact, s, omega, alpha, s + gravity)
+    return DetectorSamples(contact, s, omega, alpha, s + gravity)
 
 
 def detect_contact(
-    rows: Samples,
+    rows: DetectorSamples,
     dt: float,
     cutoff_hz: float | None,
     covariance: Array,
     usual: Array,
     *,
     edge: NDArray[np.bool_] | None = None,
-    free: tuple[Samples, float] | None = None,
+    free: tuple[DetectorSamples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
     """Find contact in a log; return None for fewer than 100 judged samples.
@@ -96,7 +101,7 @@ def detect_contact(
     """
     period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
     inner = _select_judged_samples(rows, dt, period, edge)
-    judged = rows.at(inner)
+    judged = rows.select_rows(inner)
     if len(judged.contact) < MIN_SAMPLES:
         return None
     hold = round(period / dt)
@@ -105,12 +110,12 @@ def detect_contact(
         fade = math.exp(-dt / period)
         floor, threshold, train = _floor_from_record(judged, dt, hold, fade, covariance, statistic)
     else:
-        train = free[0].at(_select_judged_samples(free[0], free[1], period))
+        train = free[0].select_rows(_select_judged_samples(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
         threshold = max(MAX_NOISE_LEVEL, floor.threshold(statistic))
     values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
     detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
-    values[inner] = statistics(floor, *judged)
+    values[inner] = statistics_of_log(floor, *judged)
     touched[inner] = _remove_hold_after_contact(detector.detect(*judged), hold)
     if free is None:
         _remove_marginal_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
@@ -121,13 +126,14 @@ def detect_contact(
         statistics=values,
         touched=touched,
         free_s=len(train.contact) * (dt if free is None else free[1]),
-        force_threshold=MARGIN * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
+        force_threshold=THRESHOLD_MARGIN
+        * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
         notes=() if free is not None else _detection_notes(floor, touched, usual),
     )
 
 
 def _select_judged_samples(
-    rows: Samples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
+    rows: DetectorSamples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
 ) -> slice | NDArray[np.bool_]:
     ends, judged = max(1, round(period / dt)), np.zeros(len(rows.contact), bool)
     judged[ends : len(judged) - ends] = True
@@ -139,8 +145,8 @@ def _select_judged_samples(
 
 
 def _floor_from_record(
-    rows: Samples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
-) -> tuple[NoiseFloor, float, Samples]:
+    rows: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
+) -> tuple[NoiseFloor, float, DetectorSamples]:
     from scipy.ndimage import maximum_filter1d
 
     n = len(rows.contact)
@@ -150,25 +156,27 @@ def _floor_from_record(
     if (quiet & selected).sum() < MIN_SAMPLES:
         quiet = selected = np.ones(n, bool)
     for _ in range(_CONCENTRATION_STEPS if n >= _MIN_NUM_BLOCKS * block else 0):
-        floor = fit_noise_floor(*rows.at(quiet & selected), covariance, fade=fade)
-        half = _quieter_half_of_blocks(statistics(floor, *rows)[:, 0], block)
+        floor = fit_noise_floor(*rows.select_rows(quiet & selected), covariance, fade=fade)
+        half = _quieter_half_of_blocks(statistics_of_log(floor, *rows)[:, 0], block)
         if (half & selected).sum() < MIN_SAMPLES:
             break
         quiet = half
     for attempt in range(_NUM_FLOOR_ROUNDS):
-        train = rows.at(quiet & selected)
+        train = rows.select_rows(quiet & selected)
         floor = fit_noise_floor(*train, covariance, fade=fade)
-        values = statistics(floor, *train)[:, statistic_index(statistic)]
+        values = statistics_of_log(floor, *train)[:, statistic_index(statistic)]
         reached = _extrapolated_maximum(values, block, n)
         if attempt > 0:
             reached = min(reached, float(values.max()))
         reached = max(_MIN_REACHED, reached)
-        detector = ContactDetector(floor, MARGIN * reached, statistic=statistic, hold=hold)
+        detector = ContactDetector(
+            floor, THRESHOLD_MARGIN * reached, statistic=statistic, hold=hold
+        )
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
         if (selected & without_contact).sum() < MIN_SAMPLES or attempt == _NUM_FLOOR_ROUNDS - 1:
             break
         quiet = without_contact
-    return floor, _RECORD_MARGIN * reached, rows.at(quiet)
+    return floor, _RECORD_MARGIN * reached, rows.select_rows(quiet)
 
 
 def _quieter_half_of_blocks(level: Array, block: int) -> NDArray[np.bool_]:
@@ -199,7 +207,7 @@ def _remove_marginal_contacts(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
     for start, stop in find_runs_of_true(touched):
-        if 2 * (stop - start) < hold and values[start:stop].max() < MARGIN * threshold:
+        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_MARGIN * threshold:
             touched[start:stop] = False
 
 
@@ -276,7 +284,7 @@ def summarize_contacts(
     for start, stop in find_runs_of_true(touched):
         wrench = contact[start:stop]
         forces = np.linalg.norm(wrench[:, :3], axis=1)
-        direction, point, _ = wrench_axis(wrench[np.argmax(forces)])
+        direction, point, _ = central_axis_of_wrenches(wrench[np.argmax(forces)])
         known = bool(np.isfinite(direction).all())
         rows.append(
             {

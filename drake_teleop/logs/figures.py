@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import (
-    PARAMETERS,
-    SIGNIFICANT,
+    PARAMETER_NAMES,
+    SIGNIFICANT_DEVIATIONS,
     Identification,
     com_deviations,
     consistency_margin,
@@ -58,7 +58,7 @@ def figures_of_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
 
 def load_figures(load: Identification) -> dict[str, Any]:
     deviations = load.standard_deviations
-    ends = intervals(load)
+    ends = confidence_intervals(load)
     return {
         "mass": load.mass,
         "mass_std": deviations[6],
@@ -68,7 +68,7 @@ def load_figures(load: Identification) -> dict[str, Any]:
         "phi": load.phi,
         "phi_std": deviations[6:],
         "phi_interval": np.stack(ends, axis=1)[6:],
-        "verdicts": dict(zip(PARAMETERS, load.verdicts, strict=True)),
+        "verdicts": dict(zip(PARAMETER_NAMES, load.verdicts, strict=True)),
         "identifiable": _parameter_names(load, True),
         "not_identifiable": _parameter_names(load, False),
         "physically_consistent": load.physically_consistent,
@@ -79,13 +79,13 @@ def figures_of_object_alone(alone: Identification) -> dict[str, Any]:
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
-        figures[name] = [entry for entry in figures[name] if entry in PARAMETERS[6:]]
+        figures[name] = [entry for entry in figures[name] if entry in PARAMETER_NAMES[6:]]
     return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
 
 
 def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < SIGNIFICANT * deviation:
+    if alone.mass < SIGNIFICANT_DEVIATIONS * deviation:
         return [
             f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
             f" ± {deviation:.2g} kg"
@@ -93,7 +93,7 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
-    if margin < -SIGNIFICANT * deviation:
+    if margin < -SIGNIFICANT_DEVIATIONS * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
             " identified in the same sensor frame, with the same gripper"
@@ -102,7 +102,7 @@ def notes_on_object_alone(alone: Identification) -> list[str]:
 
 
 def _parameter_names(result: Identification, identifiable: bool) -> list[str]:
-    pairs = zip(PARAMETERS, result.identifiable, strict=True)
+    pairs = zip(PARAMETER_NAMES, result.identifiable, strict=True)
     return [name for name, flag in pairs if bool(flag) == identifiable]
 
 

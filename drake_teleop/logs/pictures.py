@@ -25,9 +25,9 @@ from drake_teleop.common.style import (
     plot_style,
     shade_contact,
 )
-from drake_teleop.load.batch.uncertainty import intervals
-from drake_teleop.load.contact.noise_floor import STATISTICS
-from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
+from drake_teleop.load.batch.uncertainty import confidence_intervals
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
+from drake_teleop.load.identification import VERDICT_NAMES, Identification, natural_scales
 from drake_teleop.logs.processing import DetectedLog, EliminatedLog, IdentifiedLog
 from drake_teleop.logs.read.canonical import Log
 
@@ -38,10 +38,10 @@ _SYMBOLS = (
     *("$m$", "$m c_x$", "$m c_y$", "$m c_z$"),
     *(f"$I_{{{axes}}}$" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
-VERDICT_COLOURS = dict(zip(VERDICTS, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
+VERDICT_COLOURS = dict(zip(VERDICT_NAMES, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
 VERDICT_WORDS = dict(
     zip(
-        VERDICTS,
+        VERDICT_NAMES,
         ("identified", "weakly identified", "not identified", "mostly the prior's"),
         strict=True,
     )
@@ -135,9 +135,9 @@ def _draw_knowledge_into(figure: Any, found: IdentifiedLog) -> None:
 
 
 def _draw_parameters(figure: Any, result: Identification) -> None:
-    natural = natural_scale(result.phi)
+    natural = natural_scales(result.phi)
     theta = np.concatenate([result.offsets, result.phi]) / natural
-    low, high = (end / natural for end in intervals(result))
+    low, high = (end / natural for end in confidence_intervals(result))
     deviations = result.standard_deviations / natural
     rows = np.arange(16)
     colours = [VERDICT_COLOURS[verdict] for verdict in result.verdicts]
@@ -165,7 +165,7 @@ def _draw_parameters(figure: Any, result: Identification) -> None:
     right.set_title("Standard deviation over the natural scale", pad=16)
     handles = [
         Patch(color=VERDICT_COLOURS[verdict], label=VERDICT_WORDS[verdict])
-        for verdict in VERDICTS
+        for verdict in VERDICT_NAMES
         if verdict in result.verdicts
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
@@ -227,7 +227,7 @@ def draw_detection(found: DetectedLog) -> Any:
         top.set_ylim(bottom=0.0)
         top.set_ylabel("$|F|$ [N]")
         top.set_title("dotted: the same threshold for all motions")
-        below.plot(t, found.statistics[inner, STATISTICS.index(found.statistic)], color=BLUE)
+        below.plot(t, found.statistics[inner, STATISTIC_NAMES.index(found.statistic)], color=BLUE)
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set_ylabel(f"{found.statistic} [standard deviations]")
         below.set_xlabel("time [s]")

@@ -19,11 +19,11 @@ from drake_teleop.load.compensation import (
     contact_wrench,
     scaled_wrench,
     scales_from_eta,
-    unknown_gravity,
+    unknown_gravity_error,
     weight_and_inertia_scales,
 )
-from drake_teleop.load.contact.noise_floor import finite_covariance, statistic_index
-from drake_teleop.load.identification import PARAMETERS, Identification, identified_object
+from drake_teleop.load.contact.noise_floor import limit_covariance, statistic_index
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
@@ -368,7 +368,7 @@ def eliminate_log(
     phi_gripper = np.zeros(10)
     if gripper is not None:
         alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
-        identified_object(identification, alone)  # raises an error for exchanged files
+        load_of_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = usable_phi(alone)[0]
     eliminated = partial(
         _eliminate_read_log,
@@ -400,8 +400,8 @@ def eliminate_log(
     reference = None
     if free_motion is not None:
         free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
-        reference = free_samples.at(~free_motion.edge), free_motion.log.dt
-    covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
+        reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
+    covariance = limit_covariance(found.phi, identification.covariance, tared=tare)
     options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
     usual = identification.residual_rms
     detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
@@ -550,7 +550,7 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
-    return phi, tuple(PARAMETERS[10 + i] for i in replaced)
+    return phi, tuple(PARAMETER_NAMES[10 + i] for i in replaced)
 
 
 def _suspected_errors(
@@ -581,7 +581,7 @@ def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
     if removed:
         raise weight_scale_error(log.source)
     if log.gravity is None:
-        raise unknown_gravity(
+        raise unknown_gravity_error(
             f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from drake_teleop.common.files import write_text
 from drake_teleop.common.html import png_data_url, render_page
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
@@ -44,7 +44,7 @@ class ParameterRow:
 def parameter_rows(load: Identification) -> list[ParameterRow]:
     """Return the 16 rows of [offsets; phi], Eq. (7), without values of unidentified parameters."""
     theta = np.concatenate([load.offsets, load.phi])
-    columns = np.stack([theta, load.standard_deviations, *intervals(load)], axis=1)
+    columns = np.stack([theta, load.standard_deviations, *confidence_intervals(load)], axis=1)
     rows = []
     for (symbol, index, unit, scale), values, verdict in zip(
         _PARAMETER_LABELS, columns, load.verdicts, strict=True
@@ -110,7 +110,7 @@ def write_report(
         tiles=_summary_tiles(result),
         notes=summary["notes"],
         tables=tables,
-        determined=found.base.lines(),
+        determined=found.base.text_lines(),
         figures=[
             (
                 "Fit",

@@ -19,7 +19,11 @@ from drake_teleop.common.interruption import INTERRUPTED
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
-from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
+from drake_teleop.load.tolerance import (
+    Tolerance,
+    derivatives_over_tolerances,
+    deviations_over_tolerances,
+)
 from drake_teleop.logs.causes.cause import CHANGE_CAUSES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_pass_log
@@ -83,7 +87,7 @@ def evaluate_record(
     delay: str | float,
 ) -> Evaluation:
     """Identify the load of a record and compare its uncertainty with the tolerance."""
-    count, found, why = len(tolerance.entries), None, ""
+    count, found, why = len(tolerance.required_entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
     except DrakeTeleopError as error:
@@ -109,7 +113,9 @@ def evaluate_record(
     elif changes:
         advice = _START_AGAIN.format(t=min(changes))
     else:
-        advice = best_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
+        advice = best_motion(
+            log.motion, log.dt, cutoff_hz, derivatives_over_tolerances(tolerance, phi), noise
+        )
     t = 0.0 if log is None else float(log.t[-1])
     return Evaluation(t, found, why, half, sure, known, doubts, advice)
 
@@ -117,8 +123,8 @@ def evaluate_record(
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
     """Return half-widths (k,) of both intervals over the tolerances, and degrees of freedom."""
     load = found.identification
-    errors = errors_of(tolerance, load.phi)
-    deviations = deviations_of(errors, load.covariance)
+    errors = derivatives_over_tolerances(tolerance, load.phi)
+    deviations = deviations_over_tolerances(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
     half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, CONFIDENCE))
@@ -154,7 +160,7 @@ def best_motion(
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
     for words, of_motion in _candidate_motions(last, noise, rate):
-        left = deviations_of(errors, np.linalg.inv(gram + of_motion))
+        left = deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
             best, least = words, cost

@@ -15,7 +15,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import yaml_text
-from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
 STANDARD_GRAVITY = 9.80665  #: m/s^2
@@ -115,12 +115,14 @@ def refuse_removed_weight(found: Identification, to: str) -> None:
 
 
 def _warnings(found: Identification, to: str, format: Format) -> list[str]:
-    written = {name: name.startswith(("m", "I")) for name in PARAMETERS}
-    written |= {name: format.inertia for name in PARAMETERS if name.startswith("I")}
-    written |= {name: format.offsets for name in PARAMETERS if name.endswith(("_ox", "_oy", "_oz"))}
+    written = {name: name.startswith(("m", "I")) for name in PARAMETER_NAMES}
+    written |= {name: format.inertia for name in PARAMETER_NAMES if name.startswith("I")}
+    written |= {
+        name: format.offsets for name in PARAMETER_NAMES if name.endswith(("_ox", "_oy", "_oz"))
+    }
     warnings = [
         f"{name} is not identified ({verdict}): do not use values that depend on it"
-        for name, verdict in zip(PARAMETERS, found.verdicts, strict=True)
+        for name, verdict in zip(PARAMETER_NAMES, found.verdicts, strict=True)
         if written[name] and verdict != "identified"
     ]
     if not format.inertia:

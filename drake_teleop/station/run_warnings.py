@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from drake_teleop.common.blocks import MEANINGS, Fault
 from drake_teleop.common.numeric import contact_spans
-from drake_teleop.load.regressor import LOST
+from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale
 from drake_teleop.station.contact_chatter import find_chatter
@@ -125,7 +125,7 @@ def _check_limits(
 ) -> Iterator[tuple[str, Spans]]:
     t = result.t
     flag = result["saturated"][:, 0]
-    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST))
+    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status

@@ -9,12 +9,12 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.regressor import sample_parts
+from drake_teleop.load.regressor import signals_of_sample
 from drake_teleop.station.signals import LOG, POSE_OF, SIGNALS
 
 #: Ports with several signals, in the order of `SIGNALS`: reading one port is faster than its parts.
 COMBINED_PORTS = {
-    "sample": (*sample_parts(0), "sample_time"),
+    "sample": (*signals_of_sample(0), "sample_time"),
     "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
     "displayed_and_fault": ("force_to_master", "fault_at_hand"),
 }

@@ -335,7 +335,7 @@ def test_identification_refuses_an_unsuitable_trajectory(short):
         identify_load(scenario, trajectory=short.trajectory)
     fitting = replace(scenario, simulation__duration=2.4)
     with pytest.raises(DrakeTeleopError, match=r"trajectory: it uses 1\d\d\.\d% of its"):
-        identify_load(fitting, trajectory=short.trajectory.scaled(1.1))
+        identify_load(fitting, trajectory=short.trajectory.with_scaled_amplitudes(1.1))
     with pytest.raises(DrakeTeleopError, match="it has 5 joints, the arm 6"):
         less = {name: getattr(short.trajectory, name)[:5] for name in ("q0", "rho", "delta")}
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))

@@ -135,7 +135,7 @@ LIMITS = {
     "pose_motion.splines._CHUNK_ROWS": 260,
     "posed_fit._MIN_KEPT_SAMPLES": 300,
     "posed_fit._CHUNK": 70,
-    "posed_fit._NEIGHBOURS": 30,
+    "posed_fit._FILTER_NEIGHBOURS": 30,
 }
 """What an hour at 1 kHz is too long for, so low that 10 s are."""
 

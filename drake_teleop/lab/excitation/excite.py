@@ -165,7 +165,7 @@ def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajector
             continue
         last[iterate.start] = iterate.value
         for factor in _SHRINK_FACTORS:
-            trajectory = iterate.trajectory.scaled(factor)
+            trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
             if _largest_use(robot, trajectory) <= 1:
                 yield trajectory
                 checks += 1

@@ -41,7 +41,11 @@ from drake_teleop.lab.excitation.prediction import (
 )
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
-from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
+from drake_teleop.load.tolerance import (
+    Tolerance,
+    derivatives_over_tolerances,
+    deviations_over_tolerances,
+)
 from drake_teleop.load.trajectory import FourierTrajectory
 
 RELIABLE = 0.95
@@ -89,7 +93,9 @@ def shortest(
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = errors_of(tolerance, robot.limits.phi) * reliable_factor(len(tolerance.entries))
+    errors = derivatives_over_tolerances(tolerance, robot.limits.phi) * reliable_factor(
+        len(tolerance.required_entries)
+    )
     factor = np.ones(len(errors))
     task = Task(
         robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
@@ -110,7 +116,7 @@ def shortest(
         trajectory, uses = best_checked(robot, found)
         motion = sensor_motion(robot, trajectory)
         covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
-        reached = deviations_of(errors, covariance)
+        reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
         around = problem.best if worst < _MAX_START_MISFIT else None
         if worst <= 1.0:

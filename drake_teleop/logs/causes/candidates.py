@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import signed_permutations
-from drake_teleop.load.identification import natural_scale
+from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.changes import add_step, find_contact_spans
 from drake_teleop.logs.causes.instants import CONSTANT_COLUMN, FORCES, G, R, S
 from drake_teleop.logs.causes.model import Model
@@ -141,7 +141,7 @@ def has_negative_inertia(state: State) -> bool:
     # The derivative of n^T I n by the six entries.
     slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
     deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
-    smallest = _NEGATIVE_SHARE * natural_scale(state.x[6:16])[10]
+    smallest = _NEGATIVE_SHARE * natural_scales(state.x[6:16])[10]
     return bool(least[0] < -max(_NEGATIVE_DEVIATIONS * deviation, smallest))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
-from drake_teleop.load.identification import natural_scale
+from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_similar_torque_factors
 from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
 from drake_teleop.logs.causes.model import LOAD_PARAMETERS
@@ -131,7 +131,7 @@ def attenuation_bias(state: State) -> Array:
 def misfit_factor(state: State, blocks: Array) -> float:
     """Return the factor that widens all standard deviations; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD_PARAMETERS])
-    shown = deviations < natural_scale(state.x[6:16])
+    shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0
     if shown.any():
         spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))

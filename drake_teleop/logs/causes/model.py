@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.moments import centripetal_matrix, coefficients
+from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA,
     CONSTANT_COLUMN,
@@ -45,7 +45,7 @@ _R_OF_STEP = slice(16, 25)
 _LARGEST_DELAY = 0.03  # s, in an iteration
 _ROTATION_STEP = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
-_REGRESSOR_TENSOR = coefficients()[:, 6:, 7:19]
+_REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
 _SYMMETRIC_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 

@@ -254,7 +254,7 @@ def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUn
 
 
 def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUnit]:
-    """Return three columns of angles, named as in `_EULER` after a common prefix."""
+    """Return three columns of angles, named as in `_EULER_ANGLE_NAMES` after a common prefix."""
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
         prefix, _, end = words.rpartition("_")

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.contact.detection import MAX_NOISE_LEVEL, fit_noise_floor
-from drake_teleop.load.contact.noise_floor import NoiseFloor, Samples, finite_covariance
+from drake_teleop.load.contact.noise_floor import DetectorSamples, NoiseFloor, limit_covariance
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
@@ -99,8 +99,8 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
         _contact_free_samples(episodes[k], x, phi, typical)
         for k, x in zip(chosen, usual, strict=True)
     ]
-    pooled = Samples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
-    floor = fit_noise_floor(*pooled, finite_covariance(phi, load.covariance, tared=True), fade=0.0)
+    pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
+    floor = fit_noise_floor(*pooled, limit_covariance(phi, load.covariance, tared=True), fade=0.0)
     threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_MARGIN * float(floor.reached[0]))
     return SharedLoad(load, phi, spacing, lag, typical, floor, threshold)
 
@@ -203,16 +203,16 @@ def _fit_load_to_members(
 
 def _contact_free_samples(
     signals: EpisodeSignals, x: Hypothesis, phi: Array, typical: Array
-) -> Samples:
+) -> DetectorSamples:
     residual = (
         unexplained_reading(x, signals.reading_predictor(phi), signals.regressor_at_lag) - x.offsets
     )
     far = (np.abs(residual) > _FREE_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL).any(axis=1)
     near = np.convolve(far, np.ones(2 * _CONTACT_MARGIN_FRAMES + 1), "same") > 0.5
-    return samples_for_detector(signals, x.lag, residual).at(~near)
+    return samples_for_detector(signals, x.lag, residual).select_rows(~near)
 
 
-def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> Samples:
+def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> DetectorSamples:
     """Return the input of the contact detector for a contact wrench (N, 6)."""
     at = signals.motion_at_lag(lag)
-    return Samples(contact, at.s, at.omega, at.alpha, at.s + at.gravity)
+    return DetectorSamples(contact, at.s, at.omega, at.alpha, at.s + at.gravity)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, gain_effects
-from drake_teleop.load.moments import centripetal_matrix, coefficients
+from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, parameter_errors_by_gains
+from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.pose_motion.linear_model import LinearFit, rounding_error_power
 from drake_teleop.logs.pose_motion.spectra import (
     FORCE_COLUMNS,
@@ -122,7 +122,7 @@ def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
 def _coefficients_of(phi: Array) -> Array:
     theta = np.concatenate([np.zeros(6), phi])
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
-    return np.asarray(np.einsum("cjk,j->ck", coefficients(), theta) @ M)
+    return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
 
 
 def _rotated_products(R: Array) -> Array:
@@ -243,7 +243,7 @@ def _motion_map_with_delay(state: RigidParameters) -> Array:
 
 
 def _residual_coefficients(state: RigidParameters) -> Array:
-    L = -np.einsum("cjk,j->ck", coefficients(), state.theta)
+    L = -np.einsum("cjk,j->ck", regressor_coefficients(), state.theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     return L
 
@@ -252,7 +252,7 @@ def _residual_derivative(state: RigidParameters) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and the residual e (6, 38), in coefficients of y."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
     B = np.zeros((6, NUM_PARAMETERS, MOMENTS_SIZE))
-    B[:, LOAD_PARAMETERS] = coefficients() @ M
+    B[:, LOAD_PARAMETERS] = regressor_coefficients() @ M
     B[:, DELAY_PARAMETER, SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
         lever = _motion_map_with_delay(replace(state, r=state.r + unit)) - M
@@ -320,7 +320,7 @@ def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     BF = (B.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, FORCE_COLUMNS].reshape(
         len(Z), 6, NUM_PARAMETERS, 6
     )
-    return gain_effects(BF, W, inverse)
+    return parameter_errors_by_gains(BF, W, inverse)
 
 
 def _misfit_of_gains(record: _FitData, solution: _Solution, gain: float) -> float:

@@ -27,7 +27,7 @@ from drake_teleop.logs.read.canonical import Log
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
 _MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
 Pairs = list[tuple[Array, Array]]
-"""Signal of the pose and of the IMU, for each sensor, see `signal_pairs`."""
+"""Signal of the pose and of the IMU, for each sensor, see `comparable_signals`."""
 
 
 def comparable_signals(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:

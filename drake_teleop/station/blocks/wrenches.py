@@ -16,7 +16,7 @@ from drake_teleop.common.numeric import finite_array
 from drake_teleop.load.compensation import (
     add_weight_into,
     scaled_wrench_into,
-    unknown_gravity,
+    unknown_gravity_error,
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
@@ -167,7 +167,7 @@ def WrenchScaling_(T: Any) -> Any:
             excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
             if any(excess):
                 if not self._orientation.HasValue(context):
-                    raise unknown_gravity("WrenchScaling: gravity in S", "connect R_WS")
+                    raise unknown_gravity_error("WrenchScaling: gravity in S", "connect R_WS")
                 gravity = self._R_WS(context).T @ self._gravity_W
                 parts = self._parts(self._inputs[-1].Eval(context))
                 _for_scalar(add_weight_into, T)(gravity, *parts, *excess, wrench)

@@ -26,15 +26,15 @@ from drake_teleop.load.compensation import (
     weight_and_inertia_scales,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    BEFORE_JOINTS,
-    LOST,
-    MOTION,
-    SATURATED,
-    SPECIFIC_FORCE,
-    TIME,
-    WRENCH,
+    FIRST_JOINT_INDEX,
+    LOST_SAMPLE_FLAG,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_MOTION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_TIME_INDEX,
+    SAMPLE_WRENCH,
+    SATURATION_FLAG_INDEX,
     non_contact_wrench_into,
     sample_size,
 )
@@ -158,14 +158,15 @@ def _scaled_into(sample, estimate, gripper, arm, scales, out):
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
     scaled_wrench_into(
-        sample[WRENCH], estimate[:6],
-        sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION],
+        sample[SAMPLE_WRENCH], estimate[:6],
+        sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY],
+        sample[SAMPLE_ANGULAR_ACCELERATION],
         phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
     )  # fmt: skip
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
         gravity = np.empty(3)
-        acceleration_into(arm, sample[BEFORE_JOINTS:TIME], np.zeros(3), gravity)
+        acceleration_into(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.zeros(3), gravity)
         add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
@@ -175,14 +176,16 @@ def find_fault(sample, estimate, time, valid_range):
 
     `valid_range` (7,) contains the largest wrench [N, N m] and age [s].
     """
-    if not abs(time - sample[TIME]) <= valid_range[6]:
+    if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
         return _STALE
-    reading = sample[SATURATED] < LOST and all_in_range(sample[MOTION])
+    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG and all_in_range(
+        sample[SAMPLE_MOTION]
+    )
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
         return _READING
-    if not all_in_range(sample[BEFORE_JOINTS:TIME]):
+    if not all_in_range(sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]):
         return _JOINTS
     return _NONE if all_in_range(estimate) else _LOAD
 
@@ -210,7 +213,7 @@ def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_ran
     scales_at(change, time, scales)
     scales[2] *= contact
     _scaled_into(sample, estimate, gripper, arm, scales, scaled_S)
-    forward_kinematics(arm, sample[BEFORE_JOINTS:TIME], R_WS, p_WS)
+    forward_kinematics(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
 
@@ -329,9 +332,9 @@ class ForceScaling(LeafSystem):
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
         non_contact_wrench_into(
-            sample[SPECIFIC_FORCE],
-            sample[ANGULAR_VELOCITY],
-            sample[ANGULAR_ACCELERATION],
+            sample[SAMPLE_SPECIFIC_FORCE],
+            sample[SAMPLE_ANGULAR_VELOCITY],
+            sample[SAMPLE_ANGULAR_ACCELERATION],
             phi,
             output.get_mutable_value(),
         )

@@ -27,13 +27,13 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    JOINT_POSITION,
-    MOTION,
-    SATURATED,
-    SPECIFIC_FORCE,
-    WRENCH,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_JOINT_POSITION,
+    SAMPLE_MOTION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH,
+    SATURATION_FLAG_INDEX,
 )
 from drake_teleop.station.sensor.sensor_chain import (
     READ_ANGLES,
@@ -276,7 +276,7 @@ def estimate_into(constants, memory, arm, reading, sample):
     """
     n = arm.shape[0] - 1
     motion, joints = memory[_MOTION:_JOINTS], memory[_JOINTS:][: _PER_JOINT * n]
-    angles = sample[JOINT_POSITION]
+    angles = sample[SAMPLE_JOINT_POSITION]
     _align_paths(constants, memory, n, reading, sample)
     if memory[0] == 0.0:
         for i in range(3 * n):
@@ -284,7 +284,7 @@ def estimate_into(constants, memory, arm, reading, sample):
     _differentiate(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
     if constants[_ENCODERS] != 0.0:
-        copy_into(sample, MOTION.start, motion, 0, 9)
+        copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
     else:
         _convert_accelerometer(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
@@ -296,17 +296,17 @@ def estimate_with_gyroscope_into(constants, memory, reading, sample):
 
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
-    n = sample.shape[0] - JOINT_POSITION.start
+    n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
     motion = memory[_MOTION:_JOINTS]
     _align_paths(constants, memory, n, reading, sample)
-    copy_into(motion, 3, sample, JOINT_POSITION.start, 3)
+    copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
     _convert_accelerometer(constants, memory, motion[:3], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
 def _align_paths(constants, memory, n, reading, sample):
-    sections, angles = constants[_LOW_PASSES:_ANGULAR_GAINS], sample[JOINT_POSITION]
+    sections, angles = constants[_LOW_PASSES:_ANGULAR_GAINS], sample[SAMPLE_JOINT_POSITION]
     filtered = memory[_JOINTS:][: _PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
@@ -317,7 +317,7 @@ def _align_paths(constants, memory, n, reading, sample):
 
 @njit(cache=True)
 def _delay_paths(constants, memory, n, reading, sample):
-    angles, width = sample[JOINT_POSITION], 12 + n
+    angles, width = sample[SAMPLE_JOINT_POSITION], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)
@@ -330,7 +330,7 @@ def _delay_paths(constants, memory, n, reading, sample):
             copy_into(line, k * width, line, 0, width)
     wrench = int(constants[_DELAYS]) * width
     acceleration = int(constants[_DELAYS + 1]) * width
-    waited, read = sample[WRENCH], sample[MOTION]
+    waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
@@ -342,7 +342,7 @@ def _delay_paths(constants, memory, n, reading, sample):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
     flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES] - 1.0
     memory[_FLAG_SAMPLES] = max(flagged, 0.0)
-    sample[SATURATED] = 1.0 if memory[_FLAG_SAMPLES] > 0.0 else 0.0
+    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAG_SAMPLES] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -359,7 +359,11 @@ def _differentiate(constants, joints, angles):
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
-    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    s, omega, alpha = (
+        sample[SAMPLE_SPECIFIC_FORCE],
+        sample[SAMPLE_ANGULAR_VELOCITY],
+        sample[SAMPLE_ANGULAR_ACCELERATION],
+    )
     R_SA, R = matrix_at(constants, _ORIENTATION), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))

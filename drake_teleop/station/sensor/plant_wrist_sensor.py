@@ -40,17 +40,17 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    JOINT_POSITION,
-    LOST,
-    SATURATED,
-    SPECIFIC_FORCE,
-    TIME,
-    WRENCH,
-    WRENCH_AND_MOTION,
-    sample_parts,
+    LOST_SAMPLE_FLAG,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_JOINT_POSITION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_TIME_INDEX,
+    SAMPLE_WRENCH,
+    SAMPLE_WRENCH_AND_MOTION,
+    SATURATION_FLAG_INDEX,
     sample_size,
+    signals_of_sample,
 )
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
@@ -183,7 +183,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         constants, chain = sensor_chain(config, 3 + n, self.period)
         motion, estimator = motion_estimator(MotionEstimationConfig(), config, 3 + n, self.period)
         sample = np.zeros(sample_size(n) + 1)
-        sample[SATURATED] = LOST
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
         held = np.full(_POSE_SIZE + n, np.nan)
         ends = np.cumsum([len(held), len(sample), len(chain), len(estimator)]).tolist()
         self._held, self._sample = slice(0, ends[0]), slice(ends[0], ends[1])
@@ -208,7 +208,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         if self._pairs_steps:
             self.DeclareInitializationDiscreteUpdateEvent(self._hold_configuration)
         first = 0
-        for name, size in {**sample_parts(n), "sample_time": 1}.items():
+        for name, size in {**signals_of_sample(n), "sample_time": 1}.items():
             self._declare_output("status" if name == "saturated" else name, first, size)
             first += size
         self._declare_output("sample", 0, first)
@@ -254,8 +254,8 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         truth = np.empty(TRUE_ANGLES.start + 3 + self._n)
         _true_values_into(geometry, configuration, acceleration, force, truth)
         sample = memory[self._sample]
-        _sample_into(self._sensor, truth, noise, memory[self._filters], sample[:TIME])
-        sample[TIME] = context.get_time()
+        _sample_into(self._sensor, truth, noise, memory[self._filters], sample[:SAMPLE_TIME_INDEX])
+        sample[SAMPLE_TIME_INDEX] = context.get_time()
 
 
 @njit(cache=True)
@@ -277,11 +277,11 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
     )
     tau = plus(tau, cross(vector_at(geometry, _JOINT_POSITION), f))
     for i in range(3):
-        truth[WRENCH.start + i] = geometry[_SIGN] * f[i]
-        truth[WRENCH.start + 3 + i] = geometry[_SIGN] * tau[i]
-        truth[SPECIFIC_FORCE.start + i] = s[i]
-        truth[ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
-        truth[ANGULAR_ACCELERATION.start + i] = alpha[i]
+        truth[SAMPLE_WRENCH.start + i] = geometry[_SIGN] * f[i]
+        truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_SIGN] * tau[i]
+        truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
+        truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
+        truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
     copy_into(
         truth, TRUE_ANGLES.start + 3, configuration, _POSE_SIZE, configuration.shape[0] - _POSE_SIZE
     )
@@ -291,23 +291,23 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
 def _sample_into(sensor, truth, noise, memory, sample):
     """Write the sample (16 + n,) for true values whose first three "angles" are omega."""
     constants, motion_constants, end, ideal = sensor
-    n = sample.shape[0] - JOINT_POSITION.start
+    n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
     if not is_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATED] = LOST + LOST_FLAG_SAMPLES
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
-    lost = sample[SATURATED] - 1.0
+    lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
-        copy_into(sample, 0, truth, 0, WRENCH_AND_MOTION.stop)
-        sample[SATURATED] = 0.0
-        copy_into(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
+        copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
+        sample[SATURATION_FLAG_INDEX] = 0.0
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
     else:
         reading, estimate = np.empty(truth.shape[0] - 2), np.empty(truth.shape[0] + 1)
         read_into(constants, memory[:end], noise, truth, reading)
         estimate_with_gyroscope_into(motion_constants, memory[end:], reading, estimate)
-        copy_into(sample, 0, estimate, 0, JOINT_POSITION.start)
-        copy_into(sample, JOINT_POSITION.start, estimate, JOINT_POSITION.start + 3, n)
-    if lost >= LOST:
-        sample[SATURATED] = lost
+        copy_into(sample, 0, estimate, 0, SAMPLE_JOINT_POSITION.start)
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, estimate, SAMPLE_JOINT_POSITION.start + 3, n)
+    if lost >= LOST_SAMPLE_FLAG:
+        sample[SATURATION_FLAG_INDEX] = lost
 
 
 def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:

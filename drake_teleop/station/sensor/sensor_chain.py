@@ -32,10 +32,10 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    SPECIFIC_FORCE,
-    WRENCH,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH,
 )
 
 #: Samples per block of random numbers: one event of a noise source, one step of a walk.
@@ -394,9 +394,9 @@ def read_into(constants, memory, noise, truth, reading):
     """
     angles = truth[TRUE_ANGLES]
     if constants[_IDEAL] != 0.0:
-        copy_into(reading, READ_WRENCH.start, truth, WRENCH.start, 6)
-        copy_into(reading, READ_ACCELERATION.start, truth, SPECIFIC_FORCE.start, 3)
-        copy_into(reading, READ_ACCELERATION.start + 3, truth, ANGULAR_ACCELERATION.start, 3)
+        copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
+        copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
+        copy_into(reading, READ_ACCELERATION.start + 3, truth, SAMPLE_ANGULAR_ACCELERATION.start, 3)
         reading[READ_SATURATED] = 0.0
         copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
@@ -459,8 +459,8 @@ def shift_delay_line(line, width):
 
 @njit(cache=True)
 def _apply_calibration_errors(constants, truth, out):
-    wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
-    omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
+    wrench, s = truth[SAMPLE_WRENCH], truth[SAMPLE_SPECIFIC_FORCE]
+    omega, alpha = truth[SAMPLE_ANGULAR_VELOCITY], truth[SAMPLE_ANGULAR_ACCELERATION]
     for i in range(6):
         value = 0.0
         for j in range(6):

@@ -37,19 +37,19 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    BEFORE_JOINTS,
-    JOINT_POSITION,
-    LOST,
-    MOTION,
-    SATURATED,
-    SPECIFIC_FORCE,
-    WRENCH,
-    WRENCH_AND_MOTION,
+    FIRST_JOINT_INDEX,
+    LOST_SAMPLE_FLAG,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_JOINT_POSITION,
+    SAMPLE_MOTION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH,
+    SAMPLE_WRENCH_AND_MOTION,
+    SATURATION_FLAG_INDEX,
     non_contact_wrench_into,
-    sample_parts,
     sample_size,
+    signals_of_sample,
 )
 from drake_teleop.station.environment.moving_bodies import interpolate_bodies
 from drake_teleop.station.sensor.motion_estimation import (
@@ -109,9 +109,13 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
     `phi` (10,) are the tool's inertial parameters.
     """
     sensor_motion(arm, q, v, vdot, motion)
-    copy_into(out, MOTION.start, motion, 0, 9)
-    s, omega, alpha = out[SPECIFIC_FORCE], out[ANGULAR_VELOCITY], out[ANGULAR_ACCELERATION]
-    wrench = out[WRENCH]
+    copy_into(out, SAMPLE_MOTION.start, motion, 0, 9)
+    s, omega, alpha = (
+        out[SAMPLE_SPECIFIC_FORCE],
+        out[SAMPLE_ANGULAR_VELOCITY],
+        out[SAMPLE_ANGULAR_ACCELERATION],
+    )
+    wrench = out[SAMPLE_WRENCH]
     non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
@@ -144,28 +148,32 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     n = half - 1
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
-    rigid = truth[WRENCH_AND_MOTION]
+    rigid = truth[SAMPLE_WRENCH_AND_MOTION]
     true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), rigid)
     copy_into(truth, TRUE_ANGLES.start, x, 0, n)
-    size = BEFORE_JOINTS + n
+    size = FIRST_JOINT_INDEX + n
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
     if not is_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATED] = LOST + LOST_FLAG_SAMPLES
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
-    lost = sample[SATURATED] - 1.0
+    lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
         copy_into(
-            sample, WRENCH_AND_MOTION.start, truth, WRENCH_AND_MOTION.start, WRENCH_AND_MOTION.stop
+            sample,
+            SAMPLE_WRENCH_AND_MOTION.start,
+            truth,
+            SAMPLE_WRENCH_AND_MOTION.start,
+            SAMPLE_WRENCH_AND_MOTION.stop,
         )
-        sample[SATURATED] = 0.0
-        copy_into(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
+        sample[SATURATION_FLAG_INDEX] = 0.0
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
     else:
         reading = np.empty(13 + n)
         read_into(constants, memory[2 * size : middle], noise, truth, reading)
         estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
-    if lost >= LOST:
-        sample[SATURATED] = lost
+    if lost >= LOST_SAMPLE_FLAG:
+        sample[SATURATION_FLAG_INDEX] = lost
 
 
 @njit(cache=True)
@@ -218,7 +226,7 @@ def sample_step(
         result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
-    size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
+    size, half, tau, joints = FIRST_JOINT_INDEX + n, n + 1, scratch[7, :n], physics[4]
     extra = around.shape[0] - 2
     full = 2 * half + extra
     width = 1 + full
@@ -323,7 +331,7 @@ class WristSensor(LeafSystem):
         self._physics, contact = slave.physics, slave.contact
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
-            first[WRENCH] += config.offset
+            first[SAMPLE_WRENCH] += config.offset
         # Contact needs many steps per torque sample, so queueing them saves time.
         self._beyond_contact_law = contact.beyond
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
@@ -411,7 +419,7 @@ class WristSensor(LeafSystem):
         _, _, chain_end, end, _ = self._sensor
         size = sample_size(self._n)
         before_and_walks = range(size, 2 * size + FILTERED)
-        others = [SATURATED, *before_and_walks, chain_end, chain_end + 1]
+        others = [SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
@@ -559,9 +567,9 @@ class WristSensor(LeafSystem):
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
-    touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[WRENCH_AND_MOTION]
+    touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[SAMPLE_WRENCH_AND_MOTION]
     true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
-    sample[JOINT_POSITION] = q
+    sample[SAMPLE_JOINT_POSITION] = q
     return sample
 
 
@@ -599,7 +607,7 @@ def AddCompiledWristSensor(
         builder.Connect(
             slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
         )
-    parts = sample_parts(slave.arm.num_joints)
+    parts = signals_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
     rest = step.size() - sum(sizes)
