@@ -32,7 +32,7 @@ from drake_teleop.cli import main as cli
 from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 from drake_teleop.common.files import models_dir, scenarios_dir, studies_dir
 from drake_teleop.common.parquet_sizes import check_parquet_content
-from drake_teleop.common.texts import read_json, yaml_data
+from drake_teleop.common.texts import parse_yaml, read_json
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
 from drake_teleop.live.inputs import RANGES, Inputs, csv_header, range_of, read_inputs
@@ -98,7 +98,7 @@ def _scenario(path: Path) -> None:
     if path.stat().st_size % 4:  # the rest takes longer
         return
     text = commented(scenario)
-    if ScenarioFromData(yaml_data(text, "printed", tagged=True), "printed") != scenario:
+    if ScenarioFromData(parse_yaml(text, "printed", tagged=True), "printed") != scenario:
         raise AssertionError("what `drake-teleop scenario` prints is another scenario")
 
 

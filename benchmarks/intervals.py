@@ -3,8 +3,8 @@
 `python benchmarks/intervals.py [--json FILE] [--seeds N]` identifies the same load N times (500)
 from the same motion with new noise of six colours, counts for each of the 16 parameters how often
 the interval of `uncertainty.confidence_intervals` holds the truth, and prints the table. With 500
-seeds the standard error of a count is 1 %. Then records that do not excite some parameters, in the same
-noise: how often each of these was called identified.
+seeds the standard error of a count is 1 %. Then records that do not excite some parameters, in the
+same noise: how often each of these was called identified.
 """
 
 from __future__ import annotations

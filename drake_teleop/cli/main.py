@@ -13,8 +13,8 @@ from typing import Any
 import click
 
 from drake_teleop.cli import options as option
-from drake_teleop.common.errors import DrakeTeleopError, one_line
-from drake_teleop.common.interruption import INTERRUPTED, install_handlers
+from drake_teleop.common.errors import DrakeTeleopError, to_one_line
+from drake_teleop.common.interruption import INTERRUPTED_EVENT, install_handlers
 from drake_teleop.common.version import __version__
 
 
@@ -790,7 +790,7 @@ def main(arguments: list[str] | None = None) -> None:
         try:
             status = _run(arguments)
         finally:
-            INTERRUPTED.clear()
+            INTERRUPTED_EVENT.clear()
     sys.exit(status if isinstance(status, int) else 0)
 
 
@@ -813,5 +813,5 @@ def _run(arguments: list[str] | None) -> Any:
 
 
 def _fail(message: str) -> int:
-    click.echo(one_line(f"error: {message}"), err=True)
+    click.echo(to_one_line(f"error: {message}"), err=True)
     return 2

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, check_identified, one_blas_thread
-from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.excitation.check import check
 from drake_teleop.lab.excitation.excite import criteria_of, excite
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
@@ -122,7 +122,7 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
 
 def identify_load(
     scenario: Scenario,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
     *,
     trajectory: FourierTrajectory | None = None,
     log: Path | None = None,
@@ -130,7 +130,7 @@ def identify_load(
     """Simulate an excitation trajectory and identify the load.
 
     Args:
-        progress: True shows progress bars; or a `Stage` that receives the progress.
+        progress: True shows progress bars; or a `StartStage` that receives the progress.
         trajectory: excitation of the scenario's duration; None: one that each process designs once.
         log: folder of the log, see `simulate`.
 
@@ -190,7 +190,7 @@ def batch_identification(
     return found.identification
 
 
-def _design_trajectory(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
+def _design_trajectory(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
@@ -222,7 +222,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
 
 
 def simulate_with_timing(
-    station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
+    station: Diagram, simulation: Simulation, progress: UpdateProgress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
     """Return the result of a simulation, and simulated time over elapsed time."""
     start = time.perf_counter()

@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_teleop.common.files import CannotWrite, make_folder, models_dir, whole_file
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.progress import Stage
+from drake_teleop.common.progress import StartStage
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
 from drake_teleop.load.contact.noise_floor import NoiseFloor
@@ -51,7 +51,7 @@ class IdentifiedLoad:
 
 def identified_load(
     scenario: Scenario,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
     *,
     fresh: bool = False,
     folder: Path | None = None,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
-from drake_teleop.common.errors import one_line
+from drake_teleop.common.errors import to_one_line
 from drake_teleop.station.film import quiet_drake
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import Scenario
@@ -64,7 +64,7 @@ class PageScene:
         return moves.rounded()
 
     def _fail(self, error: BaseException) -> None:
-        self.failure = one_line(f"no 3D scene: {error}")
+        self.failure = to_one_line(f"no 3D scene: {error}")
         print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
 
 

@@ -16,7 +16,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.progress import Progress
+from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
@@ -331,7 +331,7 @@ class Drive:
     folder: Path = Path()
 
     def repeat(
-        self, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
+        self, progress: UpdateProgress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
         """Simulate the session again in steps of at most `slice_ms`; return the same log."""
         session = Session(self.scenario, self.load, log=log, device=self.device)

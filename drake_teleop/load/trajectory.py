@@ -65,14 +65,14 @@ class FourierTrajectory:
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
-        from drake_teleop.common.texts import yaml_text
+        from drake_teleop.common.texts import to_yaml_text
 
         joints = {
             name: {"q0": float(q0), "rho": rho.tolist(), "delta": delta.tolist()}
             for name, q0, rho, delta in zip(joint_names, self.q0, self.rho, self.delta, strict=True)
         }
         data = {"frequency": float(self.frequency), "joints": joints}
-        write_text(Path(path), yaml_text(data, head=["Eqs. (9)-(10), rad and Hz."]))
+        write_text(Path(path), to_yaml_text(data, head=["Eqs. (9)-(10), rad and Hz."]))
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import yaml_data
+from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
@@ -95,7 +95,9 @@ def _correct_fields(
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
     texts, corrected = [], []
     for cause, names in zip(causes, touched, strict=True):
-        corrected.append({name: yaml_data(_yaml_value(name, fields[name]), name) for name in names})
+        corrected.append(
+            {name: parse_yaml(_yaml_value(name, fields[name]), name) for name in names}
+        )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _OTHER_REMEDIES.get(cause.name, "")
         texts.append(f"set {lines}{_no_yaml_note(log)}" if lines else otherwise)

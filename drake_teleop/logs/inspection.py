@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, one_line
+from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.check.conventions import check_conventions
@@ -121,7 +121,7 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     text = draft.text()
     for message in lacking:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
-        text += f"# {one_line(f'INCOMPLETE, this has {message}')}\n"
+        text += f"# {to_one_line(f'INCOMPLETE, this has {message}')}\n"
     write_text(path, text)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.files import output_folder, write_json, write_table, write_text
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -120,7 +120,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     with output_folder(out):
         for row, (name, (touches, what)) in enumerate(records.items()):
             head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
-            text = yaml_text(_description_of_record(name), head=head, comments=_COMMENTS)
+            text = to_yaml_text(_description_of_record(name), head=head, comments=_COMMENTS)
             write_text(out / f"{name}.yaml", text)
             _write_wrench(
                 out / f"{name}_wrench.csv", _random_motion(row), touches, TRUE_OFFSETS[row], random

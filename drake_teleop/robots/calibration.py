@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import move_earlier_recordings
-from drake_teleop.common.interruption import INTERRUPTED
+from drake_teleop.common.interruption import INTERRUPTED_EVENT
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
@@ -230,7 +230,7 @@ def calibrate(
     done = False
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
-            while not (done or INTERRUPTED.is_set()):
+            while not (done or INTERRUPTED_EVENT.is_set()):
                 if (samples := source.read(_IDLE_S)) is None:
                     break
                 for sample in samples:

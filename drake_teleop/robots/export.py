@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
@@ -162,7 +162,7 @@ def _xarm(load: Load) -> str:
 
 
 def _kth(load: Load) -> str:
-    return yaml_text(
+    return to_yaml_text(
         {
             "bias": _list(load.offsets),
             "gripper_com_frame_id": "ft_sensor",
@@ -173,7 +173,7 @@ def _kth(load: Load) -> str:
 
 
 def _ft_tools(load: Load) -> str:
-    return yaml_text(
+    return to_yaml_text(
         {
             "mass": float(load.mass),
             "sensor_frame_to_com": _list(load.com),
@@ -187,7 +187,7 @@ def _admittance(load: Load) -> str:
     centre = {"pos": _list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
     compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
     parameters = {"gravity_compensation": compensation}
-    return yaml_text({"admittance_controller": {"ros__parameters": parameters}})
+    return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
 
 
 def _bota(load: Load) -> str:

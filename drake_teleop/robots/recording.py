@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_table, write_text
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import Parts
@@ -152,7 +152,7 @@ class PartRecorder(Records[tuple[Part, float]]):
             t, values = samples.table(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
-        write_text(path, yaml_text(self._description()))
+        write_text(path, to_yaml_text(self._description()))
 
     def _description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY}

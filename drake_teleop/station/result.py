@@ -20,7 +20,7 @@ from drake_teleop.common.errors import (
     remedy_to_install_extra,
     wrap_read_errors,
 )
-from drake_teleop.common.files import PARTS_OF_LOG, make_folder, part_of_log, write_table
+from drake_teleop.common.files import LOG_PARTS_PATTERN, make_folder, part_of_log, write_table
 from drake_teleop.common.numeric import float_array
 from drake_teleop.common.parquet_sizes import check_parquet
 
@@ -406,7 +406,7 @@ def _signal_text(spec: Signal) -> str:
 
 
 def _log_parts(path: Path) -> list[Path]:
-    return sorted(path.glob(PARTS_OF_LOG)) or [path]
+    return sorted(path.glob(LOG_PARTS_PATTERN)) or [path]
 
 
 def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from drake_teleop.common.blocks import MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.numeric import contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
@@ -114,7 +114,7 @@ def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
         slave = result["fault"][:, 0]
     if "fault_at_hand" in result:
         hand = result["fault_at_hand"][:, 0]
-    for fault, meaning in MEANINGS.items():
+    for fault, meaning in FAULT_MEANINGS.items():
         if fault != Fault.RESUMING:
             happened = (slave == fault) | ((hand == fault) & (slave == 0))
             yield f"a fault: {meaning},", find_spans(t, happened)

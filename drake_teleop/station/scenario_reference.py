@@ -12,7 +12,7 @@ from typing import Any
 from drake_teleop.common.config import FieldInfo, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
-from drake_teleop.common.texts import yaml_data, yaml_scalar
+from drake_teleop.common.texts import parse_yaml, yaml_scalar
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
@@ -67,7 +67,7 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
     A DrakeTeleopError is raised if reading the file would not give the same scenario.
     """
     text, where = "".join(f"# {line}\n" for line in heading) + commented(scenario), str(path)
-    found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
+    found = ScenarioFromData(parse_yaml(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
     if found != scenario and _all_texts(found) != _all_texts(scenario):

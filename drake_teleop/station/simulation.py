@@ -11,11 +11,11 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.blocks import MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.files import remove_log
-from drake_teleop.common.progress import Progress, show_progress
+from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.station.operator.decision import DONE
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation
@@ -31,7 +31,7 @@ def simulate(
     diagram: Diagram,
     simulation: Simulation | None = None,
     *,
-    progress: bool | Progress = True,
+    progress: bool | UpdateProgress = True,
     log: str | Path | None = None,
 ) -> SimulationResult:
     """Simulate a station for its settling time and duration.
@@ -103,7 +103,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
         if name not in ("fault", "fault_at_hand"):
             continue
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
-            what = MEANINGS[Fault(int(log.data()[column][0, k]))]
+            what = FAULT_MEANINGS[Fault(int(log.data()[column][0, k]))]
             raise DrakeTeleopError(
                 f"at {log.sample_times()[k] - start:.3f} s {what}",
                 where="simulation.on_fault",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.progress import Stage
+from drake_teleop.common.progress import StartStage
 from drake_teleop.lab.analysis import absolute_stability, sampled_wall, transparency
 from drake_teleop.lab.analysis.cut_loop import (
     cut_loop,
@@ -238,7 +238,7 @@ def measured_figures(
 
 
 def parameter_maps(
-    axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
+    axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: StartStage
 ) -> dict[str, dict[str, StabilityMap]]:
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
     n, tool = _MAP_POINTS, axis.tool_mass

@@ -19,7 +19,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
-from drake_teleop.common.progress import Stage, show_progress
+from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.comparison.decision import decide
 from drake_teleop.lab.comparison.delayed_contact import (
     LEAVES,
@@ -202,7 +202,7 @@ def _run_to_end_or_hold(
 
 
 def _one_dof_study(
-    methods: Sequence[str], seed: int, jobs: int, stage: Stage
+    methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
     # Compile here once, so that the parallel processes read the cache.
@@ -230,7 +230,7 @@ def _one_dof_study(
 
 
 def _hands_study(
-    networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
+    networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
     found = _run_parallel(
@@ -253,7 +253,7 @@ def _station_study(
     methods: Sequence[str],
     seed: int,
     jobs: int,
-    stage: Stage,
+    stage: StartStage,
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
     base = station_base(scenario, seed)
     estimate = identified_load(base, stage).estimate
@@ -280,7 +280,7 @@ def _station_study(
     return rows, traces
 
 
-def _covering_study(stage: Stage) -> list[dict[str, Any]]:
+def _covering_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
     for done, (sigma, round_trip, wall) in enumerate(_COVERING_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)

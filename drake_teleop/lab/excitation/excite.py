@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.progress import Stage, show_progress
+from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.excitation.check import RATE, Use, check
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
@@ -66,7 +66,7 @@ def excite(
     seed: int = 0,
     starts: int = 4,
     seconds: float | None = None,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
 ) -> Excitation:
     """Design an excitation trajectory with `harmonics` harmonics in Eq. (9), and check it.
 

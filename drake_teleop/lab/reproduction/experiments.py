@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.progress import Progress, Stage
+from drake_teleop.common.progress import StartStage, UpdateProgress
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
 from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
@@ -78,14 +78,14 @@ class ContactMotion:
     threshold: float
 
 
-def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
+def free_motion(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> FreeMotion:
     """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
     scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
-def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
+def contact_motion(scenario: Scenario, estimate: Array, stage: StartStage) -> ContactMotion:
     """Simulate the contact transition with and without the leaf spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
@@ -104,7 +104,7 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
     )
 
 
-def ideal_motion(progress: Progress) -> IdealMotion:
+def ideal_motion(progress: UpdateProgress) -> IdealMotion:
     """Simulate a free movement that moves and rotates the tool about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
@@ -224,7 +224,7 @@ def without_sheet(scenario: Scenario) -> Scenario:
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
 
-def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> SimulationResult:
+def _simulate(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> SimulationResult:
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     return simulate(station, scenario.simulation, progress=progress)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.progress import Progress
+from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.scenario import Scenario, Simulation
 from drake_teleop.station.simulation import MakeSimulator, advance
@@ -52,7 +52,7 @@ def cpu_seconds(
     simulators: Mapping[str, Simulator],
     *,
     repetitions: int = 11,
-    progress: Progress = lambda done: None,
+    progress: UpdateProgress = lambda done: None,
 ) -> dict[str, float]:
     """Return the CPU time per simulated second of each simulator: minimum of interleaved runs."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.read.description_fields import (
     FORCE_UNITS,
@@ -102,7 +102,7 @@ class Draft(NamedTuple):
     head: list[str]
 
     def text(self) -> str:
-        return yaml_text(self.streams, head=self.head)
+        return to_yaml_text(self.streams, head=self.head)
 
     def corrected(self, finding: Finding) -> Draft:
         streams = copy.deepcopy(self.streams)

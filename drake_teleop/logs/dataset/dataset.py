@@ -27,7 +27,7 @@ from drake_teleop.common.files import (
 from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import show_progress
-from drake_teleop.common.texts import read_yaml, yaml_text
+from drake_teleop.common.texts import read_yaml, to_yaml_text
 from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.conventions import check_conventions
@@ -120,7 +120,7 @@ def dataset_command(
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
         columns = [_read_columns(work / f"{k}.npy") for k in range(len(rows))]
         write_copy(dataset, copied, columns)
-        write_text(out / "description.yaml", yaml_text(streams))
+        write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
         summary = to_plain_values(_dataset_summary(dataset, copied, shared, rows))
         report = render_page(

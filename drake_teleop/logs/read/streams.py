@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import (
-    WIDTHS,
+    NUM_COLUMNS_OF_FORM,
     nearest_rotation,
     quaternions_of,
     rotation_error,
@@ -103,7 +103,7 @@ class Orientations:
         where: str,
     ) -> None:
         self._orientation, self._table, self._where = orientation, table, where
-        width = WIDTHS[orientation.form]
+        width = NUM_COLUMNS_OF_FORM[orientation.form]
         self._columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form in ("rotation_vector", "euler"):
             self._columns *= description.si_value(orientation.unit)

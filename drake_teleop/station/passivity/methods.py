@@ -14,7 +14,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from drake_teleop.common.compiled import address_of, call_at, njit
+from drake_teleop.common.compiled import address_of, make_call_at_address, njit
 from drake_teleop.common.config import (
     check_name,
     check_ranges,
@@ -277,7 +277,7 @@ _MASTER_ARGUMENTS = (_VECTOR, types.boolean, *[_VECTOR] * 5, types.float64, *[_V
 _SLAVE_ARGUMENTS = (_VECTOR, types.boolean, *[_VECTOR] * 4, types.float64, *[_VECTOR] * 4)
 _RECORD_ARGUMENTS = (_VECTOR,) * 6
 _master_step, _slave_step, _record_command = map(
-    call_at, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS)
+    make_call_at_address, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS)
 )
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.blocks import LARGEST
+from drake_teleop.common.blocks import LARGEST_PORT_VALUE
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -376,7 +376,7 @@ def is_plausible(constants, truth):
     for i in range(6):
         good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOADS + i]
     for i in range(6, truth.shape[0]):
-        good = good and abs(truth[i]) <= LARGEST
+        good = good and abs(truth[i]) <= LARGEST_PORT_VALUE
     return good
 
 
