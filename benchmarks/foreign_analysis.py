@@ -86,7 +86,7 @@ def station_of(arm: str, models: Path | None) -> Scenario:
     if file:
         slave = dataclasses.replace(slave, model=str(models / file) if models else "")
     scenario, master = LoadScenario("free_motion_force"), Master(model=DEVICES[arm])
-    own_period = master.own_period(scenario.rates.hand_hz)
+    own_period = master.sampling_period(scenario.rates.hand_hz)
     rate = scenario.rates.hand_hz if own_period is None else 1 / own_period
     return replace(
         scenario,

@@ -450,7 +450,7 @@ def _traces(suffix: str) -> Callable[[Path], list[bytes]]:
 
 def _trace(path: Path) -> None:
     config = network.NetworkConfig(trace=str(path))
-    network.parameters(config, 0, network.FORWARD, 1e-3)
+    network.network_parameters(config, 0, network.FORWARD, 1e-3)
     if not network.mean_delay(config) <= network.longest_delay(config) + 1e-9:
         raise AssertionError("the mean delay is longer than the longest")
 
@@ -480,14 +480,14 @@ def _exchange(path: Path) -> None:
     known = data if isinstance(data, dict) else {}
     scenario = ScenarioFromData({"channel": known.get("channel", {})}, str(path))
     numbers = _floats(known.get("packets"))
-    for direction, config in enumerate(scenario.channel.lines()):
-        p = network.parameters(config, 1, direction, 1e-3)
+    for direction, config in enumerate(scenario.channel.networks_of_directions()):
+        p = network.network_parameters(config, 1, direction, 1e-3)
         neutral, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
-        state = network.initial_state(p, neutral)
+        state = network.initial_network_state(p, neutral)
         sent = [np.resize(np.roll(numbers, k), PACKET_SIZE) for k in range(60)]
         for k, each in enumerate(sent):
-            network.send(p, state, k, each)
-            newest, fresh = network.receive(p, state, k, packet)
+            network.send_packet(p, state, k, each)
+            newest, fresh = network.receive_packet(p, state, k, packet)
             expected = sent[newest] if newest >= 0 else neutral
             if newest > k or (fresh and packet.tobytes() != expected.tobytes()):
                 raise AssertionError(f"packet {newest} came changed, or before it was sent")

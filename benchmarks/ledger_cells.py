@@ -42,7 +42,7 @@ from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
-from drake_teleop.station.master.data_sheets import Master, figures_of
+from drake_teleop.station.master.data_sheets import Master, data_sheet_of
 from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.operator.operator import GRIPS, MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.oscillation import fast_part
@@ -106,7 +106,9 @@ def draw(seed: int, index: int) -> Drawn:
     action, sigma, gamma = choose(ACTIONS), choose((0.0, 0.5, 1.0)), 1.0 + 2.0 * rng.random()
     force, frequency = 20.0 ** rng.random(), 1.0 + rng.random()
     scale = gamma / 17.5
-    peak = Master(model=device, figures=figures_of({"model": device})).device(0.0, 0.0).peak_force
+    peak = (
+        Master(model=device, figures=data_sheet_of({"model": device})).device(0.0, 0.0).peak_force
+    )
     force = min(force, PEAK_SHARE * peak, scale * ARMS[arm][4], scale * stiffness * MAX_DEPTH)
     grips = [name for name, hand in GRIPS.items() if force / hand.stiffness < 0.04]
     return Drawn(
@@ -204,7 +206,7 @@ def times_of(drawn: Drawn, round_trip: float) -> Times:
 def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
     """Return the scenario of a cell without passivity method, and its times."""
     slave, channel = slave_of(drawn.arm), channel_of(drawn.network)
-    times = times_of(drawn, sum(mean_delay(line) for line in channel.lines()))
+    times = times_of(drawn, sum(mean_delay(line) for line in channel.networks_of_directions()))
     base = replace(station_base("contact_transition", seed), slave=slave, wrist_sensor__ideal=True)
     nominal = NominalSlave(slave)
     tip = nominal.start_tip - [0.0, 0.0, GAP]
@@ -251,7 +253,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
         base,
         simulation=dataclasses.replace(base.simulation, settle=SETTLE, duration=times.end),
         operator=OperatorConfig(grip=drawn.grip, intent=moves),
-        master=Master(model=drawn.device, figures=figures_of({"model": drawn.device})),
+        master=Master(model=drawn.device, figures=data_sheet_of({"model": drawn.device})),
         channel=channel,
         environment=[thing],
         force_scaling__sigma=drawn.sigma,

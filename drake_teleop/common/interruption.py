@@ -20,7 +20,7 @@ _DELAYED = _DelayedSignalState()
 
 
 def install_handlers() -> None:
-    """Handle SIGINT, unless it is ignored, and SIGTERM by a KeyboardInterrupt and `INTERRUPTED_EVENT`."""
+    """Handle SIGTERM, and SIGINT unless ignored, by KeyboardInterrupt and `INTERRUPTED_EVENT`."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _raise_interrupt)

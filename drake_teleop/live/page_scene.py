@@ -13,7 +13,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
 from drake_teleop.common.errors import to_one_line
-from drake_teleop.station.film import quiet_drake
+from drake_teleop.station.film import silence_drake_log
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import Scenario
 
@@ -39,7 +39,7 @@ class PageScene:
         arrows = ("measured_wrench_S", "contact_wrench_S") if forces else ()
         recorded = ("slave_state", "master_state", *arrows)
         try:
-            with quiet_drake():
+            with silence_drake_log():
                 meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
             self._scene = ReplayScene(meshcat, scenario, recorded)
             self.objects = _extract_objects(meshcat.StaticHtml())

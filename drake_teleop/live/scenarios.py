@@ -13,7 +13,7 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
+from drake_teleop.station.master.data_sheets import LEADER_NAME, PHANTOM_NAME, Master
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.passivity.safe_state import RESUME_TIME
@@ -58,7 +58,7 @@ def live_scenario(scenario: Scenario) -> Scenario:
 
 def with_device(scenario: Scenario) -> Scenario:
     """Return the scenario with a task-space device if its master is a serial arm."""
-    if scenario.master.model not in (PHANTOM, LEADER):
+    if scenario.master.model not in (PHANTOM_NAME, LEADER_NAME):
         return scenario
     return replace(scenario, master=Master(model="haply_inverse3"))
 
@@ -145,4 +145,6 @@ def channel_fill_time(scenario: Scenario) -> float:
     """Return the time until all packets of a new channel arrive [s]."""
     if scenario.is_direct:
         return 0.0
-    return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME_TIME
+    return (
+        sum(longest_delay(line) for line in scenario.channel.networks_of_directions()) + RESUME_TIME
+    )

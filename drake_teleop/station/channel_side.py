@@ -58,7 +58,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _limit_to_device(scenario, passivity_with_arm_mass(scenario)),
+            _limit_method_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             _contact_scale(scenario),
@@ -84,7 +84,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     """Limit the method's wrench to the device, so that its balance counts displayed wrenches."""
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
@@ -118,7 +118,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     )
 
 
-def power_scale(scenario: Scenario) -> Array:
+def power_scale_of_scenario(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)

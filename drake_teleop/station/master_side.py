@@ -73,7 +73,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     export(builder, operator, "intent", "hand_wrench_E")
     export(builder, device, "pose_master", "twist_master", master_state="state")
 
-    if isinstance(model, LeaderDevice) and scenario.master.leads_joints:
+    if isinstance(model, LeaderDevice) and scenario.master.is_joint_leader:
         slave = NominalSlave(scenario.slave)
         kinematic_scaling = builder.AddNamedSystem(
             "kinematic_scaling", JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD)
@@ -83,19 +83,19 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
             "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD, start_W)
         )
     read, command = device.GetOutputPort("pose_master"), display.GetInputPort("wrench_command")
-    if scenario.master.steps().any() and isinstance(model, HapticDevice):
-        encoders = Encoders(model, q_start, scenario.master.steps())
+    if scenario.master.encoder_steps().any() and isinstance(model, HapticDevice):
+        encoders = Encoders(model, q_start, scenario.master.encoder_steps())
         builder.AddNamedSystem("encoders", encoders)
         builder.Connect(device.GetOutputPort("state"), encoders.get_input_port())
         read = encoders.get_output_port()
-    own_period = scenario.master.own_period(scenario.rates.hand_hz)
+    own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
     if own_period is not None:
         held_pose = builder.AddNamedSystem("held_pose", SampleHold(own_period, start_B))
         held_wrench = builder.AddNamedSystem("held_wrench", SampleHold(own_period, np.zeros(6)))
         builder.Connect(read, held_pose.get_input_port())
         builder.Connect(held_wrench.get_output_port(), command)
         read, command = held_pose.get_output_port(), held_wrench.get_input_port()
-    if scenario.master.leads_joints:
+    if scenario.master.is_joint_leader:
         state = device.GetOutputPort("state")
         builder.Connect(state, kinematic_scaling.GetInputPort("master_state"))
         export(builder, kinematic_scaling, "leader_joints")
@@ -113,7 +113,7 @@ def _make_operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator
     if scenario.operator.task is None:
         return Operator(scenario.operator, start_B)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling
-    forward, backward = (mean_delay(line) for line in scenario.channel.lines())
+    forward, backward = (mean_delay(line) for line in scenario.channel.networks_of_directions())
     training = Training(
         RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
         scaling.translation_scale,

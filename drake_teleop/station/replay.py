@@ -21,16 +21,16 @@ from drake_teleop.common.files import models_dir, output_folder, write_json
 from drake_teleop.common.numeric import contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.film import (
-    Arrow,
     Canvas,
-    Film,
-    Reading,
-    Show,
+    DisplayedNumber,
+    ForceArrow,
+    ReplayFile,
+    ShowFrame,
     add_shapes,
     frame_times,
     set_plain_background,
 )
-from drake_teleop.station.master.data_sheets import PHANTOM
+from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.result import SimulationResult
@@ -119,7 +119,7 @@ def write_replay(
     contact = np.zeros(len(result.t), dtype=bool)
     if "true_contact_wrench_W" in result:
         contact = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    film = Film(
+    film = ReplayFile(
         scenario.description or "A run of the station",
         times,
         slow_motion,
@@ -129,7 +129,7 @@ def write_replay(
         curves="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )
 
-    def make_scene(meshcat: Meshcat) -> Show:
+    def make_scene(meshcat: Meshcat) -> ShowFrame:
         scene = ReplayScene(meshcat, scenario, signals)
         return lambda film_time, frame: scene.show(film_time, signals, frame)
 
@@ -143,15 +143,17 @@ def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
     return np.where(times - t[before] <= t[after] - times, before, after)
 
 
-def _readings(signals: Signals) -> list[Reading]:
+def _readings(signals: Signals) -> list[DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
-    readings = [Reading("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)]
+    readings = [
+        DisplayedNumber("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)
+    ]
     if "contact_wrench_S" in signals:
         contact = _row_norms(signals["contact_wrench_S"][:, :3])
-        readings.append(Reading("Contact, calculated", "N", contact, VERMILION, arrow=True))
+        readings.append(DisplayedNumber("Contact, calculated", "N", contact, VERMILION, arrow=True))
     if "force_to_master" in signals:
         readings.append(
-            Reading("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
+            DisplayedNumber("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
         )
     return readings
 
@@ -225,7 +227,7 @@ class ReplayScene:
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
         kinds = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
         self._arrows = [
-            (force, place, Arrow(meshcat, f"{force}_at_{place}", colour))
+            (force, place, ForceArrow(meshcat, f"{force}_at_{place}", colour))
             for force, at_slave, colour in kinds
             if f"{force}_wrench_S" in recorded
             for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
@@ -263,7 +265,7 @@ class ReplayScene:
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
-            arrow.show(self.canvas, film_time, places[place], f_W)
+            arrow.show_force(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
         """Set the pose (7,) of a moving body, after those of its parents."""
@@ -312,7 +314,7 @@ class _ReplayDevice(NamedTuple):
 def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if scenario.master.leader is not None:
         return _add_leader(plant, scenario.master.leader)
-    is_phantom = scenario.master.model == PHANTOM
+    is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
@@ -323,7 +325,7 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
 
 def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
-    parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
+    parsed = leader.add_to_plant(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
 
     def positions(q: Array) -> Array:
         ordered = np.empty(len(q))

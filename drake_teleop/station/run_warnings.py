@@ -13,7 +13,7 @@ from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.numeric import contact_spans
 from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
-from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale
+from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale_of_scenario
 from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
@@ -152,7 +152,7 @@ def _check_limits(
             "the device displays its largest force or torque",
             find_spans(t, full, _MIN_DURATION_S),
         )
-        ended = device.at_an_end(result["master_state"][:, : device.num_joints])
+        ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", find_spans(t, ended)
     if scenario.leaf is not None and "sheet_state" in result:
         bent = scenario.leaf.largest_small_deflection
@@ -165,7 +165,7 @@ def _check_limits(
 def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
     if "ports" not in result:
         return
-    t, timeout = result.t, scenario.channel.silent_after(1.0 / scenario.rates.hand_hz)
+    t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
         silent = result[f"ports.{end}_silent"] > timeout
         yield (
@@ -173,7 +173,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             find_spans(t, silent, _MIN_DURATION_S),
         )
     # An end without new packets uses the last one until `timeout`.
-    window = longest_delay(scenario.channel.lines()[0]) + timeout
+    window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
     for command, actual, least, unit, scale in _pose_parts(sent, received):
@@ -199,10 +199,12 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
-    mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale(scenario)
+    mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale_of_scenario(
+        scenario
+    )
     limit = speed_limit(config, mass)
     then = t - _packet_ages(t, scenario)
-    window = longest_delay(scenario.channel.lines()[0]) + _SETTLING_TIME_S
+    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _SETTLING_TIME_S
     for g, (command, actual, least, unit, scale) in enumerate(_pose_parts(sent, received)):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
         far = lag_beyond_delay(t, asked, actual, _SETTLING_TIME_S)
@@ -240,7 +242,7 @@ def _packet_ages(t: Array, scenario: Scenario) -> Array:
     """Return (N,) age of the newest packet at the slave's end [s], from the network model."""
     period = 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
-    line, seed = scenario.channel.lines()[0], scenario.simulation.seed
+    line, seed = scenario.channel.networks_of_directions()[0], scenario.simulation.seed
     return (step - newest_packets(line, seed, FORWARD, step[-1] + 1, period)[step]) * period
 
 

@@ -66,7 +66,7 @@ def MakeSlaveSide(
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
         - saturated: (1,) 1 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
-        - the parts of a sample (`signals_of_sample`), slave_state, joint_torque, joint_command,
+        - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
           ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is identified or estimated online): signals
         - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
@@ -91,7 +91,7 @@ def MakeSlaveSide(
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    led, torques = scenario.master.leads_joints, _gives_torques(controller, scenario)
+    led, torques = scenario.master.is_joint_leader, _gives_torques(controller, scenario)
     body = _add_slave_blocks(
         builder, scenario, load_estimate, load_covariance, custom_torque=torques
     )

@@ -70,7 +70,7 @@ def MakeTeleopStation(
     sides = [master, slave]
     if channel is None and scenario.is_direct and scenario.contact_detection is None:
         # A Diagram of two wires would cost 3 % of the time.
-        setpoint = "leader_joints" if scenario.master.leads_joints else "pose_command"
+        setpoint = "leader_joints" if scenario.master.is_joint_leader else "pose_command"
         wire(builder, master, setpoint, slave, setpoint)
         wire(builder, slave, "wrench_B", master, "wrench_command")
     else:

@@ -9,9 +9,9 @@ from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel import channel
-from drake_teleop.station.channel.channel import MEMORY_S, Channel, channel_step
+from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, step_channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.channel_side import MakeChannel, _limit_to_device
+from drake_teleop.station.channel_side import MakeChannel, _limit_method_to_device
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.memory import HELD_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -38,7 +38,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     device = scenario.master.device(0.0, 0.0)
     force, torque = device.peak_force, min(device.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
-    limited = _limit_to_device(scenario, own)
+    limited = _limit_method_to_device(scenario, own)
     assert limited.method == "wave"
     assert limited.force_limit == pytest.approx(min(share, 1.0) * force)
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)
@@ -117,9 +117,9 @@ def test_load_wrench_is_transformed_as_the_wrench():
     for name, value in inputs.items():
         block.GetInputPort(name).FixValue(context, value)
     ends = block.EvalUniquePeriodicDiscreteUpdate(context).value(2)
-    held = ends[MEMORY_S][HELD_WRENCH]
+    held = ends[SLAVE_METHOD_MEMORY][HELD_WRENCH]
     assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
-    np.testing.assert_allclose(ends[MEMORY_S][LOAD_WRENCH], 0.5 * held, atol=1e-15)
+    np.testing.assert_allclose(ends[SLAVE_METHOD_MEMORY][LOAD_WRENCH], 0.5 * held, atol=1e-15)
 
 
 def test_packets_in_transit_belong_to_the_context():
@@ -153,8 +153,8 @@ def test_packets_in_transit_belong_to_the_context():
 
 def test_directions_may_differ():
     channel = Channel(delay=0.1, backward=NetworkConfig(delay=0.2))
-    assert [line.delay for line in channel.lines()] == [0.1, 0.2]
-    assert Channel(network="lunar").lines() == (PRESETS["lunar"], PRESETS["lunar"])
+    assert [line.delay for line in channel.networks_of_directions()] == [0.1, 0.2]
+    assert Channel(network="lunar").networks_of_directions() == (PRESETS["lunar"], PRESETS["lunar"])
 
 
 @pytest.mark.parametrize(
@@ -189,9 +189,9 @@ def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
     def failing(method, pose, wrench_B, *rest):
         ends = rest[-4]
         failed = 2 * 800 <= ends[0] < 2 * 1000  # at 2 kHz, after 0.6 s of settling
-        channel_step(method, pose, np.full(6, np.nan) if failed else wrench_B, *rest)
+        step_channel(method, pose, np.full(6, np.nan) if failed else wrench_B, *rest)
 
-    monkeypatch.setattr(channel, "channel_step", failing)
+    monkeypatch.setattr(channel, "step_channel", failing)
     result = run(scenario, load_estimate)
     for name in result:
         values = result[name][:, :4] if name == "ports" else result[name]  # then come ages
@@ -215,9 +215,9 @@ def test_the_timeout_follows_from_the_worse_of_both_directions():
     """1.5 silences of a packet every 0.2 s, from 0.1 s to 1 s, unless configured."""
     slow = NetworkConfig(rate_hz=5.0)
     for one in (Channel(rate_hz=5.0, backward=NetworkConfig()), Channel(backward=slow)):
-        assert one.silent_after(1e-3) == pytest.approx(0.3)
-    waits = [Channel(network=name).silent_after(5e-4) for name in PRESETS]
+        assert one.timeout_s(1e-3) == pytest.approx(0.3)
+    waits = [Channel(network=name).timeout_s(5e-4) for name in PRESETS]
     assert waits[:3] == [0.1] * 3
     assert waits == sorted(waits) and waits[-1] < 0.5
-    assert Channel(rate_hz=1.0).silent_after(1e-3) == 1.0
-    assert Channel(rate_hz=5.0, timeout=0.4).silent_after(1e-3) == 0.4
+    assert Channel(rate_hz=1.0).timeout_s(1e-3) == 1.0
+    assert Channel(rate_hz=5.0, timeout=0.4).timeout_s(1e-3) == 0.4

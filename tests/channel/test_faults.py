@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from drake_teleop.station.channel import network
-from drake_teleop.station.channel.channel import MEMORY_S, channel_step, initial_ends
+from drake_teleop.station.channel.channel import (
+    SLAVE_METHOD_MEMORY,
+    initial_state_of_ends,
+    step_channel,
+)
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.memory import DAMPING, HELD_WRENCH, STIFFNESS
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters, steps_of
@@ -50,12 +54,12 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
     """Both ends with a hand that moves as prescribed and a slave behind a servo."""
     p = parameters(PassivityConfig(method=method, force_limit=LIMIT), [1 / 17.5] * 2)
     line = NetworkConfig(delay=DELAY)
-    lines = [network.parameters(line, 0, way, T, least=1) for way in range(2)]
-    states = [network.initial_state(each, np.zeros(PACKET_SIZE)) for each in lines]
+    lines = [network.network_parameters(line, 0, way, T, least=1) for way in range(2)]
+    states = [network.initial_network_state(each, np.zeros(PACKET_SIZE)) for each in lines]
     frame = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1])
     hand = hand_position()
     start = np.array([1.0, 0, 0, 0, hand[0], 0, 0])
-    ends, received, slave = initial_ends(method, p, start), start.copy(), start.copy()
+    ends, received, slave = initial_state_of_ends(method, p, start), start.copy(), start.copy()
     ports, felt, velocity = np.zeros(8), np.zeros(7), 0.0
     found = Run(
         np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 7, 8, 2)), np.zeros(STEPS)
@@ -76,14 +80,14 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
             inputs[fault][:] = bad
         if now and fault == "saturated":
             inputs["slave_wrench"][:] = 1e3
-        channel_step(
+        step_channel(
             steps_of(method), *inputs.values(), now and fault == "saturated",
             float(wall < 0.0), T, TIMEOUT, frame, p, *lines, *states, ends, received, ports, felt,
         )  # fmt: skip
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
         pull = p[STIFFNESS][0] * (received[4] - slave[4]) - p[DAMPING][0] * velocity
-        found.servo[k] = pull, ends[MEMORY_S][HELD_WRENCH][0]
+        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][HELD_WRENCH][0]
     return found
 
 

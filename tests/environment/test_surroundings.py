@@ -18,11 +18,11 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.run_summary import ScenarioRun, summarise
-from drake_teleop.station.environment.environment import Several
+from drake_teleop.station.environment.environment import SeveralObjects
 from drake_teleop.station.environment.moving_bodies import (
     JointTable,
-    bodies_into,
-    interpolate_bodies,
+    interpolate_joint_state,
+    poses_and_twists_into,
 )
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.solids import Block, Box, Wall
@@ -59,7 +59,7 @@ SOFT_PAD = """
 
 def test_walls_and_boxes_follow_drakes_contact_law():
     """In a corner of a soft rough floor, a stiff smooth wall and a tilted box."""
-    corner = Several(
+    corner = SeveralObjects(
         [
             Wall(position=[0.55, 0.0, 0.2], stiffness=3e3, dissipation=4.0, friction=0.7),
             Wall(position=[0.567, 0.0, 0.2], normal=[-1.0, 0.0, 0.2], stiffness=7e5, friction=0.1),
@@ -109,7 +109,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
     """A block that tips over, and a drawer that slides in a rotating door."""
     (tmp_path / "cabinet.sdf").write_text(CABINET)
     cabinet = Scene(file=str(tmp_path / "cabinet.sdf"), position=[0.4, 0.0, 0.1])
-    both = Several([Block(position=[0.5, 0.0, 0.0], friction=0.6), cabinet])
+    both = SeveralObjects([Block(position=[0.5, 0.0, 0.0], friction=0.6), cabinet])
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, Slave(position=[0.6, 0.0, 0.4]), both)
     root = builder.Build().CreateDefaultContext()
@@ -140,7 +140,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
 
 def test_between_two_states_bodies_move_on_smoothly():
     """A body that rotates about two axes, at a half and a third of a step."""
-    plant = AddSlavePlant(DiagramBuilder(), Slave(), Several([Block(), Scene()])).plant
+    plant = AddSlavePlant(DiagramBuilder(), Slave(), SeveralObjects([Block(), Scene()])).plant
     bodies = [plant.GetBodyByName(name).index() for name in ("block", "door")]
     (joints, order), h = JointTable(plant, bodies), 0.002
     assert order == [int(body) for body in bodies]
@@ -159,10 +159,10 @@ def test_between_two_states_bodies_move_on_smoothly():
 
     for u in (1 / 3, 0.5):
         start, end, found = state(0.1), state(0.1 + h), state(0.1)
-        interpolate_bodies(joints, h, u, start, end, found)
+        interpolate_joint_state(joints, h, u, start, end, found)
         poses, expected = np.empty((2, 2, 13))
-        bodies_into(joints, found, poses)
-        bodies_into(joints, state(0.1 + u * h), expected)
+        poses_and_twists_into(joints, found, poses)
+        poses_and_twists_into(joints, state(0.1 + u * h), expected)
         np.testing.assert_allclose(poses[:, :7], expected[:, :7], atol=1e-9)
         np.testing.assert_allclose(poses[:, 7:], expected[:, 7:], atol=2e-6)
 

@@ -33,7 +33,7 @@ from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.film import Film
+from drake_teleop.station.film import ReplayFile
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
@@ -150,7 +150,7 @@ def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
         assert speed.values[0] < 0.05 < speed.values.max()
         assert film.slow_motion == 1.0
 
-    monkeypatch.setattr(Film, "write", write)
+    monkeypatch.setattr(ReplayFile, "write", write)
     write_motion_film(tmp_path / "film.html", short)
     assert np.linalg.norm(frames[1].translation() - frames[0].translation()) > 0.02
 

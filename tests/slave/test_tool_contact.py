@@ -10,7 +10,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.point_contact import ContactPairs, separation
+from drake_teleop.station.environment.point_contact import ContactPairs, min_distance_of_boxes
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
@@ -148,7 +148,7 @@ def test_distance_of_separate_boxes():
         rest = [moved.rotation().matrix().ravel(), moved.translation(), half[1], leaf, np.zeros(6)]
         own = [X_SOwn.rotation().matrix().ravel(), half[0]]
         pair = np.concatenate([X_SOwn.translation(), [0.0], *rest, *own])
-        found = separation(
+        found = min_distance_of_boxes(
             pair, pair[:28], X_WS.translation(), X_WS.rotation().matrix(), deflection
         )
         told = query.Eval(context).ComputeSignedDistancePairClosestPoints(*shapes).distance

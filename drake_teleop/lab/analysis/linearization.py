@@ -37,7 +37,7 @@ from drake_teleop.common.vectors import (
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port
 from drake_teleop.station.channel.channel import Channel
-from drake_teleop.station.environment.point_contact import FRICTION
+from drake_teleop.station.environment.point_contact import FRICTION_COLUMNS
 from drake_teleop.station.master.force_display import initial_display_state
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
@@ -273,7 +273,7 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 def delays(scenario: Scenario) -> tuple[int, int]:
     """Return the network delays of pose and wrench in hand periods."""
-    lines = scenario.channel.lines()
+    lines = scenario.channel.networks_of_directions()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
         return 0, 0
     ahead, back = (
@@ -324,7 +324,7 @@ class _States:
 class _Period:
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rates(scenario)
-        own_period = scenario.master.own_period(scenario.rates.hand_hz)
+        own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
         if own_period is not None:
             raise DrakeTeleopError(
                 f"the device's own rate of {1 / own_period:g} Hz is below the hand's rate",
@@ -487,7 +487,7 @@ class _Period:
             np.append(q, np.zeros(len(q))),
             pose_B,
             np.zeros(6),
-            initial_display_state(self._device.display_coordinates(q), self._device.numbers),
+            initial_display_state(self._device.coordinates_for_display(q), self._device.numbers),
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
@@ -610,7 +610,7 @@ def _remove_friction(diagram: Diagram) -> None:
         properties = inspector.GetProximityProperties(geometry)
         properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(0.0, 0.0))
         scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
-    GetBlock(diagram, "wrist_sensor").contact_pairs[:, FRICTION] = 0.0
+    GetBlock(diagram, "wrist_sensor").contact_pairs[:, FRICTION_COLUMNS] = 0.0
 
 
 def _check_rates(scenario: Scenario) -> None:

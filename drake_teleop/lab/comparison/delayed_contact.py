@@ -56,7 +56,7 @@ def delayed_contact(
     `leaf` is a key of `LEAVES` or a stiffness [N/m]; `depth` [m] is the intended displacement of
     the hand beyond the contact.
     """
-    task = task or task_for_round_trip(sum(line.delay for line in channel.lines()))
+    task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
     settle = 0.5
     swing = Sine(
         t_start=settle + task.swing,

@@ -86,7 +86,7 @@ def wall_of(plan: Plan) -> Wall:
 
 
 def _device_rates(device: str) -> dict[str, Any]:
-    own = Master(model=device).own_period(Rates().hand_hz)
+    own = Master(model=device).sampling_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 

@@ -113,7 +113,7 @@ class StationTrial:
             scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base.channel
-        task = short_task(sum(line.delay for line in channel.lines()))
+        task = short_task(sum(line.delay for line in channel.networks_of_directions()))
         setup, _ = delayed_contact(
             scenario,
             channel,
@@ -208,7 +208,7 @@ class GammaSearch:
         self, axis: Axis, settings: Settings, gamma: float, grip: str, wall: float, seed: int
     ) -> float:
         """Return the rendered share of the contact force; 0 if the axis does not come to rest."""
-        forward, backward = self.base.channel.lines()
+        forward, backward = self.base.channel.networks_of_directions()
         hand = GRIPS[grip]
         shown = {entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(Axis)}
         model = OneDof(**shown | {

@@ -24,7 +24,7 @@ from drake_teleop.load.online.watched import (
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
 # Samples between two checks for settling.
-_CHECK_SAMPLES = 16
+_SAMPLES_PER_CHECK = 16
 
 
 @settings
@@ -145,14 +145,14 @@ class LoadEstimator(LeafSystem):
         if sample[SATURATION_FLAG_INDEX] > 0.0:  # the wrench contains more than the load's
             return
         estimate = discrete_state.get_mutable_value(0)
-        if self._state(discrete_state) == STATE_LEARNING:
-            self._learn(estimate, sample, discrete_state, context.get_time())
+        if self._load_state_index(discrete_state) == STATE_LEARNING:
+            self._update_estimate(estimate, sample, discrete_state, context.get_time())
         else:
             monitor_load(
                 estimate, discrete_state.get_mutable_value(2), sample, *self._watch_arguments
             )
 
-    def _learn(
+    def _update_estimate(
         self,
         estimate: NDArray[np.float64],
         sample: NDArray[np.float64],
@@ -162,17 +162,17 @@ class LoadEstimator(LeafSystem):
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
         # The check for settling takes longer than the update.
-        due = self._watches and round(time / self._period) % _CHECK_SAMPLES == 0
+        due = self._watches and round(time / self._period) % _SAMPLES_PER_CHECK == 0
         if due and self._estimator.is_settled_at(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
 
-    def _state(self, discrete_state: DiscreteValues) -> int:
+    def _load_state_index(self, discrete_state: DiscreteValues) -> int:
         return monitor_state(discrete_state.value(2)) if self._watches else STATE_LEARNING
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()
-        output[0] = self._state(state)
+        output[0] = self._load_state_index(state)
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
             settled = self._estimator.is_settled_at(estimate, memory.reshape(self._shape))

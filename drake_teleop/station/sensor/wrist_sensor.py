@@ -51,7 +51,7 @@ from drake_teleop.load.regressor import (
     sample_size,
     signals_of_sample,
 )
-from drake_teleop.station.environment.moving_bodies import interpolate_bodies
+from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     estimate_into,
@@ -269,7 +269,7 @@ def sample_step(
             _interpolate(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
                 at_start, at_end = start[width - extra :], end[2 * half :]
-                interpolate_bodies(joints, h, u, at_start, at_end, between[2 * half :])
+                interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])
             _torque_at(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)

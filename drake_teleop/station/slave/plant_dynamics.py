@@ -18,13 +18,13 @@ from drake_teleop.common.vectors import (
     rotate_vector,
     vector_at,
 )
-from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, bodies_into
+from drake_teleop.station.environment.moving_bodies import NUM_POSE_AND_TWIST, poses_and_twists_into
 from drake_teleop.station.environment.point_contact import (
-    BODY,
-    WIDTH,
+    BODY_COLUMN,
+    NUM_PAIR_COLUMNS,
     contact_force,
-    indentation,
-    separation,
+    depth_of_sphere_in_box,
+    min_distance_of_boxes,
 )
 from drake_teleop.station.slave.arm import ArmModel, forward_dynamics, forward_kinematics, jacobian
 from drake_teleop.station.slave.surroundings import Contact
@@ -55,13 +55,13 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False
-    bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
-    bodies_into(joints, state, bodies)
+    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
-        depth = indentation(box, p_WS, R_WS, sheet[0], normal)
+        box = _place_box(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
+        depth = depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
         if not has_twist:
@@ -73,8 +73,8 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         point_velocity = plus(vector_at(twist, 0), cross(vector_at(twist, 3), lever))
         for i in range(3):
             velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
-        if pair[BODY] >= 0.0:
-            body = bodies[int(pair[BODY])]
+        if pair[BODY_COLUMN] >= 0.0:
+            body = bodies[int(pair[BODY_COLUMN])]
             lever = minus(vector_at(normal, 3), vector_at(body, 4))
             point_velocity = plus(vector_at(body, 10), cross(vector_at(body, 7), lever))
             for i in range(3):
@@ -86,8 +86,8 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 @njit(cache=True)
 def _place_box(pair, bodies, placed):
     """Write the pair, with its box at the pose of its body, to `placed` (28,); return `placed`."""
-    body = bodies[int(pair[BODY])]
-    copy_into(placed, 0, pair, 0, WIDTH)
+    body = bodies[int(pair[BODY_COLUMN])]
+    copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
     turn = (body[0], body[1], body[2], body[3])
     for i in range(3):
         column = rotate_vector(turn, (pair[4 + i], pair[7 + i], pair[10 + i]))
@@ -102,19 +102,19 @@ def _place_box(pair, bodies, placed):
 def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     """Return the tool's proximity `FAR`, `TOUCHING` or `WATCHED`; `watched` is `Pairs.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
-    bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
-    bodies_into(joints, state, bodies)
+    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
-        if pair[BODY] >= 0.0:
+        if pair[BODY_COLUMN] >= 0.0:
             _place_box(pair, bodies, placed)
         else:
-            copy_into(placed, 0, pair, 0, WIDTH)
-        if separation(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
+            copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
+        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
             return WATCHED
     for pair in pairs:
-        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
-        if indentation(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
+        box = _place_box(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
+        if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
             return TOUCHING
     return FAR
 

@@ -36,7 +36,7 @@ from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.environment.environment import Environment, Several
+from drake_teleop.station.environment.environment import Environment, SeveralObjects
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.model.repair_report import join_names
@@ -245,7 +245,7 @@ def _start_overlaps(
     key: HashableByValue, _: tuple[int, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
-    shapes = PostureShapes(slave, Several(parts) if parts else None)
+    shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
     return tuple(overlap_texts(shapes)), tuple(shapes.assumptions)
 

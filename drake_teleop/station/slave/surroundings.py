@@ -27,12 +27,16 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
-    JOINT_WIDTH,
-    POSE_AND_TWIST,
+    NUM_JOINT_COLUMNS,
+    NUM_POSE_AND_TWIST,
     JointTable,
-    bodies_into,
+    poses_and_twists_into,
 )
-from drake_teleop.station.environment.point_contact import WATCHED_WIDTH, WIDTH, ContactPairs
+from drake_teleop.station.environment.point_contact import (
+    NUM_MONITORED_COLUMNS,
+    NUM_PAIR_COLUMNS,
+    ContactPairs,
+)
 
 _FRAME_TOLERANCE = 1e-12  # rounding of frames
 _MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
@@ -78,8 +82,8 @@ class Contact(NamedTuple):
 
 def no_contact() -> Contact:
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
-    pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
-    watched = np.zeros((0, WATCHED_WIDTH))
+    pairs, joints = np.zeros((0, NUM_PAIR_COLUMNS)), np.zeros((0, NUM_JOINT_COLUMNS))
+    watched = np.zeros((0, NUM_MONITORED_COLUMNS))
     return Contact(pairs, watched, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
 
 
@@ -219,10 +223,10 @@ class MovingPose(LeafSystem):
     def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
         super().__init__()
         self._joints, order = JointTable(plant, [body])
-        self._bodies = np.empty((len(order), POSE_AND_TWIST))
+        self._bodies = np.empty((len(order), NUM_POSE_AND_TWIST))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        bodies_into(self._joints, self._state.Eval(context), self._bodies)
+        poses_and_twists_into(self._joints, self._state.Eval(context), self._bodies)
         output.SetFromVector(self._bodies[-1, :7])  # the body is last in its chain
