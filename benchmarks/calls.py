@@ -37,7 +37,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     read_into,
     sensor_chain,
 )
-from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.station import MakeTeleopStation
 
 PERIOD = 1 / 8000  # [s] of the sensor
@@ -141,7 +141,12 @@ def linearisation() -> tuple[float, float]:
     pressing = (0.0, 0.0, -0.04)
     ours = seconds(lambda: linearize(scenario, load_estimate=estimate, displacement=pressing), 1)
     station = MakeTeleopStation(scenario, load_estimate=estimate)
-    return ours, seconds(lambda: advance(MakeSimulator(station, scenario.simulation), 1.0), 1)
+    return ours, seconds(
+        lambda: advance_without_garbage_collection(
+            MakeSimulator(station, scenario.simulation), 1.0
+        ),
+        1,
+    )
 
 
 def measure() -> dict[str, dict[str, float]]:

@@ -54,7 +54,7 @@ from drake_teleop.station.channel import network
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, ScenarioFromData
-from drake_teleop.station.scenario_reference import commented
+from drake_teleop.station.scenario_reference import to_commented_yaml
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
@@ -97,7 +97,7 @@ def _scenario(path: Path) -> None:
     scenario = LoadScenario(path)
     if path.stat().st_size % 4:  # the rest takes longer
         return
-    text = commented(scenario)
+    text = to_commented_yaml(scenario)
     if ScenarioFromData(parse_yaml(text, "printed", tagged=True), "printed") != scenario:
         raise AssertionError("what `drake-teleop scenario` prints is another scenario")
 

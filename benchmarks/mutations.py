@@ -23,7 +23,7 @@ _ANY_ORDER |= {"zip", "isinstance", "getattr", "setattr", "hasattr", "print", "r
 _NO_NUMBERS = re.compile(r"(Error|Warning)$|^(quantity|choice|field|warn|print|_?refuse.*)$")
 _TEXT = re.compile(
     r"^_?(print|draw|write|describe|draft|show|report|plot|say)"
-    r"|(_notes|_rows|_report|_text|_data_sheet|_description|_picture|_table)$|^__(str|repr)__$"
+    r"|(_notes|_rows|_report|_text|_figures|_description|_picture|_table)$|^__(str|repr)__$"
 )
 _MATRIX = re.compile(r"^_?([A-Z]|jacobian|rotation|matrix|axes)")
 _LIMIT = re.compile(r"clip|limit|saturat|bounded")

@@ -40,7 +40,11 @@ from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfi
 from drake_teleop.station.scenario import Rates, Scenario, Simulation, replace
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.sensor_chain import NOISE_BLOCK
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+)
 from drake_teleop.station.slave.joint_control import JointControlConfig
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -140,8 +144,8 @@ def run(
     rows = round(scenario.simulation.duration * scenario.rates.log_hz)
     for engaged, until in ((1.0, OPENED), (0.0, CLOSED), (1.0, END)):
         clutch.FixValue(simulator.get_mutable_context(), [engaged])
-        advance(simulator, min(until, end) * PERIOD)
-    log = read_log(simulator, scenario.simulation.settle)
+        advance_without_garbage_collection(simulator, min(until, end) * PERIOD)
+    log = read_recorded_signals(simulator, scenario.simulation.settle)
     assert len(log.t) == rows + 1
     return Recorded(scenario, log, slave.plant, *poses_of_S(slave.plant, log["joint_position"]))
 

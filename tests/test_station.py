@@ -26,7 +26,11 @@ from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, 
 from drake_teleop.station.operator.task import Touch
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.signals import SIGNALS
-from drake_teleop.station.simulation import MakeSimulator, advance, simulate
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    simulate,
+)
 from drake_teleop.station.slave.arm import MOTION_SIZE, sensor_motion
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.plant import AddSlavePlant
@@ -351,7 +355,7 @@ def test_scales_change_during_a_run_without_force_step(slave):
 
     def forces(duration: float | None) -> np.ndarray:
         simulator = MakeSimulator(station, scenario.simulation)
-        advance(simulator, 0.7)
+        advance_without_garbage_collection(simulator, 0.7)
         context = simulator.get_mutable_context()
         shown = [station.GetOutputPort("force_to_master").Eval(context)[:3].copy()]
         if duration is not None:
@@ -364,7 +368,7 @@ def test_scales_change_during_a_run_without_force_step(slave):
                 duration=duration,
             )
         for time in np.arange(0.7, 1.0, 1 / scenario.rates.hand_hz):
-            advance(simulator, time)
+            advance_without_garbage_collection(simulator, time)
             shown.append(station.GetOutputPort("force_to_master").Eval(context)[:3].copy())
         return np.array(shown)
 

@@ -168,10 +168,10 @@ def print_scenario(name: str | None) -> None:
     its range and its meaning: drake-teleop scenario press > mine.yaml
     """
     from drake_teleop.station.scenario import LoadScenario, ScenarioNames
-    from drake_teleop.station.scenario_reference import commented
+    from drake_teleop.station.scenario_reference import to_commented_yaml
 
     if name is not None:
-        click.echo(commented(LoadScenario(name)), nl=False)
+        click.echo(to_commented_yaml(LoadScenario(name)), nl=False)
         return
     for shipped in ScenarioNames():
         click.echo(f"{shipped:20} {LoadScenario(shipped).description}")

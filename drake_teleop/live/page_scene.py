@@ -56,7 +56,7 @@ class PageScene:
         moves = _Moves()
         try:
             self._scene.canvas = moves
-            self._scene.show(0.0, rows, -1)
+            self._scene.show_sample(0.0, rows, -1)
         except _FAILURE_EXCEPTIONS as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._fail(error)

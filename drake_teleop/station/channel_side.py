@@ -16,7 +16,7 @@ from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.joint_control import servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
-from drake_teleop.station.wiring import export
+from drake_teleop.station.wiring import export_outputs
 
 Array = NDArray[np.float64]
 
@@ -72,8 +72,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         builder.ExportInput(channel.GetInputPort(name), name)
     if scenario.contact_detection is not None:
         builder.ExportInput(channel.GetInputPort("contact"), "contact")
-        export(builder, channel, "contact_at_hand")
-    export(
+        export_outputs(builder, channel, "contact_at_hand")
+    export_outputs(
         builder,
         channel,
         "pose_received",

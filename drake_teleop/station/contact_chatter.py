@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from drake_teleop.station.oscillation import remove_explained, split_at_gaps
+from drake_teleop.station.oscillation import remove_explained_times, split_at_gaps
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
         force: (N,) magnitude of the contact force [N].
         reversals: times of the command's reversals [s].
     """
-    touches = remove_explained(_find_touches(t, force), reversals, _MAX_TIME_TO_REVERSAL_S)
+    touches = remove_explained_times(_find_touches(t, force), reversals, _MAX_TIME_TO_REVERSAL_S)
     found = []
     for series in split_at_gaps(touches, _MAX_INTERVAL_S):
         if len(series) < _MIN_TOUCHES or series[-1] - series[0] < _MIN_DURATION_S:

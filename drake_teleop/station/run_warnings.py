@@ -18,13 +18,13 @@ from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
-    MAX_FAST_FORCE_N,
+    MAX_HIGH_FREQUENCY_FORCE_N,
     REVERSAL_WINDOW_S,
-    fast_part,
-    oscillates,
-    pose_oscillates,
+    doubled_quaternions_near,
+    find_unexplained_oscillation,
+    find_unexplained_pose_oscillation,
+    high_pass,
     pose_reversals,
-    rotation_near,
 )
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
@@ -42,7 +42,7 @@ _MIN_DURATION_S = 0.2
 # Gaps between time spans that are shorter are closed [s].
 _MAX_GAP_S = 0.05
 # Share of a limit from which the limit counts as reached (rounding).
-_LIMIT_SHARE = 1 - 1e-9
+_SHARE_AT_LIMIT = 1 - 1e-9
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
 # Settling time of the command of `ledger` with sufficient energy [s].
@@ -55,7 +55,7 @@ _SETTLING_TIME_CONSTANTS = 6.0
 # Time in which an intent at rest moves by less than a distance.
 _REST_S, _MAX_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
-_MIN_CYCLES = 4
+_MIN_OSCILLATION_CYCLES = 4
 # Largest number of time spans that a warning lists; further ones are counted.
 _MAX_LISTED_TIMES = 3
 
@@ -138,14 +138,14 @@ def _check_limits(
         ("speed", asked, fastest),
         ("torque", result["joint_torque"], arm.effort_limit),
     ):
-        clipped = np.abs(values) >= _LIMIT_SHARE * limit
+        clipped = np.abs(values) >= _SHARE_AT_LIMIT * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
             yield f"joint {joint + 1} is at its largest {what}", find_spans(t, clipped[:, joint])
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _LIMIT_SHARE * device.peak_force
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * device.peak_force
         if isinstance(device, LeaderDevice):
-            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _LIMIT_SHARE * device.peak_torque[0]
+            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
         elif device.peak_torque.all():
             full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
         yield (
@@ -176,7 +176,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
-    for command, actual, least, unit, scale in _pose_parts(sent, received):
+    for command, actual, least, unit, scale in _position_and_rotation_parts(sent, received):
         lag = lag_beyond_delay(t, command, actual, window)
         spans = find_spans(t, lag > least, _MIN_DURATION_S)
         largest = _maximum_within(t, lag, spans)
@@ -186,7 +186,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             spans,
         )
     yield from _check_reserve(result, scenario)
-    oscillating = pose_oscillates(t, sent, received, REVERSAL_WINDOW_S + window)
+    oscillating = find_unexplained_pose_oscillation(t, sent, received, REVERSAL_WINDOW_S + window)
     yield (
         f"the channel ({by}) makes the slave's command oscillate",
         find_spans(t, oscillating, _MIN_DURATION_S),
@@ -205,7 +205,9 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     limit = speed_limit(config, mass)
     then = t - _packet_ages(t, scenario)
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + _SETTLING_TIME_S
-    for g, (command, actual, least, unit, scale) in enumerate(_pose_parts(sent, received)):
+    for g, (command, actual, least, unit, scale) in enumerate(
+        _position_and_rotation_parts(sent, received)
+    ):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
         far = lag_beyond_delay(t, asked, actual, _SETTLING_TIME_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
@@ -222,16 +224,19 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
             " pose (move more slowly, or increase the energy:"
             f" passivity.{scenario.passivity.method}.reserve"
-            f" {_list_text(enough)} and initial {_list_text(enough + config.hand_reserve)}),",
+            f" {_join_values(enough)} and initial {_join_values(enough + config.hand_reserve)}),",
             find_spans(t, held),
         )
 
 
-def _pose_parts(
+def _position_and_rotation_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
     """Return command, motion, smallest lag, display unit and factor, for position and rotation."""
-    rotations = rotation_near(command, command), rotation_near(actual, command)
+    rotations = (
+        doubled_quaternions_near(command, command),
+        doubled_quaternions_near(actual, command),
+    )
     return (
         (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
         (*rotations, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
@@ -246,7 +251,7 @@ def _packet_ages(t: Array, scenario: Scenario) -> Array:
     return (step - newest_packets(line, seed, FORWARD, step[-1] + 1, period)[step]) * period
 
 
-def _list_text(values: Array) -> str:
+def _join_values(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
@@ -267,7 +272,7 @@ def _check_joints(
         largest = _maximum_within(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
-    oscillating = oscillates(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
+    oscillating = find_unexplained_oscillation(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
     yield (
         "the slave oscillates while its command does not,",
         find_spans(t, oscillating, _MIN_DURATION_S),
@@ -276,7 +281,7 @@ def _check_joints(
 
 def _check_hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     if "intent" in result and "pose_master" in result:
-        oscillating = pose_oscillates(
+        oscillating = find_unexplained_pose_oscillation(
             result.t, result["intent"], result["pose_master"], REVERSAL_WINDOW_S
         )
         yield (
@@ -306,20 +311,20 @@ def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans
     if not {"ports", "intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
-    force = fast_part(t, result["force_to_master"][:, :3])
+    force = high_pass(t, result["force_to_master"][:, :3])
     rows = round(_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
     largest, least = _running_maximum(intent, rows), -_running_maximum(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans(t, rests & (rms > MAX_FAST_FORCE_N), _MIN_DURATION_S)
+    spans = find_spans(t, rests & (rms > MAX_HIGH_FREQUENCY_FORCE_N), _MIN_DURATION_S)
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])
     part = force[(t >= start) & (t <= stop)]
     strongest = part[:, part.std(axis=0).argmax()]
     crossings = np.count_nonzero(np.diff(np.signbit(strongest)))
-    if crossings < 2 * _MIN_CYCLES:  # a step is no oscillation
+    if crossings < 2 * _MIN_OSCILLATION_CYCLES:  # a step is no oscillation
         return
     yield (
         f"the rendered force oscillates at {crossings / (2 * (stop - start)):.2g} Hz with up to"
@@ -337,7 +342,7 @@ def _joint_error(result: SimulationResult) -> Array:
 
 
 def _torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    full, peak = np.zeros(len(torque), dtype=bool), _LIMIT_SHARE * device.peak_torque
+    full, peak = np.zeros(len(torque), dtype=bool), _SHARE_AT_LIMIT * device.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
         turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])

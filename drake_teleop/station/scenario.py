@@ -51,7 +51,7 @@ ENVIRONMENTS: Registry[type[Environment]] = Registry(
 )
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
-_CONTACT_STEP_S = 1.25e-4
+_MAX_CONTACT_STEP_S = 1.25e-4
 
 
 @settings
@@ -305,12 +305,12 @@ def _check_steps(scenario: Scenario, where: str) -> None:
     if (
         scenario.surroundings is not None
         and not controlled
-        and simulation.max_step > _CONTACT_STEP_S
+        and simulation.max_step > _MAX_CONTACT_STEP_S
     ):
         raise DrakeTeleopError(
             f"steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",
-            remedy=f"set it to {_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
+            remedy=f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
         )
 
 

@@ -15,7 +15,7 @@ from drake_teleop.station.channel_side import MakeChannel, _limit_method_to_devi
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.memory import HELD_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
@@ -198,11 +198,11 @@ def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
         assert np.isfinite(values).all(), name
     t, force = result.t, np.linalg.norm(result["force_to_master"][:, :3], axis=1)
     position = result["pose_received"][:, 4:]
-    safe = (t > 0.2 + 0.01 + STOP_TIME + 0.005) & (t < 0.4)
+    safe = (t > 0.2 + 0.01 + STOP_TIME_S + 0.005) & (t < 0.4)
     assert force[safe].max() < 1e-12
     assert np.ptp(position[safe], axis=0).max() < 1e-12
     # Later the hand feels the tool's inertia at full, which trembles without the failure as well.
-    resumed = t[1:] < 0.4 + 0.01 + RESUME_TIME
+    resumed = t[1:] < 0.4 + 0.01 + RESUME_TIME_S
     assert np.abs(np.diff(result["force_to_master"][:, :3], axis=0))[resumed].max() < 0.5
     fastest = np.abs(np.diff(sound["pose_received"][:, 4:], axis=0)).max()
     assert np.abs(np.diff(position, axis=0)).max() < 2.0 * fastest

@@ -252,7 +252,7 @@ def test_contact_only_takes_energy_from_the_tool(inserted):
 def test_the_replay_shows_the_slot_where_it_is_and_the_peg_in_it(inserted, meshcat):
     scenario, result = inserted
     scene = ReplayScene(meshcat, scenario, result)
-    scene.show(0.0, result, len(result.t) - 1)
+    scene.show_sample(0.0, result, len(result.t) - 1)
     slot = scene.plant.GetBodyByName("slot").EvalPoseInWorld(scene.context)
     np.testing.assert_allclose(slot.translation(), scenario.slot.position)
     assert len(scene.plant.GetVisualGeometriesForBody(scene.plant.GetBodyByName("slot"))) == 7

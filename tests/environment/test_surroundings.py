@@ -318,7 +318,7 @@ def test_replay_shows_moving_bodies_at_their_poses(tmp_path, meshcat):
         "load_estimate": np.zeros((1, 16)),
     }
     scene = ReplayScene(meshcat, scenario, still | poses)
-    scene.show(0.0, still | poses, 0)
+    scene.show_sample(0.0, still | poses, 0)
     for name, pose in poses.items():
         body = scene.plant.GetBodyByName(name.removeprefix("pose_of_"))
         X_WBody = body.EvalPoseInWorld(scene.context)

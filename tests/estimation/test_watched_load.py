@@ -25,7 +25,12 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+    simulate,
+)
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
@@ -82,10 +87,10 @@ def grasped():
     station = MakeIdentificationStation(SCENARIO, TRAJECTORY)
     simulator = MakeSimulator(station, SCENARIO.simulation)
     simulator.Initialize()
-    advance(simulator, GRASP)
+    advance_without_garbage_collection(simulator, GRASP)
     grasp(station, simulator)
-    advance(simulator, SCENARIO.simulation.duration)
-    return read_log(simulator, 0.0)
+    advance_without_garbage_collection(simulator, SCENARIO.simulation.duration)
+    return read_recorded_signals(simulator, 0.0)
 
 
 @pytest.fixture(scope="module")

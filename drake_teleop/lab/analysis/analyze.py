@@ -28,7 +28,7 @@ from drake_teleop.lab.analysis.task_direction import TaskDirection, task_directi
 from drake_teleop.lab.analysis.two_port import absorb, hybrid
 from drake_teleop.lab.analysis.verdict import verdict
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
@@ -141,7 +141,7 @@ def _analyze(
     summary = _plain(summary)
     summary["verdict"] = verdict(summary)
     nyquist = {}
-    for grip in GRIPS:
+    for grip in GRIP_IMPEDANCES:
         loop = cut_loop(figures.with_grip(contact, grip), sampling)
         nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
     return summary, Curves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)

@@ -40,11 +40,15 @@ from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_ta
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.oscillation import fast_part
+from drake_teleop.station.oscillation import high_pass
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, steps_of
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+)
 from drake_teleop.station.station import MakeTeleopStation
 
 NETWORKS = ("lan", "wan", "internet", "geostationary", "lunar")
@@ -173,7 +177,7 @@ def station_run(
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
-    fast = fast_part(result.t[held], result["force_to_master"][held, :3])
+    fast = high_pass(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),
@@ -192,8 +196,10 @@ def _run_to_end_or_hold(
     simulator.Initialize()
     hold = dataclasses.replace(task, end=task.release)
     for part in (hold, task):
-        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # exactly to the event
-        result = read_log(simulator, settle)
+        advance_without_garbage_collection(
+            simulator, 1e-3 * round(1e3 * (settle + part.end))
+        )  # exactly to the event
+        result = read_recorded_signals(simulator, settle)
         found = station_figures(result, scenario, part)
         if not found.stable:
             break

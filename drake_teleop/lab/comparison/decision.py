@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drake_teleop.lab.comparison.one_dof import TIP
-from drake_teleop.station.oscillation import MAX_FAST_FORCE_N
+from drake_teleop.station.oscillation import MAX_HIGH_FREQUENCY_FORCE_N
 
 UNSTABLE, POSITION_ERROR, CHATTERS = "unstable", "position error", "chatters"
 LEAKS, HOLDS = "leaks", "holds"
@@ -60,7 +60,7 @@ def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
         return Cell(POSITION_ERROR, forces, leaked=leaked)
-    if max(run["fast_force"] for run in runs) > MAX_FAST_FORCE_N:
+    if max(run["fast_force"] for run in runs) > MAX_HIGH_FREQUENCY_FORCE_N:
         return Cell(CHATTERS, forces, leaked=leaked)
     return Cell(LEAKS if leaked > MIN_LEAK_J else HOLDS, forces, leaked=leaked)
 

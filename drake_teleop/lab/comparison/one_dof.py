@@ -25,7 +25,7 @@ from drake_teleop.station.channel.channel import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.memory import LEDGER
+from drake_teleop.station.passivity.memory import STORED_ENERGY
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
@@ -173,7 +173,7 @@ def run_one_dof(
         servo_damping=[model.believed_damping * model.servo_damping] * 2,
         slave_mass=[model.believed_mass * model.slave_mass] * 2,
     )
-    p = methods.parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
+    p = methods.method_parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
     intent = operators_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
     # The channel's command belongs to the next step; here it is used at once.
@@ -191,7 +191,9 @@ def run_one_dof(
     ]
     states = [network.initial_network_state(line, np.zeros(PACKET_SIZE)) for line in lines]
     ends = initial_state_of_ends(passivity.method, p, start)
-    stored = float(ends[MASTER_METHOD_MEMORY][LEDGER][0] + ends[SLAVE_METHOD_MEMORY][LEDGER][0])
+    stored = float(
+        ends[MASTER_METHOD_MEMORY][STORED_ENERGY][0] + ends[SLAVE_METHOD_MEMORY][STORED_ENERGY][0]
+    )
     numbers = (
         model.device_mass, model.device_friction, model.slave_mass, model.servo_stiffness,
         model.servo_damping, model.ideal_servo, model.slave_friction, model.motor_lag,

@@ -17,7 +17,12 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+    simulate,
+)
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 Values = dict[str, Any]
@@ -120,13 +125,15 @@ def ideal_motion(progress: UpdateProgress) -> IdealMotion:
     place = list(plant.GetJointIndices()).index(weld.index())
     wrenches = np.empty((round((simulation.settle + simulation.duration) * rate) + 1, 6))
     for k in range(len(wrenches)):
-        advance(simulator, k * (1 / rate))  # the same product as Drake's event times
+        advance_without_garbage_collection(
+            simulator, k * (1 / rate)
+        )  # the same product as Drake's event times
         reaction = reactions.Eval(context)[place]
         wrenches[k] = *reaction.translational(), *reaction.rotational()
         if k % 256 == 0:
             progress(k / len(wrenches))
     progress(1.0)
-    result = read_log(simulator, simulation.settle)
+    result = read_recorded_signals(simulator, simulation.settle)
     taken = np.rint((result["sample_time"][:, 0] + simulation.settle) * rate).astype(int)
     started = taken >= 0
     _, s, omega, alpha = (part[started] for part in sensor_samples(result))

@@ -11,7 +11,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.scenario import Scenario, Simulation
-from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -44,7 +44,7 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
-    advance(simulator, scenario.simulation.settle)
+    advance_without_garbage_collection(simulator, scenario.simulation.settle)
     return simulator
 
 
@@ -59,7 +59,9 @@ def cpu_seconds(
     for k in range(repetitions):
         for name, simulator in simulators.items():
             start = time.thread_time()
-            advance(simulator, simulator.get_context().get_time() + _RUN_S)
+            advance_without_garbage_collection(
+                simulator, simulator.get_context().get_time() + _RUN_S
+            )
             times_s[name].append((time.thread_time() - start) / _RUN_S)
         progress((k + 1) / repetitions)
     return {name: min(times) for name, times in times_s.items()}

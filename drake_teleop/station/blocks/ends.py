@@ -59,7 +59,7 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         super().__init__()
         start, scales = finite_array("start", start, 7), finite_array("scales", scales, 2)
         rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
-        parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
+        parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         frame = np.concatenate([rotation.ravel(), scales])
         self._method = methods.steps_of(passivity.method)
         self._constants = period, timeout, frame, parameters

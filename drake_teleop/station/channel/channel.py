@@ -22,23 +22,29 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.memory import FILL_TIME, LIMIT, LOAD_WRENCH, MEMORY_SIZE, Slots
+from drake_teleop.station.passivity.memory import (
+    FILL_TIME,
+    LOAD_WRENCH,
+    MEMORY_SIZE,
+    WRENCH_LIMIT,
+    SlotAllocator,
+)
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import (
     CONTACT_FLAG,
     INPUTS_FINITE,
     LOAD,
     PACKET_SIZE,
-    dot,
+    dot_of_group,
     pose_difference_into,
 )
 from drake_teleop.station.passivity.safe_state import (
-    MASTER_WATCH,
+    MASTER_MONITOR_SIZE,
     SILENCE_S,
-    SLAVE_WATCH,
-    STOP_TIME,
-    initial_master_watch,
-    initial_slave_watch,
+    SLAVE_MONITOR_SIZE,
+    STOP_TIME_S,
+    initial_master_monitor,
+    initial_slave_monitor,
     master_limits_into,
     slave_command_into,
 )
@@ -96,8 +102,8 @@ class Channel(NetworkConfig):
 
 
 # State of both ends in one array.
-_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_WATCH + SLAVE_WATCH
-_slots = Slots(_STATE_SIZE)
+_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_MONITOR_SIZE
+_slots = SlotAllocator(_STATE_SIZE)
 _STEP_COUNT = _slots.number()  # number of the step
 _LAST_POSE_AT_MASTER = _slots.vector(
     8
@@ -107,17 +113,17 @@ _RENDERED_WRENCH = _slots.vector(6)  # wrench rendered since the last step
 _VALID_WRENCH_AT_SLAVE = _slots.vector(6)  # slave's wrench at the last step
 _VALID_TIME = _slots.number()  # time with valid wrenches [s]
 _MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = (
-    _slots.vector(MASTER_WATCH),
-    _slots.vector(SLAVE_WATCH),
+    _slots.vector(MASTER_MONITOR_SIZE),
+    _slots.vector(SLAVE_MONITOR_SIZE),
 )
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _slots.vector(MEMORY_SIZE), _slots.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world, one array.
-_slots = Slots(11)
+_slots = SlotAllocator(11)
 _ROTATION = _slots.vector(9)  # R_WB by rows
 _SCALES = _slots.vector(2)  # of translation and rotation
 # Recorded values, see `ports` of `TeleopChannel`.
 NUM_PORT_SIGNALS = 8
-_slots = Slots(NUM_PORT_SIGNALS)
+_slots = SlotAllocator(NUM_PORT_SIGNALS)
 _WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH, _SILENCE = (
     _slots.vector(2),
     _slots.vector(2),
@@ -125,7 +131,7 @@ _WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH, _SILENCE = (
 )
 _WORK_ALONG_COMMAND = _slots.vector(2)
 # Received values at the master.
-_slots = Slots(7)
+_slots = SlotAllocator(7)
 _RENDERED, _CONTACT_FLAG = _slots.vector(6), _slots.number()
 
 # Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
@@ -140,10 +146,10 @@ def initial_state_of_ends(
     """Return the state of both ends before their first step; `start` (7,) is the slave's X_WS."""
     ends = np.zeros(_STATE_SIZE)
     ends[_LAST_POSE_AT_MASTER][:7] = ends[_LAST_POSE_AT_SLAVE][:7] = start
-    ends[_VALID_TIME] = STOP_TIME
-    ends[_MASTER_SILENCE_MONITOR] = initial_master_watch()
-    ends[_SLAVE_SILENCE_MONITOR] = initial_slave_watch(start)
-    memory = methods.initial_memory(method, parameters, start)
+    ends[_VALID_TIME] = STOP_TIME_S
+    ends[_MASTER_SILENCE_MONITOR] = initial_master_monitor()
+    ends[_SLAVE_SILENCE_MONITOR] = initial_slave_monitor(start)
+    memory = methods.initial_method_memory(method, parameters, start)
     ends[MASTER_METHOD_MEMORY] = ends[SLAVE_METHOD_MEMORY] = memory
     return ends
 
@@ -222,7 +228,7 @@ def step_master_end(
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        work[g] -= dot(held, dx, g)
+        work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
     if all_in_range(hand_B):
         _wrench_to_world(hand_B, frame, hand)
@@ -230,7 +236,7 @@ def step_master_end(
         valid = False
     healthy = fresh and received[INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
-    master_limits_into(healthy, fault, T, timeout, parameters[LIMIT], held, watch, limits)
+    master_limits_into(healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits)
     methods.master_step(
         steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
         packet,
@@ -246,7 +252,8 @@ def step_slave_end(
     steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
-    """Run one step of the slave's end; arguments are those of `step_channel` and `step_master_end`."""
+    """Run one step of the slave's end; arguments are those of `step_channel` and"
+    " `step_master_end`."""
     before, held = ends[_LAST_POSE_AT_SLAVE], ends[_VALID_WRENCH_AT_SLAVE]
     watch, memory, work = (
         ends[_SLAVE_SILENCE_MONITOR],
@@ -259,7 +266,7 @@ def step_slave_end(
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        work[g] += dot(held, dx, g)
+        work[g] += dot_of_group(held, dx, g)
     load = memory[LOAD_WRENCH]
     if not (all_in_range(wrench_B) and all_in_range(load_B)):
         valid = False
@@ -269,7 +276,7 @@ def step_slave_end(
     else:
         # Blend from the kept wrench to the measured one.
         _wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(STOP_TIME - ends[_VALID_TIME], T)
+        share = T / max(STOP_TIME_S - ends[_VALID_TIME], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _wrench_to_world(load_B, frame, wrench)
@@ -290,7 +297,7 @@ def step_slave_end(
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
     pose_difference_into(pose_received, left, dx)
     for g in range(2):
-        ports[_WORK_ALONG_COMMAND][g] += dot(held, dx, g)
+        ports[_WORK_ALONG_COMMAND][g] += dot_of_group(held, dx, g)
 
 
 @njit(cache=True)
@@ -379,7 +386,7 @@ class TeleopChannel(LeafSystem):
             network.network_parameters(line, seed, direction, period, least=_MIN_DELAY)
             for line, direction in zip(channel.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
-        parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
+        parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         self._steps = methods.steps_of(passivity.method)
         self._uses_load = methods.METHODS[passivity.method].needs_load_apart
         self._constants = (

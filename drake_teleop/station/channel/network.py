@@ -22,7 +22,7 @@ from drake_teleop.station.passivity.packet import (
     VELOCITY,
     WRENCH,
     has_arrived,
-    moved_pose_into,
+    move_pose_into,
 )
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
@@ -322,7 +322,7 @@ def _fill_silence(policy, silent, packet):
         velocity[:] = 0.0
         packet[WRENCH] = packet[LOAD] = 0.0
     elif policy == _POLICY_EXTRAPOLATE and has_arrived(packet):
-        moved_pose_into(pose, velocity * min(silent, MAX_EXTRAPOLATION_S), pose)
+        move_pose_into(pose, velocity * min(silent, MAX_EXTRAPOLATION_S), pose)
         if silent > MAX_EXTRAPOLATION_S:
             velocity[:] = 0.0
 

@@ -15,12 +15,12 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
-from drake_teleop.station.passivity.memory import Slots
-from drake_teleop.station.passivity.packet import limit
+from drake_teleop.station.passivity.memory import SlotAllocator
+from drake_teleop.station.passivity.packet import limit_group
 from drake_teleop.station.passivity.safe_state import (
-    MASTER_WATCH,
-    STOP_TIME,
-    initial_master_watch,
+    MASTER_MONITOR_SIZE,
+    STOP_TIME_S,
+    initial_master_monitor,
     master_limits_into,
 )
 
@@ -28,10 +28,10 @@ from drake_teleop.station.passivity.safe_state import (
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
-_slots = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
+_slots = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
 _POSITIONS, _LAST_POSITIONS, DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
 _FAULT, _IS_WRENCH_REDUCED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
-_SILENCE_MONITOR = _slots.vector(MASTER_WATCH)
+_SILENCE_MONITOR = _slots.vector(MASTER_MONITOR_SIZE)
 _DISPLAYED_AND_FAULT = slice(DISPLAYED.start, _FAULT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
@@ -48,7 +48,7 @@ def initial_display_state(
 ) -> NDArray[np.float64]:
     display = np.zeros(_SILENCE_MONITOR.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
-    display[_SILENCE_MONITOR] = initial_master_watch(_peak_wrench_of_device(numbers))
+    display[_SILENCE_MONITOR] = initial_master_monitor(_peak_wrench_of_device(numbers))
     return display
 
 
@@ -110,14 +110,14 @@ def _fade_after_fault(device, numbers, period, drive):
     limits, full = np.empty(2), _peak_wrench_of_device(numbers)
     fault = drive[_FAULT] != _NO_FAULT
     drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
-    # Complete within STOP_TIME, so that the direction does not jump either.
-    share = 0.0 if fault else period / max(STOP_TIME + period - drive[_TIME_SINCE_FAULT], period)
+    # Complete within STOP_TIME_S, so that the direction does not jump either.
+    share = 0.0 if fault else period / max(STOP_TIME_S + period - drive[_TIME_SINCE_FAULT], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
     master_limits_into(not fault, fault, period, 0.0, full, last, drive[_SILENCE_MONITOR], limits)
     drive[_IS_WRENCH_REDUCED] = 0.0
     for g in range(2):
-        limit(displayed, g, limits[g])
+        limit_group(displayed, g, limits[g])
         if limits[g] < full[g]:
             drive[_IS_WRENCH_REDUCED] = 1.0
     if not fault:

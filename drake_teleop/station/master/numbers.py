@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drake_teleop.station.passivity.memory import Slots
+from drake_teleop.station.passivity.memory import SlotAllocator
 
 NUM_DEVICE_PARAMETERS = 31  #: length of the vector
-_slots = Slots(NUM_DEVICE_PARAMETERS)
+_slots = SlotAllocator(NUM_DEVICE_PARAMETERS)
 HAND_MASS = _slots.number()  #: mass of the hand on the grip [kg]
 HAND_INERTIA = _slots.number()  #: inertia of the hand about every axis through E [kg m^2]
 COULOMB = _slots.vector(6)  #: Coulomb friction of the device's axes [N or N m]
