@@ -32,12 +32,12 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.sensor.motion_estimation import estimate_into, motion_estimator
+from drake_teleop.station.sensor.motion_estimation import estimate_sample_into, motion_estimator
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
-    read_into,
-    sensor_chain,
+    SAMPLES_PER_NOISE_BLOCK,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 
@@ -49,8 +49,8 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
     """The sensor's chain and the motion estimation, over a whole record."""
     reading = np.empty(truth.shape[1] - 2)
     for k in range(len(truth)):
-        read_into(constants, memory, noise[k // NOISE_BLOCK], truth[k], reading)
-        estimate_into(estimator, remembered, table, reading, samples[k])
+        read_sensor_into(constants, memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading)
+        estimate_sample_into(estimator, remembered, table, reading, samples[k])
 
 
 def reached(
@@ -70,7 +70,7 @@ def reached(
     sensor_vectors(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     noisy = without_parts(sensor, "calibration")
-    constants, memory = sensor_chain(noisy, joints[0].shape[1], period)
+    constants, memory = sensor_chain_constants(noisy, joints[0].shape[1], period)
     estimator, remembered = motion_estimator(
         scenario.motion_estimation, noisy, joints[0].shape[1], period
     )
@@ -78,7 +78,7 @@ def reached(
     rng = np.random.default_rng(0)
     true, sizes = values_of_required(tolerance, phi), tolerances_in_units(tolerance, phi)
     for _ in range(records):
-        noise = rng.standard_normal((len(truth) // NOISE_BLOCK + 1, NOISE_SIZE))
+        noise = rng.standard_normal((len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         parts = (samples[:, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(*parts, noise=sensor.wrench_std())

@@ -39,7 +39,7 @@ from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Rates, Scenario, Simulation, replace
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
-from drake_teleop.station.sensor.sensor_chain import NOISE_BLOCK
+from drake_teleop.station.sensor.sensor_chain import SAMPLES_PER_NOISE_BLOCK
 from drake_teleop.station.simulation import (
     MakeSimulator,
     advance_without_garbage_collection,
@@ -441,7 +441,7 @@ def test_the_load_estimator_learns_by_the_scenarios_method_and_sensor(finely_log
     estimator = RecursiveTotalLeastSquares(sensor.wrench_std(), motion, forgetting=0.98)
     # The log shows the last sample of each block of noise differently.
     rows = instants(finely_logged, 500.0)
-    rows = rows[log.t[rows] < 0.99 * NOISE_BLOCK * period]
+    rows = rows[log.t[rows] < 0.99 * SAMPLES_PER_NOISE_BLOCK * period]
     names = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
     estimator.learn(log["measured_wrench_S"][rows], *(log[name][rows] for name in names))
     expected = np.concatenate([estimator.offsets, estimator.phi])

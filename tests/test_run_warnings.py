@@ -23,7 +23,7 @@ from drake_teleop.station.scenario import Scenario, Simulation, replace
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import SLIDES
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.station import MakeTeleopStation
@@ -200,7 +200,7 @@ def test_further_times_are_counted():
 
 def test_lag_of_prismatic_joint_is_in_millimetres():
     sliding = dataclasses.replace(ARM, table=ARM.table.copy())
-    sliding.table[5, SLIDES] = 1.0
+    sliding.table[5, IS_PRISMATIC_COLUMN] = 1.0
     late = recorded(slave_state=(5, 0.01 * during(1, 1.5)))
     (warning,) = run_warnings(late, OVER_NETWORK, sliding)
     assert "joint 6 is up to 10.0 mm behind" in warning

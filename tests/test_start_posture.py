@@ -113,7 +113,7 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     plan.shapes.move_to(plan.place.q)
     # The base link has a plate on the plane; everything that moves is above it.
     assert plan.plane == pytest.approx(0.0, abs=1e-9)
-    assert plan.shapes.points(plan.shapes.moving())[:, 2].min() > 0.02
+    assert plan.shapes.points_on_bodies(plan.shapes.moving_bodies())[:, 2].min() > 0.02
     assert start_overlaps(slave_of(plan, path), wall_of(plan))[0] == ()
     assert wall_of(plan).position[2] < plan.lowest[2] - 0.01
 

@@ -192,7 +192,7 @@ def batch_identification(
 
 def _design_trajectory(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
-    models = [path.read_bytes() for path in scenario.slave.files()]
+    models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
     if key not in _DESIGN_CACHE or scenario.environment:  # the environment's files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration

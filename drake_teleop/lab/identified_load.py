@@ -99,7 +99,7 @@ def _cache_key(before: Scenario, detects: bool) -> str:
 
     computed_by = [f"{name} {version(name)}" for name in _LIBRARIES]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
-    models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.files()]
+    models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.model_files()]
     what = (__version__, dataclasses.asdict(before), detects, computed_by, models)
     return sha256(repr(what).encode()).hexdigest()
 

@@ -61,7 +61,7 @@ class Detection:
     floor: NoiseFloor
     statistic: str
     threshold: float
-    statistics_of_log: Array
+    statistics: Array
     touched: NDArray[np.bool_]
     free_s: float
     force_threshold: float

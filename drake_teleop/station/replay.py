@@ -37,12 +37,12 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import POSE_SIGNAL_PREFIX
 from drake_teleop.station.slave.model.meshes import AddSkeleton
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import (
+    AddedEnvironment,
     AddEnvironment,
     MovingBodies,
-    Touched,
-    positions_of,
+    joint_positions_of_pose,
 )
 
 Array = NDArray[np.float64]
@@ -212,14 +212,14 @@ class ReplayScene:
         nominal = NominalSlave(scenario.slave)
         self._joints, self._tip = nominal.arm.num_joints, nominal.tip
         AddSkeleton(self.plant, self._sensor)
-        touched = Touched([], None)
+        touched = AddedEnvironment([], None)
         if scenario.surroundings is not None:
             touched = AddEnvironment(self.plant, scenario.surroundings)
         self._sheet = touched.sheet
         self._master = None
         if "master_state" in recorded:
             self._master = _add_master(self.plant, scenario)
-        finalize(self.plant)
+        finalize_plant(self.plant)
         self._moving_bodies = {
             POSE_SIGNAL_PREFIX + k: body for k, body in MovingBodies(self.plant, touched).items()
         }
@@ -279,7 +279,7 @@ class ReplayScene:
         X_WF = joint.frame_on_parent().CalcPoseInWorld(self.context)
         X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
         q, first = self.plant.GetPositions(self.context), joint.position_start()
-        moved = positions_of(joint, X_WF.inverse() @ X_WBody @ X_BM)
+        moved = joint_positions_of_pose(joint, X_WF.inverse() @ X_WBody @ X_BM)
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 

@@ -29,7 +29,7 @@ from drake_teleop.station.oscillation import (
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.slave.arm import SLIDES, ArmModel
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.posture_shapes import start_overlaps
 
@@ -263,11 +263,12 @@ def _check_joints(
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
     window = (
-        _SETTLING_TIME_CONSTANTS * scenario.joint_control.lag + 1 / scenario.rates.joint_control_hz
+        _SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+        + 1 / scenario.rates.joint_control_hz
     )
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
-        slides = arm.table[k, SLIDES] != 0.0
+        slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
         spans = find_spans(t, far > (_MIN_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_DURATION_S)
         largest = _maximum_within(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"

@@ -39,7 +39,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
-from drake_teleop.station.sensor.presets import preset_of
+from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.joint_control import JointControlConfig, default_interface
 from drake_teleop.station.slave.scene import Scene
@@ -251,7 +251,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     """
     check_structure(Scenario, data, where)  # before the presets are read
     defaults = Scenario(
-        wrist_sensor=preset_of(data.get("wrist_sensor")),
+        wrist_sensor=preset_of_block(data.get("wrist_sensor")),
         master=Master(figures=data_sheet_of(data.get("master"))),
         joint_control=JointControlConfig(interface=default_interface(data.get("joint_control"))),
     )

@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
 from drake_teleop.common.texts import parse_yaml, yaml_scalar
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
-from drake_teleop.station.sensor.presets import preset_of
+from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 _COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
@@ -114,7 +114,11 @@ def _block_lines(config: Any) -> list[str]:
     starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
     column = min(_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
-    preset = preset_of({"preset": config.preset}) if isinstance(config, WristSensorConfig) else None
+    preset = (
+        preset_of_block({"preset": config.preset})
+        if isinstance(config, WristSensorConfig)
+        else None
+    )
     lines = []
     for entry in entries:
         if entry.kind == "block":

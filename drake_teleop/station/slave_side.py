@@ -324,10 +324,10 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
     """Raise DrakeTeleopError for dry friction that stops a joint within one step [s]."""
-    if not slave.friction.any():
+    if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
-    slope = np.diag(slave.friction / FRICTION_SPEED)
+    slope = np.diag(slave.joint_friction / FRICTION_SPEED)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
     if rate * step > _MAX_FRICTION_STEP:
         shorter = 0.9 * _MAX_FRICTION_STEP / rate
@@ -353,8 +353,8 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
         if slave.contact.plant_size:
             builder.Connect(plant.get_state_output_port(), contact.GetInputPort("plant_state"))
     export_outputs(builder, contact, "true_contact_wrench_W")
-    if slave.sheet is not None:
-        sheet = plant.get_state_output_port(slave.sheet)
+    if slave.sheet_instance is not None:
+        sheet = plant.get_state_output_port(slave.sheet_instance)
         builder.ExportOutput(sheet, "sheet_state")
         if slave.sensed_sheet is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))

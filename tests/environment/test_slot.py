@@ -182,7 +182,14 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     q, status = nearest_branch(R_WS.matrix(), p_WS, near, arm.lower, arm.upper)
     assert status == IkStatus.OK
     environment_wrench(
-        arm.table, *slave.contact.law, np.zeros(6), q, 0 * q, np.zeros(2), np.zeros(0), wrench
+        arm.table,
+        *slave.contact.compiled_law_arguments,
+        np.zeros(6),
+        q,
+        0 * q,
+        np.zeros(2),
+        np.zeros(0),
+        wrench,
     )
     return wrench
 

@@ -33,9 +33,9 @@ from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
-    FAR,
-    TOUCHING,
-    WATCHED,
+    PROXIMITY_FAR,
+    PROXIMITY_NEAR_MONITORED,
+    PROXIMITY_TOUCHING,
     environment_wrench,
     tool_proximity,
 )
@@ -80,7 +80,14 @@ def test_walls_and_boxes_follow_drakes_contact_law():
         results = plant.get_contact_results_output_port().Eval(context)
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
-            slave.arm.table, *slave.contact.law, np.zeros(6), q, v, np.zeros(2), np.zeros(0), found
+            slave.arm.table,
+            *slave.contact.compiled_law_arguments,
+            np.zeros(6),
+            q,
+            v,
+            np.zeros(2),
+            np.zeros(0),
+            found,
         )
         expected = contact_wrench_W(results, slave.contact.bodies, slave.contact.shapes)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
@@ -130,7 +137,11 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         arm = [get(context, slave.instance) for get in (plant.GetPositions, plant.GetVelocities)]
         state = plant.GetPositionsAndVelocities(context)
         environment_wrench(
-            *(slave.arm.table, *slave.contact.law, np.zeros(6)), *arm, np.zeros(2), state, found
+            *(slave.arm.table, *slave.contact.compiled_law_arguments, np.zeros(6)),
+            *arm,
+            np.zeros(2),
+            state,
+            found,
         )
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         touched.add((bool(k % 2), bool(expected.any())))
@@ -214,7 +225,7 @@ def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
         return
     # Its log has the leaf, and no other body moves.
     assert station.HasOutputPort("sheet_state")
-    assert "leaf is not alone" in sensor.beyond
+    assert "leaf is not alone" in sensor.reason_beyond_contact_law
 
 
 def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
@@ -259,14 +270,19 @@ def test_separation_of_tool_and_unmodelled_shapes():
     slave = Slave(position=[0.5, 0.0, 0.45], tool=Tool(mass=1.0, shapes=shapes))
     wall = Wall(position=[0.5, 0.0, 0.0])
     built, found = AddSlavePlant(DiagramBuilder(), slave, wall), []
-    pairs, joints = built.contact.law
+    pairs, joints = built.contact.compiled_law_arguments
     for height in (0.2499, 0.2501, 0.3279, 0.3281):
         rows = [pairs.copy(), built.contact.watched.copy()]
         for row in rows:
             row[:, 15] += height
         nothing = np.zeros(2)
         found.append(tool_proximity(built.arm.table, *rows, joints, built.start, nothing, nothing))
-    assert found == [FAR, TOUCHING, TOUCHING, WATCHED]  # from 0.45 - 0.1 - 0.002 - 0.02
+    assert found == [
+        PROXIMITY_FAR,
+        PROXIMITY_TOUCHING,
+        PROXIMITY_TOUCHING,
+        PROXIMITY_NEAR_MONITORED,
+    ]  # from 0.45 - 0.1 - 0.002 - 0.02
 
 
 @pytest.mark.long

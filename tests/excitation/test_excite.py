@@ -37,16 +37,16 @@ from drake_teleop.station.film import ReplayFile
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    estimate_into,
+    estimate_sample_into,
     motion_estimator,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
+    SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -160,8 +160,8 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
     """Return a record through sensor chain and motion estimation."""
     reading = np.empty(truth.shape[1] - 2)
     for k in range(len(truth)):
-        read_into(constants, memory, noise[k // NOISE_BLOCK], truth[k], reading)
-        estimate_into(estimator, remembered, table, reading, samples[k])
+        read_sensor_into(constants, memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading)
+        estimate_sample_into(estimator, remembered, table, reading, samples[k])
 
 
 @pytest.mark.long
@@ -178,12 +178,12 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     vectors = np.empty((3, len(t), 3))
     sensor_vectors(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
-    constants, memory = sensor_chain(sensor, 6, period)
+    constants, memory = sensor_chain_constants(sensor, 6, period)
     estimator, remembered = motion_estimator(motion, sensor, 6, period)
     samples, found = np.empty((len(t), 22)), []
     rng = np.random.default_rng(0)
     for _ in range(200):
-        noise = rng.standard_normal((len(t) // NOISE_BLOCK + 1, NOISE_SIZE))
+        noise = rng.standard_normal((len(t) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         wrench, s, omega, alpha = (samples[::2, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(wrench, s, omega, alpha, noise=sensor.wrench_std())
@@ -686,13 +686,13 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
     sensor = dataclasses.replace(
         without_parts(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
     )
-    constants, memory = sensor_chain(sensor, joints, 1e-3)
+    constants, memory = sensor_chain_constants(sensor, joints, 1e-3)
     rng = np.random.default_rng(0)
     readings = np.empty((len(recording.t), 13 + joints))
     for k, truth in enumerate(recording.truth):
-        if k % NOISE_BLOCK == 0:
+        if k % SAMPLES_PER_NOISE_BLOCK == 0:
             noise = rng.standard_normal(NOISE_SIZE)
-        read_into(constants, memory, noise, truth, readings[k])
+        read_sensor_into(constants, memory, noise, truth, readings[k])
     log = write_log(tmp_path, recording.t, readings, recording)
     with pytest.raises(SystemExit) as stop:
         main(["identify", str(log), "--out", str(tmp_path / "load"), "--quiet"])

@@ -44,8 +44,8 @@ from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.sensor.sensor_chain import without_parts
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.joint_commands import AUTOMATIC, ik_method_name
-from drake_teleop.station.slave.plant import ARM, NominalSlave
+from drake_teleop.station.slave.joint_commands import AUTOMATIC_METHOD, ik_method_name
+from drake_teleop.station.slave.plant import ARM_INSTANCE_NAME, NominalSlave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
@@ -397,7 +397,7 @@ class _Period:
         joints = self._context("slave_plant").num_continuous_states() // 2
         axes = self._device.num_joints
         # The sensor's memory contains angles, which must stay small.
-        remembered = np.full(len(self._sensor.remembered), _ANGLE_STEP)
+        remembered = np.full(len(self._sensor.motion_dependent_indices), _ANGLE_STEP)
         return [
             whole("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
             whole("master_device", 1, np.full(7, _ANGLE_STEP)),
@@ -408,7 +408,7 @@ class _Period:
             _States(
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
-            _States("wrist_sensor", 0, self._sensor.remembered, remembered),
+            _States("wrist_sensor", 0, self._sensor.motion_dependent_indices, remembered),
             *self._ik_state(),
         ]
 
@@ -448,7 +448,7 @@ class _Period:
         self._fix("wrist_sensor", "applied_wrench_W", push)
 
     def _slave_state(self) -> Array:
-        return self._eval("slave_plant", f"{ARM}_state")
+        return self._eval("slave_plant", f"{ARM_INSTANCE_NAME}_state")
 
     def _run(self) -> Array:
         # At this time no event of noise or log interferes.
@@ -588,13 +588,13 @@ def _linear_part(scenario: Scenario) -> Scenario:
         slave__friction=[],
         load_estimator__enabled=False,
         # The closed form, if the arm has one, has no state.
-        slave__inverse_kinematics=AUTOMATIC,
+        slave__inverse_kinematics=AUTOMATIC_METHOD,
     )
 
 
 def _check_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
-    if beyond := sensor.beyond or sensor.moves:
+    if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
         raise DrakeTeleopError(
             f"this environment cannot be linearised: {beyond}",
             where="environment",

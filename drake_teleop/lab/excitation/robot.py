@@ -27,7 +27,7 @@ from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 _NUM_POSTURES = 1000  # random postures for distances of shapes
@@ -186,7 +186,7 @@ def _make_robot(
 ) -> Robot:
     """Return the robot with its limits; `box` is middle and half size in W [m]."""
     arm = scene.arm
-    middle, half = arm.middle, (arm.upper - arm.lower) / 2
+    middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
     random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
     postures = middle + sampled_half(half) * random
     candidates, touching = scene.without_neighbours(postures, start)
@@ -236,7 +236,7 @@ def _make_robot(
 def _read_arm(parse: Parse) -> ArmModel:
     plant = MultibodyPlant(0.0)
     instance, frame = parse(plant)
-    finalize(plant)
+    finalize_plant(plant)
     return ArmModelFromPlant(plant, instance, frame.name())
 
 

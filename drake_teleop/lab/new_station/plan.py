@@ -193,7 +193,7 @@ def base_plane(shapes: PostureShapes) -> float:
 
     Without such shapes: the base, but not above the first joint.
     """
-    heights = shapes.points(shapes.anchored())[:, 2]
+    heights = shapes.points_on_bodies(shapes.anchored_bodies())[:, 2]
     return float(heights.min()) if len(heights) else min(float(shapes.arm.table[0, 11]), 0.0)
 
 

@@ -76,7 +76,7 @@ class Combination:
         words: the sum as text.
     """
 
-    regressor_coefficients: Array
+    coefficients: Array
     leading: int
     value: float
     standard_deviation: float

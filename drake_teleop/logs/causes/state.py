@@ -195,7 +195,7 @@ class State:
 
     data: Instants
     spans: Spans
-    fit_model: Fit
+    fit: Fit
 
     @classmethod
     def fit_record(

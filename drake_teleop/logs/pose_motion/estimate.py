@@ -105,7 +105,7 @@ class PoseMotion:
     splines: PoseSplines
     delay_s: float
     delay_deviation: float
-    estimate_clock_rate_error: float
+    clock_rate: float
     imu_agrees: bool
 
     @property

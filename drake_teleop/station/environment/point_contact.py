@@ -34,9 +34,9 @@ from drake_teleop.common.vectors import (
 
 Array = NDArray[np.float64]
 
-#: Columns of `Pairs.known`: stiffness; static and dynamic friction; row of the box's body.
+#: Columns of `ShapePairs.known`: stiffness; static and dynamic friction; row of the box's body.
 STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_COLUMN = 22, slice(24, 26), 27
-#: Number of columns of `Pairs.known` and `Pairs.watched`.
+#: Number of columns of `ShapePairs.known` and `ShapePairs.watched`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
 _STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
 _MIN_SLIP_SPEED = 1e-14  # m/s, as in Drake: a point at rest has a direction
@@ -188,7 +188,7 @@ def depth_of_sphere_in_box(
     """Return the depth of a sphere in its box [m], below 0 if they are apart.
 
     Args:
-        pair: (28,) row of `Pairs.known`.
+        pair: (28,) row of `ShapePairs.known`.
         deflection: deflection of the sheet spring [m].
         normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
@@ -237,7 +237,7 @@ def min_distance_of_boxes(
 ) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    `pair` (40,) is a row of `Pairs.watched`, for the tool's box; `box` (28,) is this row with the
+    `pair` (40,) is a row of `ShapePairs.watched`, for the tool's box; `box` (28,) is this row with the
     present pose of the other box. The bound is the largest gap along an edge of either box.
     """
     R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
@@ -273,7 +273,7 @@ def _friction_coefficient(static: float, dynamic: float, slip: float) -> float:
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
     """Write the contact force on a sphere in its box into `force` (3,) [N].
 
-    `pair` (28,) is a row of `Pairs.known`, `x` the depth [m], `normal` the direction out of the
+    `pair` (28,) is a row of `ShapePairs.known`, `x` the depth [m], `normal` the direction out of the
     box, `velocity` that of the sphere at the contact, relative to the box [m/s].
     """
     out = dot(velocity, normal)

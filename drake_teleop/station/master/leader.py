@@ -20,8 +20,8 @@ from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, display_into
 from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.slave.arm import (
-    DAMPING,
-    GRAVITY,
+    DAMPING_COLUMN,
+    GRAVITY_COLUMN,
     ArmModel,
     forward_dynamics,
     forward_kinematics,
@@ -131,7 +131,7 @@ def step_leader(
             F[i], F[3 + i] = drive[i], drive[5 - i]
         copy_into(applied, 0, hand_wrench, 0, 6)
         # The arm's own gravity vector may have any direction.
-        g = arm[n, GRAVITY : GRAVITY + 3]
+        g = arm[n, GRAVITY_COLUMN : GRAVITY_COLUMN + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
@@ -246,7 +246,7 @@ class LeaderDevice(DisplayDevice):
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
+        own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING_COLUMN]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 
 
@@ -287,7 +287,7 @@ class LeaderArm(DeviceBlock):
 
 
 def _operator_hand_weight(device: LeaderDevice) -> float:
-    gravity = np.linalg.norm(device.arm.table[-1, GRAVITY : GRAVITY + 3])
+    gravity = np.linalg.norm(device.arm.table[-1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3])
     return float(device.numbers[HAND_MASS] * gravity)
 
 

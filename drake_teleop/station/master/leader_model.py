@@ -22,10 +22,10 @@ from drake_teleop.station.master.numbers import (
     PEAK_TORQUE,
 )
 from drake_teleop.station.slave.arm import (
-    PHI,
-    ROTATION,
-    ROTOR,
-    TRANSLATION,
+    PHI_COLUMN,
+    ROTATION_COLUMN,
+    ROTOR_COLUMN,
+    TRANSLATION_COLUMN,
     ArmModel,
     forward_kinematics,
 )
@@ -137,7 +137,7 @@ class Leader:
         if self.home:
             return self._value_per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
-        return np.where(within, 0.0, arm.middle)
+        return np.where(within, 0.0, arm.middle_positions)
 
     def _value_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         values, n = getattr(self, name), arm.num_joints
@@ -155,11 +155,11 @@ def _with_end_frame_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
-    table[0, TRANSLATION:PHI] += p_BE - p
+    table[0, TRANSLATION_COLUMN:PHI_COLUMN] += p_BE - p
     # R rotates the hand's frame into B, so that E has B's axes at home.
-    R_LS = table[n, ROTATION:TRANSLATION].reshape(3, 3)
-    table[n, ROTATION:TRANSLATION] = (R_LS @ R.T).ravel()
-    phi, upper = table[n, PHI:ROTOR], np.triu_indices(3)
+    R_LS = table[n, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)
+    table[n, ROTATION_COLUMN:TRANSLATION_COLUMN] = (R_LS @ R.T).ravel()
+    phi, upper = table[n, PHI_COLUMN:ROTOR_COLUMN], np.triu_indices(3)
     inertia = np.zeros((3, 3))
     inertia[upper] = phi[4:]
     inertia = inertia + np.triu(inertia, 1).T

@@ -175,7 +175,7 @@ class _CommonConfig:
     )
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest rendered force at the hand")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
-    limit_retreat_of_hand: list[float] = quantity(
+    retreat: list[float] = quantity(
         [0.1, 1.0],
         "m/s, rad/s",
         1e-3,

@@ -63,7 +63,7 @@ def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[n
 
 
 def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the silence monitor (SLAVE_MONITOR_SIZE,) of the slave; `pose` (7,) is its first command."""
+    """Return the silence monitor (SLAVE_MONITOR_SIZE,) of the slave; `pose` (7,): first command."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_S] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
