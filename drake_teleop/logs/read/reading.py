@@ -422,8 +422,9 @@ class _Reader:
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
         names = ("specific_force", "angular_velocity", "angular_acceleration")
+        s, omega, alpha = map(signal_on_clock, names)
         return Log(
-            *(t, wrench, *map(signal_on_clock, names)),
+            *(t, wrench, s, omega, alpha),
             gravity=gravity,
             R_WS=R_WS,
             gravity_W=None if R_WS is None else self._description.gravity_W,

@@ -237,7 +237,7 @@ def min_distance_of_boxes(
 ) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    `pair` (40,) is a row of `ShapePairs.watched`, for the tool's box; `box` (28,) is this row with the
+    `pair` (40,) is a row of `ShapePairs.watched`, for the tool's box; `box` (28,) is it with the
     present pose of the other box. The bound is the largest gap along an edge of either box.
     """
     R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
@@ -273,7 +273,7 @@ def _friction_coefficient(static: float, dynamic: float, slip: float) -> float:
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
     """Write the contact force on a sphere in its box into `force` (3,) [N].
 
-    `pair` (28,) is a row of `ShapePairs.known`, `x` the depth [m], `normal` the direction out of the
+    `pair` (28,): row of `ShapePairs.known`, `x`: depth [m], `normal`: direction out of the
     box, `velocity` that of the sphere at the contact, relative to the box [m/s].
     """
     out = dot(velocity, normal)

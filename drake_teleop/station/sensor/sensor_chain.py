@@ -386,7 +386,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
 
     Args:
         constants, memory: results of `sensor_chain_constants`; memory is updated.
-        noise: (NOISE_SIZE,) standard normal numbers for this block of SAMPLES_PER_NOISE_BLOCK samples.
+        noise: (NOISE_SIZE,) standard normal numbers for this block of samples.
         truth: (15 + n,) [wrench (6) of the sensor on the tool at So in S | specific force of So
             (3), angular velocity (3), angular acceleration (3) in S | joint angles (n)].
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)

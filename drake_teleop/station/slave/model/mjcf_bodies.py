@@ -113,7 +113,7 @@ class Body:
 
     def with_descendants(self) -> list[Body]:
         """Return the body and all bodies on it."""
-        return [self, *(body for child in self.children for body in child.all())]
+        return [self, *(body for child in self.children for body in child.with_descendants())]
 
     def path_to(self, name: str) -> list[Body]:
         """Return the bodies from this one to a body, or an empty list."""
