@@ -49,7 +49,7 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
         def show(self, canvas, film_time, place, force):
             shown[self.name] = force
 
-    monkeypatch.setattr(replay, "Arrow", Arrow)
+    monkeypatch.setattr(replay, "ForceArrow", Arrow)
     return shown
 
 

@@ -81,7 +81,6 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
 def _correct_fields(
     causes: Sequence[Cause], log: Log, by_pose: bool
 ) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
-    """Return all corrected fields, and the remedy and the corrected fields of each cause."""
     assert log.described is not None
     fields = _described_fields(log.described, by_pose)
     column = _column_of_each_axis(fields[_FRAME_FIELD])

@@ -107,7 +107,6 @@ def _are_numbers(names: Sequence[str]) -> bool:
 
 
 def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
-    """Write a draft description, corrected by the data; missing fields become comments."""
     write_text(path, draft.text())
     summary["draft"] = str(path)
     lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft.text() else []
@@ -126,10 +125,6 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
 
 
 def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
-    """Inspect a draft description, and return it corrected by its data.
-
-    Each round applies the first finding with corrected fields.
-    """
     tables: dict[Path, Table] = {}
     for _ in range(_MAX_CORRECTIONS):
         found = _inspect_described_log(load_description(path), str(path), dict(tables), summary)
@@ -144,7 +139,6 @@ def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) ->
 def _inspect_described_log(
     description: Description, source: str, tables: dict[Path, Table], summary: dict[str, Any]
 ) -> list[Finding]:
-    """Write figures and findings to the summary, and return the findings."""
     findings: list[Finding] = []
     bad: dict[Path, list[NDArray[np.intp]]] = {}
     for name in ("wrench", "imu", "pose", "static"):
@@ -183,7 +177,6 @@ def _inspect_described_log(
 def _inspect_stream(
     name: str, stream: Any, table: Table, description: Description, source: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
-    """Return figures and findings of a stream, and the rows of its file that cannot be used."""
     columns = [
         str(column)
         for field in _QUANTITIES
@@ -238,7 +231,6 @@ def _inspect_stream(
 def _repeated_rows_findings(
     at: str, values: Array, same: NDArray[np.bool_], rate: float | None, time: Any
 ) -> list[Finding]:
-    """Return a finding if the recorder repeated rows, unlike a coarse sensor at rest."""
     held = int(same.sum())
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
@@ -263,7 +255,6 @@ def _repeated_rows_findings(
 def _inspect_clock(
     at: str, time: Any, table: Table, rows: int, figures: dict[str, Any]
 ) -> tuple[list[Finding], NDArray[np.bool_]]:
-    """Return findings of the clock, and (N,) booleans: True for rows with increasing stamps."""
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return [], np.ones(rows, bool)

@@ -85,7 +85,6 @@ def MakeChannel(scenario: Scenario) -> Diagram:
 
 
 def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
-    """Limit the method's wrench to the device, so that its balance counts displayed wrenches."""
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
         passivity,

@@ -272,7 +272,6 @@ class ReplayScene:
             arrow.show_force(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
-        """Set the pose (7,) of a moving body, after those of its parents."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])

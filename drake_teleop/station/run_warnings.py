@@ -107,7 +107,6 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
 
 
 def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
-    """Yield faults and their time spans; a fault at the hand counts while the slave has none."""
     t = result.t
     slave = hand = np.zeros(len(t))
     if "fault" in result:
@@ -232,7 +231,6 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
 def _position_and_rotation_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    """Return command, motion, smallest lag, display unit and factor, for position and rotation."""
     rotations = (
         doubled_quaternions_near(command, command),
         doubled_quaternions_near(actual, command),

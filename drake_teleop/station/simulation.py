@@ -98,7 +98,6 @@ def _task_is_over(simulator: Simulator) -> bool:
 
 
 def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
-    """Raise DrakeTeleopError for a fault in the log from row `rows` on; return its length."""
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     for name, column in log_columns(station).items():

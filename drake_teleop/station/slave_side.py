@@ -163,7 +163,6 @@ def MakeSlaveSide(
 
 
 def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool:
-    """Check a custom controller's ports; return whether it replaces the joint control."""
     if controller is None:
         return False
     expect(System, controller, "controller", "make a Drake system: docs/station.md")

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from drake_teleop.logs.contact import (
     Detection,
-    Samples,
+    DetectorSamples,
     detect_contact,
     noise_floor,
     summarize_contacts,
@@ -26,9 +26,9 @@ def quiet(seed: int, n: int = 6000) -> np.ndarray:
 def detected(contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None) -> Detection:
     """At rest."""
 
-    def at_rest(wrench: np.ndarray) -> Samples:
+    def at_rest(wrench: np.ndarray) -> DetectorSamples:
         still, up = np.zeros((len(wrench), 3)), np.tile([0.0, 0.0, 9.81], (len(wrench), 1))
-        return Samples(wrench, up, still, still, still)
+        return DetectorSamples(wrench, up, still, still, still)
 
     calm = None if free is None else (at_rest(free), dt)
     found = detect_contact(at_rest(contact), dt, CUTOFF, np.zeros((16, 16)), STD, free=calm)
@@ -113,5 +113,5 @@ def test_more_contact_than_can_be_told_is_noted() -> None:
 
 
 def test_a_record_that_is_too_short_says_nothing() -> None:
-    rows = Samples(quiet(5, 120), *(np.zeros((120, 3)) for _ in range(4)))
+    rows = DetectorSamples(quiet(5, 120), *(np.zeros((120, 3)) for _ in range(4)))
     assert detect_contact(rows, DT, CUTOFF, np.zeros((16, 16)), STD) is None

@@ -186,7 +186,7 @@ def test_hand_stops_after_contact_detection(touch):
         assert force[-1] > 0.5 and np.ptp(force[-200:]) < 2.0
         # A stop takes its time, and it rests for 0.3 s, the default.
         stopping = result.t[result["task_state"][:, PHASE_INDEX] == PHASE_STOPPING]
-        assert np.ptp(stopping) > decision.STOP + 0.29
+        assert np.ptp(stopping) > decision.STOP_DURATION_S + 0.29
         # And the run ends with the task.
         assert 0.0 <= result.t[-1] - measures["task_time_s"] < 0.03
 

@@ -140,7 +140,7 @@ def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
 
 def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     """The ledger pays for additional energy of the spring, by group."""
-    monkeypatch.setattr(pspm, "dot", pspm.dot.py_func)
+    monkeypatch.setattr(pspm, "dot_of_group", pspm.dot_of_group.py_func)
     config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
     p, rng = method_parameters(config), np.random.default_rng(1)
     memory, before = (

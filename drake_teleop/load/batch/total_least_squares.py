@@ -112,7 +112,6 @@ def _solve_compensated_equations(
 
 
 def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """Return the smallest noise scale at which the augmented normal equations are singular."""
 
     def determinant_condition(ratio: float) -> float:
         return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))

@@ -157,7 +157,6 @@ def update_estimate(estimate, V, wrench, root):
 
 @njit(cache=True)
 def _update_filter(memory, place, block, noise):
-    """Update a filter by a block; return chi-squared of its innovation."""
     phi = memory[place + 6 : place + 16].copy()
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_REGRESSOR_START]
     V = memory[_REGRESSOR_START:_KNOWN_FILTER_START].reshape(6, 10)

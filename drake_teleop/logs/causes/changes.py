@@ -318,7 +318,6 @@ class _Blocks:
     def _differs_from_fit(
         self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
     ) -> bool:
-        """Return whether most of the `others` differ from a fit to the `kept` blocks."""
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))
         share = np.einsum("bij,ji->b", self._gram[others], covariance)
         predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))

@@ -171,7 +171,6 @@ def _search_causes_from(
 
 
 def _remove_cable_if_attenuated(found: list[Candidate]) -> list[Candidate]:
-    """Remove "cable" from the candidates if a reduced inertia explains a third of its score."""
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )

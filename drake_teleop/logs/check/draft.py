@@ -217,7 +217,6 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
 
 
 def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
-    """Return the streams as poses at rest (`static`), if wrench and orientation are known."""
     pose, wrench = draft.get("pose"), draft.get("wrench")
     if pose is None or wrench is None or _is_template(wrench):
         return draft
@@ -254,7 +253,6 @@ def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUn
 
 
 def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUnit]:
-    """Return three columns of angles, named as in `_EULER_ANGLE_NAMES` after a common prefix."""
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
         prefix, _, end = words.rpartition("_")
@@ -270,7 +268,6 @@ def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsW
 def _resolve_translation(
     found: dict[str, _ColumnsWithUnit], plain: dict[str, tuple[str, str]]
 ) -> None:
-    """Take tx, ty, tz without a force as a position, as in TUM files, not as a torque."""
     torque = found.get("torque", _NO_COLUMNS).columns
     bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
     if bare and "force" not in found and "position" not in found:
@@ -280,7 +277,6 @@ def _resolve_translation(
 def _find_pose_vectors(
     table: Table, plain: dict[str, tuple[str, str]]
 ) -> dict[str, _ColumnsWithUnit]:
-    """Return position and quaternion of numbered columns, which may end with a gripper's width."""
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_POSE_VECTOR_PATTERN, words):
@@ -305,7 +301,6 @@ def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
 def _find_numbered_quaternion(
     table: Table, plain: dict[str, tuple[str, str]]
 ) -> dict[str, _ColumnsWithUnit]:
-    """Return four columns such as q1, q2, q3, q4 of ABB, if they have unit length."""
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_NUMBERED_QUATERNION_PATTERN, words):
@@ -382,7 +377,6 @@ def _draft_quantity(table: Table, kind: str, found: _ColumnsWithUnit) -> dict[st
 
 
 def _are_counts(table: Table, columns: list[str]) -> bool:
-    """Return whether columns contain integers too large for a force in N: raw sensor counts."""
     if _FILL_IN in columns:
         return False
     first = table.raw(columns[0], columns[0])

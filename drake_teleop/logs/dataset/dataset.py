@@ -135,7 +135,6 @@ def dataset_command(
 
 
 def _described_or_drafted_streams(dataset: Dataset, description: Path | None) -> dict[str, Any]:
-    """Return the streams of the description, without file names."""
     if description is None:
         return _draft_streams_by_majority(dataset)
     data = read_yaml(description)
@@ -168,7 +167,6 @@ def _description_of_episode(streams: dict[str, Any], episode: Episode, fps: floa
 
 
 def _draft_streams_by_majority(dataset: Dataset) -> dict[str, Any]:
-    """Return the draft description that most of the first, middle and last episode give."""
     count = len(dataset.episodes)
     chosen = sorted({0, count // 2, count - 1})[:_MAX_DRAFTED_EPISODES]
     drafts = [_draft_streams(dataset, dataset.episodes[k]) for k in chosen]
@@ -183,7 +181,6 @@ def _draft_streams_by_majority(dataset: Dataset) -> dict[str, Any]:
 def _choose_quaternion_order_and_sign(
     dataset: Dataset, streams: dict[str, Any], episodes: Sequence[Episode]
 ) -> dict[str, Any]:
-    """Return the streams with the quaternion order and the sign with which a load fits best."""
     form = streams.get("pose", {}).get("orientation", {}).get("form", "")
     found = []
     for order in ("quaternion_xyzw", "quaternion_wxyz") if "quaternion" in form else (form,):
@@ -261,7 +258,6 @@ def _episode_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) ->
 
 
 def _work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
-    """Return the folder of results of this command, with those of an interrupted one."""
     files = sorted({episode.file for episode in dataset.episodes})
     states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     key = hashlib.sha256(repr((settings, states)).encode()).hexdigest()
@@ -308,7 +304,6 @@ def _judge_all_episodes(
 
 
 def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
-    """Write columns and row of one episode; the row last, which marks it as complete."""
     episode = task.dataset.episodes[number]
     try:
         with one_blas_thread():
@@ -328,7 +323,6 @@ def _read_columns(path: Path) -> NewColumns:
 
 
 def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, Any], NewColumns]:
-    """Return figures and new columns of an episode; named faults are corrected in the columns."""
     shared = task.shared
     log, at = _episode_log(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log, shared.spacing)
@@ -374,7 +368,6 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
 def _contact_wrench_and_flags(
     shared: SharedLoad, signals: EpisodeSignals, found: Hypothesis, residual: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return contact wrench and flags of contact; the offsets are the mean of the free frames."""
     for _ in range(3):
         contact = found.wrench_of_reading(residual)
         detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)

@@ -228,7 +228,6 @@ def _add_features_to_metadata(text: str) -> str:
 
 
 def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
-    """Append cells to each line, so that all other text remains."""
     frame, first = read_csv(path, True)
     lines = path.read_bytes().splitlines(keepends=True)
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]

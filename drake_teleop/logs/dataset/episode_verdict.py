@@ -298,7 +298,6 @@ def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
 
 
 def _weighted_number_of_deviations(x: Hypothesis, usual_lag: float) -> float:
-    """Return the number of deviations from the usual description, weighted by their freedom."""
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0

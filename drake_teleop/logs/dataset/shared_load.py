@@ -136,7 +136,6 @@ def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
 def _excess_spread(
     episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array
 ) -> Array:
-    """Return by how much each episode's spread exceeds that with its own load."""
     usual = [
         _hypothesis_at_best_lag(s, phi, x.lag).spread.sum()
         for s, x in zip(episodes, own, strict=True)
@@ -161,7 +160,6 @@ def _fit_load_to_members(
     members: NDArray[np.bool_],
     phi: Array,
 ) -> Identification:
-    """Return the load fitted to the calm frames of the member episodes, with own offsets."""
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets = []
     for k in (int(row) for row in np.flatnonzero(members)):

@@ -88,7 +88,6 @@ def _wrench_powers(Z: Array) -> Array:
 def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: NoiseLevels, load: Array | None = None
 ) -> LinearFit:
-    """Fit the linear model to moments; fit only the constants if `load` is given."""
     floor = _rounding_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T

@@ -90,7 +90,6 @@ def _content_length(text: bytes) -> int:
 
 
 def _parse_with_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
-    """Parse with types from the first rows if these are numeric, else from all rows (slow)."""
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):

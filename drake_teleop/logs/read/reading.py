@@ -361,7 +361,6 @@ class _Reader:
         return force, torque
 
     def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        """Return the times of a stream; record notes and gaps of the stream."""
         clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
         t = clock.t
         if len(t) < MIN_STREAM_SAMPLES or len(uniform_times(t)) < MIN_STREAM_SAMPLES:

@@ -68,14 +68,12 @@ def _strip_names(names: list[str]) -> list[str]:
 
 
 def _add_canonical_names(columns: dict[str, _Column]) -> dict[str, _Column]:
-    """Add lower-case column names if the table is a canonical log."""
     small = {name.lower(): column for name, column in columns.items()}
     canonical = len(small) == len(columns) and _CANONICAL_NAMES.issubset(small)
     return small | columns if canonical and not _CANONICAL_NAMES.issubset(columns) else columns
 
 
 def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
-    """Return the columns of a file that polars reads; a large Parquet file is read on access."""
     import polars as pl
 
     kind = path.suffix.lower()

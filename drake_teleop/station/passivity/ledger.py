@@ -392,7 +392,6 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _permitted_opposing_share(g, dx, T, p, memory):
-    """Return the share, 0 to 1, of a wrench against the motion that the master's energy permits."""
     if memory[STORED_ENERGY][g] >= _MIN_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]

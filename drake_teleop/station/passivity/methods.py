@@ -313,7 +313,6 @@ def _addresses_of_functions(*steps: Any) -> tuple[int, int, int]:
 
 @njit(cache=True)
 def _write_packet_number(healthy, memory, packet):
-    """Write the packet's number; repeat the last good packet if the inputs are not finite."""
     if healthy:
         packet[INPUTS_FINITE] = 1.0
         copy_into(memory, PACKET.start, packet, 0, PACKET_SIZE)

@@ -81,7 +81,6 @@ def initialize(p, memory):
 
 @njit(cache=True)
 def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memory, packet):
-    """Move the set position of group `g` as near to the requested one as the energy permits."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
     damped = -dot_of_group(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)

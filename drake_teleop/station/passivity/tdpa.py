@@ -177,7 +177,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
-    """Return the share of the wrench that may be rendered within the stored energy."""
     least, size = (
         length_of_group(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g],
         length_of_group(wrench, g),

@@ -213,7 +213,6 @@ def _output_wave_at_rest(wrench, T, p, memory):
 
 @njit(cache=True)
 def _reflect_while_filling(received, wrench, T, p, memory):
-    """Reflect as a rigid wall while a new channel fills, and prepare the steady state."""
     wave, ledger, accounted = memory[_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):

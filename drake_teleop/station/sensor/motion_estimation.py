@@ -433,7 +433,6 @@ def _rotation_vector_into(before, R, angle):
 
 @njit(cache=True)
 def _update_filters(gains, period, moved, acceleration, kept):
-    """Update `SteadyStateFilter` for three axes, with Numerov's mean acceleration."""
     for i in range(3):
         mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0
         rate = kept[3 + i] + period * mean

@@ -298,7 +298,6 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
 
 @njit(cache=True)
 def _sample_into(sensor, truth, noise, memory, sample):
-    """Write the sample (16 + n,) for true values whose first three "angles" are omega."""
     constants, motion_constants, end, ideal = sensor
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
     if not is_plausible(constants, truth):  # keeps it out of the filters
@@ -336,7 +335,6 @@ def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
 
 
 def _event_period_and_count(step: float | None, period: float | None) -> tuple[float, int]:
-    """Return the period of events [s], and the number of events per sample."""
     if period is not None and not 0.0 < period < np.inf:
         raise DrakeTeleopError(
             f"{period} s is not positive and finite",
@@ -394,7 +392,6 @@ def _joints_of_model(plant: MultibodyPlant) -> list[Joint]:
 
 
 def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
-    """Return the arm's body at the weld, and all bodies on the other side, the load."""
     neighbours: dict[BodyIndex, list[BodyIndex]] = {}
     for joint in _joints_of_model(plant):
         if joint.index() != weld.index():

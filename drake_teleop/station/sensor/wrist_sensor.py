@@ -503,7 +503,6 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        """Call `take_due_samples`; near monitored shapes, with Drake's contact at each instant."""
         inputs = self._evaluate_inputs(context, seen)
         if near != PROXIMITY_NEAR_MONITORED:
             take_due_samples(*inputs, until_now, touching_W, self._scratch, result)

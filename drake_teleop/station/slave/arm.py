@@ -130,7 +130,6 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 @njit(cache=True, inline="always")
 def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
-    """Replace the state of the previous link in x by that of link `row`."""
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))

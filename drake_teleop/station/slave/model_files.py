@@ -118,7 +118,6 @@ def _add_directives(
     purpose: ModelPurpose,
     folder: TemporaryDirectory[str],
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    """Add the models of a directives file after repairs; keep its welds and positions."""
     with raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
     repaired, purpose = dict[Path, RepairedModel](), purpose._replace(in_directives=True)
@@ -140,7 +139,6 @@ def _add_directives(
 def _repair_file(
     path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
-    """Return the repaired text of a file; without a text if Drake shall read the file itself."""
     kind = path.suffix.lower()
     if kind not in _REPAIR_OF_SUFFIX:
         return RepairedModel("", [], {})

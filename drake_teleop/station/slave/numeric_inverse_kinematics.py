@@ -93,7 +93,6 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
 
 @njit(cache=True)
 def _normal_matrix(J, H):
-    """Write J^T J to H, or J J^T if H has that size."""
     n = H.shape[0]
     rows = n == J.shape[1]
     for i in range(n):
@@ -110,7 +109,6 @@ def _normal_matrix(J, H):
 
 @njit(cache=True)
 def _smallest_eigenvalue(H, u):
-    """Return the smallest eigenvalue of H; write its eigenvector to u (inverse iteration)."""
     m = H.shape[0]
     M = np.empty((m, m))
     for i in range(m):
@@ -180,7 +178,6 @@ def _best_step_of_joint(J, e, i):
 
 @njit(cache=True)
 def _singularity_status(L, J):
-    """Return WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR."""
     n = J.shape[1]
     a, b, c = vector_at(J[3:, n - 3], 0), vector_at(J[3:, n - 2], 0), vector_at(J[3:, n - 1], 0)
     coplanar = abs(dot(a, cross(b, c))) < _MAX_COPLANAR_VOLUME * L**3

@@ -181,7 +181,6 @@ class PostureShapes:
         return found
 
     def _exclude_joined(self) -> None:
-        """Ignore overlaps in the environment, in a link, and across a joint or telescope."""
         plant, manager = self.plant, self._scene_graph.collision_filter_manager()
 
         def bodies_of_link(body: RigidBody) -> set[BodyIndex]:

@@ -92,7 +92,6 @@ def _values_in_text(text: str | None) -> list[float]:
 def _mesh_fault(
     shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> str | None:
-    """Return the fault of a shape's mesh as text; without a fault, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None

@@ -141,7 +141,6 @@ def _force_site(sensor: Element) -> str:
 
 
 def _separate_joints(body: Body) -> Body:
-    """Give each joint its own body, because Drake reads the axes of a second one wrongly."""
     body.children = [_separate_joints(child) for child in body.children]
     outer, innermost = None, body
     for joint in body.joints[:-1]:
@@ -191,7 +190,6 @@ def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
 
 
 def _is_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
-    """Return whether a constraint joins parts that joints of the chain move differently."""
     ends = [given.get("body1", "world"), given.get("body2", "world")]
     if "site1" in given or not all(end == "world" or end in carriers for end in ends):
         return False  # a free or mocap body, another arm
@@ -251,7 +249,6 @@ def _force_per_control(given: Attributes, tag: str) -> float:
 
 
 def _effort_in_both_directions(limits: tuple[float, float] | None) -> float:
-    """Return the effort that is available in both directions, or in the only one."""
     if limits is None:
         return float("inf")
     smaller, larger = sorted(map(abs, limits))

@@ -157,7 +157,6 @@ class Mjcf:
     def _insert_includes(
         self, element: Element, path: Path, included: set[Path], depth: int
     ) -> None:
-        """Replace each `include` by the content of its file; a file may be included once."""
         if depth > _MAX_DEPTH:
             what = f"its elements are nested more than {_MAX_DEPTH} deep"
             raise DrakeTeleopError(what, where=str(self.path))

@@ -93,7 +93,6 @@ def _check_bodies(world: Body, report: RepairReport) -> None:
 
 
 def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:
-    """Set the masses of all bodies; `moving` are the bodies with joints of the chain, by id."""
     total = mjcf.compiler.number("settotalmass", -1.0)
     factor = total / _total_mass_in_file(mjcf) if total > 0.0 else 1.0
 

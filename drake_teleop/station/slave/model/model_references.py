@@ -117,7 +117,6 @@ class ModelFiles:
         _check_size(*self._total, self._model)
 
     def _check_and_measure(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
-        """Check a file; return the number of files and bytes that reading it takes."""
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read(real):
             raise DrakeTeleopError(
@@ -197,7 +196,6 @@ def _is_installed_package(folder: Path) -> bool:
 
 
 def _existing_paths(path: Path | None) -> list[Path]:
-    """Return the path as given and as Drake normalizes it (a/../b is b), where they exist."""
     try:
         both = [] if path is None else [path, Path(os.path.normpath(path))]
         return [each for each in dict.fromkeys(both) if os.path.exists(each)]

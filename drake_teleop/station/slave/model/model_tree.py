@@ -110,7 +110,6 @@ def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] 
 
 
 def _remove_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
-    """Remove a first joint that lets the arm's base float or drive."""
     moving = [k for k, joint in enumerate(chain) if joint.get("type") != "fixed"]
     if not moving or chain[moving[0]].get("type") not in _BASE_JOINT_TYPES:
         return chain
@@ -126,7 +125,6 @@ def _remove_free_base(scope: Element, chain: list[Element], report: RepairReport
 def _remove_unreachable(
     scope: Element, root: str, chain: list[Element], hold: set[str], report: RepairReport
 ) -> dict[str, int]:
-    """Remove links and joints outside the tree of `root`; return `ModelTree.moved`."""
     links = {link.get("name", ""): link for link in scope.findall("link")}
     number_of, count = dict[int, int](), 0
     for joint in chain:
@@ -159,7 +157,6 @@ def _remove_unreachable(
 
 
 def _remove_loops(scope: Element, moved: dict[str, int], report: RepairReport) -> None:
-    """Remove constraints between links that do not move relative to each other."""
     for element in [child for child in scope if child.tag in _LOOP_TAGS]:
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
         groups = {moved.get(link_of_frame(scope, name), -1) for name in names}

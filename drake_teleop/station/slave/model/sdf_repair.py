@@ -60,7 +60,6 @@ def repair_sdf(
 def _repair_included(
     uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel | None:
-    """Replace an included file by its repaired text; keep what Drake has to find or reject."""
     included = _included_file((uri.text or "").strip(), file, files)
     if included is None:
         return None
@@ -88,7 +87,6 @@ def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
 def _keep_one_model(
     root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
 ) -> None:
-    """Reduce worlds and several models to the model with the sensor."""
     worlds = root.findall("world")
     models = [
         each for scope in (root, *worlds) for each in scope if each.tag in ("model", "include")

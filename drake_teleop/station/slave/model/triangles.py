@@ -96,7 +96,6 @@ def _read_obj(data: bytes) -> Triangles:
 
 
 def _read_msh(data: bytes) -> Triangles:
-    """Read MuJoCo's binary format: four counts, then vertices, normals, texture and faces."""
     n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
     if min(n, normals, texture, count) < 0:
         raise ValueError("a negative count")

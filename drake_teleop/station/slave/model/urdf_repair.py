@@ -153,7 +153,6 @@ def _model_tree_of_scopes(
 
 
 def _name_joints(scope: Element, report: RepairReport) -> None:
-    """Give each joint a separate name, and keep one link of each name."""
     names = set[str]()
     for number_of_joint, joint in enumerate(joints_of(scope), start=1):
         name = joint.get("name", "")
@@ -202,7 +201,6 @@ def _has_colour(material: Element) -> bool:
 
 
 def _remove_idle_parts(root: Element, report: RepairReport) -> None:
-    """Remove frames and filters of missing links, and motors without data for Drake."""
     links = {link.get("name", "") for link in root.findall("link")}
     moving = {joint.get("name", "") for joint in joints_of(root) if joint.get("type") != "fixed"}
     for frame in root.findall("frame"):
