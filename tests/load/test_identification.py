@@ -110,7 +110,7 @@ def test_variances_follow_from_what_the_fit_leaves_of_each_channels_noise():
     left = np.eye(6 * n) - rows @ inverse @ rows.T * np.repeat(weights, n)
     power = (left**2).reshape(6, n, 6, n).sum(axis=(1, 3)) @ variances
     equations = NormalEquations(weights**-0.5)
-    found, degrees = equations._unbiased(power, n, grams, grams, inverse)
+    found, degrees = equations._unbiased_variances(power, n, grams, grams, inverse)
     np.testing.assert_allclose(found, variances, rtol=1e-9)
     assert degrees.sum() == pytest.approx(6 * n - 16)
 
