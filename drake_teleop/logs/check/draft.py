@@ -62,6 +62,7 @@ _UNIT_NAMES = {
     **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*UNITS, "g")},
     "µs": "us",
     "°": "deg",
+    "dps": "deg/s",
     "°/s": "deg/s",
     "m/s²": "m/s^2",
     "n*m": "N m",
@@ -85,11 +86,14 @@ _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant
 _MIN_COUNTS = 2000.0  # median of integers that are raw counts
 _FILL_IN = "FILL IN"
 _TIME_FIELDS = ("column", "nanoseconds")
+_COUNTER = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
+_MIN_CLOCK_ROWS = 20
 _NANOSECONDS = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
 _COUNTS = (
     "Force and torque are raw counts. scale is the value of one count in N and N m, from the"
     " manual of the sensor: 1e-6 for 1000000 counts per N. The data contain only the ratio of both."
 )
+_WITHOUT_TORQUE = "A force alone is not enough: the commands need force and torque."
 _WITHOUT_TIME = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
 
 
@@ -192,6 +196,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
         "above all wrench.sign, units and frames.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
+        *([_WITHOUT_TORQUE] if "force" in found and "torque" not in found else []),
         *([_WITHOUT_TIME] if _FILL_IN in times else []),
         *([_COUNTS] if f"'scale': '{_FILL_IN}'" in str(draft) else []),
         *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
@@ -209,7 +214,11 @@ def _static(draft: dict[str, Any]) -> dict[str, Any]:
 
 
 def _normalized(name: str) -> tuple[str, str]:
+    """Return the words of a column's name, and its unit: `Fx [N]`, `Fx (N)` or `Fx_N`."""
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
+    suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
+    if unit is None and suffix is not None and suffix[1].lower() in _UNIT_NAMES:
+        unit = suffix
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
@@ -384,6 +393,7 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
     named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
+    named = named or _clock_columns(table, plain)
     if not named:
         return {"column": _FILL_IN}
     if beside in table.columns:
@@ -404,6 +414,20 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
         "column": named[0],
         "unit": unit if unit in _UNITS["time"] else _time_unit(table, named[0]),
     }
+
+
+def _clock_columns(table: Table, plain: dict[str, tuple[str, str]]) -> list[str]:
+    """Return the columns that increase in nearly equal steps, but are no counters of rows."""
+
+    def is_clock(name: str) -> bool:
+        values = np.asarray(table.columns[name])
+        if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:
+            return False
+        steps = np.diff(values.astype(float))
+        even = np.ptp(np.quantile(steps, [0.1, 0.9])) < steps.mean()
+        return bool((steps > 0.0).all() and even and not re.search(_COUNTER, plain[name][0]))
+
+    return [name for name in plain if is_clock(name)]
 
 
 def _time_unit(table: Table, column: str) -> str:

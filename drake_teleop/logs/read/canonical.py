@@ -219,7 +219,7 @@ def _at_rest(table: Table, fields: Container[str]) -> bool:
         return False
     if "angular_velocity" in fields:
         speed = table.numbers(ANGULAR_VELOCITY, 3, where)
-        if np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
+        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
             return False
     if "t" not in table.columns:
         return True
