@@ -303,13 +303,10 @@ def test_delay_margin_is_0_if_unstable_and_infinite_without_limit() -> None:
     assert (unstable_multipliers(firm, np.geomspace(5e-4, 100.0, 1000)) == 0).all()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "axis",
-    [
-        pytest.param(held("medium", wall_stiffness=2.5e3), marks=pytest.mark.long),
-        held("firm", wall_stiffness=2e4),
-    ],
+    "axis", [held("medium", wall_stiffness=2.5e3), held("firm", wall_stiffness=2e4)]
 )
 def test_a_simulation_becomes_unstable_at_the_margin(bench: ModuleType, axis: OneAxis) -> None:
     simulated = bench.simulated_margin(axis, JR3)

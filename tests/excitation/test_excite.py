@@ -713,6 +713,7 @@ def test_picture_of_a_shortest_motion_states_its_period(short):
     assert figure.axes[3].get_title("left") == "period down to 2.4"
 
 
+@pytest.mark.long
 def test_coaxial_shapes_of_two_links_take_little_time(tmp_path):
     """Drake takes 0.1 s for one distance: 150 s of CPU for all postures, 3 s for the first."""
     model = tmp_path / "arm.xml"

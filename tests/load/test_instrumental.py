@@ -49,7 +49,7 @@ def stacked(motion):
     return np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
 
 
-@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("own", [pytest.param(True, marks=pytest.mark.long), False])
 def test_it_is_three_stage_least_squares(own):
     """Against the stacked matrices; with the motion as its own instrument, weighted LS."""
     F, motion, commanded = record(0)

@@ -120,6 +120,7 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
     assert np.sqrt(np.mean([x[[0, -1]] for x in squares])) < 4.0
 
 
+@pytest.mark.long
 @settings(max_examples=4, deadline=None)
 @given(st.integers(0, 50), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0.35, 3.0))
 def test_any_large_rotation_of_the_wrench_is_found(
@@ -226,6 +227,7 @@ def described(folder: Path, prefix: str, **time: Any) -> Path:
     return folder / "columns.yaml"
 
 
+@pytest.mark.long
 def test_robomimic_file_gets_observations(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "demo.hdf5"
@@ -244,6 +246,7 @@ def test_robomimic_file_gets_observations(tmp_path: Path) -> None:
         np.testing.assert_array_equal(file["data/demo_1/obs/pos"], sample_episode(1).position)
 
 
+@pytest.mark.long
 def test_zarr_gets_arrays(tmp_path: Path) -> None:
     zarr = pytest.importorskip("zarr")
     path = tmp_path / "demo.zarr"
@@ -263,6 +266,7 @@ def test_zarr_gets_arrays(tmp_path: Path) -> None:
     assert copied["data/in_contact"].dtype == bool
 
 
+@pytest.mark.long
 def test_csv_episodes_keep_their_text(tmp_path: Path) -> None:
     source = tmp_path / "demo"
     source.mkdir()

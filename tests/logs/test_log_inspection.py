@@ -290,9 +290,9 @@ def test_a_table_without_names_is_drafted_as_such(tmp_path: Path, first: str) ->
     summary = inspect_command(tmp_path / "x.csv", tmp_path, quiet=True)
     assert "places that were not recognized" in summary["findings"][0]["message"]
     text = (tmp_path / "draft.yaml").read_text()
-    assert "# Columns without a guess: 0, 1, 2, 3, 4." in text
-    assert "# No column of time was recognized; where there is none, time: {rate: 500}" in text
-    assert yaml.safe_load(text)["wrench"]["header"] is False
+    assert "# Columns without a guess: 1, 2, 3, 4." in text
+    wrench = yaml.safe_load(text)["wrench"]
+    assert wrench["header"] is False and wrench["time"] == {"column": "0", "unit": "s"}
     assert len(read_table(tmp_path / "x.csv", header=False).raw(0, "here")) == 60
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import EULER_AXES, rotation_matrices
+from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.clocks import join_episodes
@@ -314,6 +315,43 @@ def drafted(*tables: Path) -> tuple[dict[str, Any], list[str]]:
 
 def renamed(frame: pl.DataFrame, names: dict[str, str]) -> pl.DataFrame:
     return frame.select([pl.col(old).alias(new) for old, new in names.items()])
+
+
+@pytest.mark.parametrize(
+    ("times", "unit"),
+    [(np.arange(60) * 10.0, "ms"), (np.arange(60) * 0.01 + 5.0, "s"), (None, None)],
+)
+def test_time_is_the_column_that_increases_evenly(
+    tmp_path: Path, times: np.ndarray | None, unit: str | None
+) -> None:
+    """A counter of rows and a value that increases unevenly are no times."""
+    uneven = np.cumsum(np.tile([0.1, 2.0], 30))
+    columns = {"frame_index": np.arange(60), "F_sum": uneven}
+    columns |= {} if times is None else {"Zeit": times}
+    columns |= dict.fromkeys(["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], np.sin(uneven))
+    pl.DataFrame(columns).write_csv(path := tmp_path / "x.csv")
+    time = draft_description(read_table(path), tmp_path).streams["wrench"]["time"]
+    assert time == ({"column": "FILL IN"} if unit is None else {"column": "Zeit", "unit": unit})
+
+
+def test_units_at_the_end_of_names_are_drafted(tmp_path: Path) -> None:
+    names = "t_s Fx_N Fy_N Fz_N Mx_Nm My_Nm Mz_Nm x_mm y_mm z_mm roll_deg pitch_deg yaw_deg"
+    values = np.random.default_rng(0).normal(size=(60, 13)) + np.arange(60)[:, None]
+    path = tmp_path / "x.csv"
+    pl.DataFrame(values, schema=names.split(), orient="row").write_csv(path)
+    draft = draft_description(read_table(path), tmp_path).streams
+    found = [draft["wrench"]["force"], draft["wrench"]["torque"], draft["pose"]["position"]]
+    assert [each["unit"] for each in found] == ["N", "N m", "mm"]
+    assert found[1]["columns"] == ["Mx_Nm", "My_Nm", "Mz_Nm"]
+    assert draft["pose"]["orientation"]["columns"] == ["roll_deg", "pitch_deg", "yaw_deg"]
+    assert draft["pose"]["orientation"]["unit"] == "deg"
+
+
+def test_a_force_without_a_torque_is_said_not_to_suffice(tmp_path: Path) -> None:
+    columns = {"t": np.arange(60) * 0.01, **dict.fromkeys(["Fx", "Fy", "Fz"], np.ones(60))}
+    pl.DataFrame(columns).write_csv(path := tmp_path / "x.csv")
+    draft = draft_description(read_table(path), tmp_path)
+    assert "A force alone is not enough: the commands need force and torque." in draft.text()
 
 
 @pytest.mark.long

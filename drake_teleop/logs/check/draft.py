@@ -62,6 +62,7 @@ _UNIT_NAMES = {
     **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g")},
     "µs": "us",
     "°": "deg",
+    "dps": "deg/s",
     "°/s": "deg/s",
     "m/s²": "m/s^2",
     "n*m": "N m",
@@ -85,14 +86,15 @@ _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant
 _MIN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN = "FILL IN"
 _TIME_FIELDS = ("column", "nanoseconds")
+_COUNTER_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
+_MIN_CLOCK_ROWS = 20
 _NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
 _RAW_COUNTS_NOTE = (
     "Force and torque are raw counts. scale is the value of one count in N and N m, from the"
     " manual of the sensor: 1e-6 for 1000000 counts per N. The data contain only the ratio of both."
 )
-_NO_TIME_COLUMN_NOTE = (
-    "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
-)
+_NO_TORQUE_NOTE = "A force alone is not enough: the commands need force and torque."
+_NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
 
 
 class Draft(NamedTuple):
@@ -134,12 +136,12 @@ def _is_template(stream: dict[str, Any]) -> bool:
     return bool(columns) and set(columns) == {_FILL_IN}
 
 
-class _ColumnsWithUnit(NamedTuple):
+class _Columns(NamedTuple):
     columns: list[str]
     unit: str
 
 
-_NO_COLUMNS = _ColumnsWithUnit([], "")
+_NO_COLUMNS = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
@@ -148,7 +150,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
     found |= (
         _find_numbered_columns(plain)
-        | _find_numbered_quaternion(table, plain)
+        | _find_quaternion(table, plain)
         | _find_array_columns(table, plain)
     )
     _resolve_translation(found, plain)
@@ -158,7 +160,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _draft_time(table, plain, beside), **groups}
 
-    none = _ColumnsWithUnit([_FILL_IN] * 3, "")
+    none = _Columns([_FILL_IN] * 3, "")
     wrench = stream_of_groups(
         **{
             kind: _draft_quantity(table, kind, found.get(kind, none))
@@ -178,7 +180,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     imu = {
         kind: _draft_quantity(table, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
-        if _number_of_columns(table, found.get(kind, _NO_COLUMNS)) == 3
+        if _width_of_columns(table, found.get(kind, _NO_COLUMNS)) == 3
     }
     if imu:
         draft["imu"] = stream_of_groups(**imu)
@@ -187,17 +189,13 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         draft["pose"] = stream_of_groups(**pose)
     if not draft:
         draft["wrench"] = wrench  # a template
-    groups = [group for stream_of_groups in draft.values() for group in stream_of_groups.values()]
+    groups = [group for stream in draft.values() for group in stream.values()]
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
     if _FILL_IN in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
-    times = {
-        stream_of_groups.get("time", {}).get(name)
-        for stream_of_groups in draft.values()
-        for name in _TIME_FIELDS
-    }
+    times = {stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_FIELDS}
     used |= times - {None}
     arrays = _array_names(table)
     used |= {name.partition("[")[0] for name in used}
@@ -209,7 +207,8 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
         "above all wrench.sign, units and frames.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
-        *([_NO_TIME_COLUMN_NOTE] if _FILL_IN in times else []),
+        *([_NO_TORQUE_NOTE] if "force" in found and "torque" not in found else []),
+        *([_NO_TIME_NOTE] if _FILL_IN in times else []),
         *([_RAW_COUNTS_NOTE] if f"'scale': '{_FILL_IN}'" in str(draft) else []),
         *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
     ]
@@ -225,7 +224,11 @@ def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
 
 
 def _split_name_and_unit(name: str) -> tuple[str, str]:
+    """Return the words of a column's name, and its unit: `Fx [N]`, `Fx (N)` or `Fx_N`."""
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
+    suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
+    if unit is None and suffix is not None and suffix[1].lower() in _UNIT_NAMES:
+        unit = suffix
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
@@ -234,8 +237,8 @@ def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUnit]:
-    found: dict[str, _ColumnsWithUnit] = {}
+def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    found: dict[str, _Columns] = {}
     for kind, names in _VECTOR_NAME_PATTERNS.items():
         axes = "wxyz" if kind == "orientation" else "xyz"
         ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
@@ -248,11 +251,11 @@ def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUn
         whole = [group for group in groups.values() if len(group) == len(axes)]
         for group in (whole or list(groups.values()))[:1]:
             columns = [group[axis] for axis in axes if axis in group]
-            found[kind] = _ColumnsWithUnit(columns, plain[columns[0]][1])
+            found[kind] = _Columns(columns, plain[columns[0]][1])
     return found
 
 
-def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUnit]:
+def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
         prefix, _, end = words.rpartition("_")
@@ -261,22 +264,18 @@ def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsW
         for group in ends.values():
             if all(name in group for name in names):
                 columns = [group[name] for name in names]
-                return {axes: _ColumnsWithUnit(columns, plain[columns[0]][1])}
+                return {axes: _Columns(columns, plain[columns[0]][1])}
     return {}
 
 
-def _resolve_translation(
-    found: dict[str, _ColumnsWithUnit], plain: dict[str, tuple[str, str]]
-) -> None:
+def _resolve_translation(found: dict[str, _Columns], plain: dict[str, tuple[str, str]]) -> None:
     torque = found.get("torque", _NO_COLUMNS).columns
     bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
     if bare and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
 
 
-def _find_pose_vectors(
-    table: Table, plain: dict[str, tuple[str, str]]
-) -> dict[str, _ColumnsWithUnit]:
+def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_POSE_VECTOR_PATTERN, words):
@@ -286,10 +285,7 @@ def _find_pose_vectors(
             quaternion = columns[first : first + 4]
             if _have_unit_length(table, quaternion):
                 position = columns[:3] if first else columns[4:7]
-                return {
-                    kind: _ColumnsWithUnit(quaternion, ""),
-                    "position": _ColumnsWithUnit(position, ""),
-                }
+                return {kind: _Columns(quaternion, ""), "position": _Columns(position, "")}
     return {}
 
 
@@ -298,53 +294,53 @@ def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
 
 
-def _find_numbered_quaternion(
-    table: Table, plain: dict[str, tuple[str, str]]
-) -> dict[str, _ColumnsWithUnit]:
+def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_NUMBERED_QUATERNION_PATTERN, words):
             groups.setdefault(_remove_trailing_number(words), []).append(name)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _have_unit_length(table, group)), None)
-    return {"orientation": _ColumnsWithUnit(found, "")} if found else {}
+    return {"orientation": _Columns(found, "")} if found else {}
 
 
-def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _ColumnsWithUnit]:
+def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(r"\d$", words):
             groups.setdefault(_remove_trailing_number(words), []).append(name)
-    found: dict[str, _ColumnsWithUnit] = {}
+    found: dict[str, _Columns] = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
         for base in sorted(fit, key=lambda name: "target" in name)[:1]:
             for kind, places in kinds.items():
                 columns = [groups[base][k] for k in places]
-                found[kind] = _ColumnsWithUnit(columns, plain[columns[0]][1])
+                found[kind] = _Columns(columns, plain[columns[0]][1])
     by_words = {words: name for name, (words, _) in plain.items()}
     if all(word in by_words for word in _MATRIX_ELEMENT_NAMES):
-        found["matrix"] = _ColumnsWithUnit([by_words[word] for word in _MATRIX_ELEMENT_NAMES], "")
+        found["matrix"] = _Columns([by_words[word] for word in _MATRIX_ELEMENT_NAMES], "")
     return found
 
 
-def _find_array_columns(
-    table: Table, plain: dict[str, tuple[str, str]]
-) -> dict[str, _ColumnsWithUnit]:
-    found: dict[str, _ColumnsWithUnit] = {}
+def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    found: dict[str, _Columns] = {}
     arrays = _array_names(table)
     for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
             words, unit = plain[name]
-            whole = _ColumnsWithUnit([name], unit)
-            fits = _number_of_columns(table, whole) == width
-            if kind not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
-                found[kind] = whole
+            whole = _Columns([name], unit)
+            fits = _width_of_columns(table, whole) == width
+            form = kind
+            if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
+                words = words[:-5]
+                form = "quaternion_xyzw" if plain[name][0].endswith("xyzw") else kind
+            if form not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
+                found[form] = whole
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
         for kind, places in _HOMOGENEOUS_MATRIX_PLACES.items():
-            found[kind] = _ColumnsWithUnit([f"{name}[{k}]" for k in places], "")
+            found[kind] = _Columns([f"{name}[{k}]" for k in places], "")
     return found
 
 
@@ -352,11 +348,11 @@ def _array_names(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _number_of_columns(table: Table, found: _ColumnsWithUnit) -> int:
+def _width_of_columns(table: Table, found: _Columns) -> int:
     return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
 
 
-def _draft_quantity(table: Table, kind: str, found: _ColumnsWithUnit) -> dict[str, Any]:
+def _draft_quantity(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(found.columns)}
     if kind in ("force", "torque") and _are_counts(table, found.columns):
         group["scale"] = _FILL_IN
@@ -385,8 +381,8 @@ def _are_counts(table: Table, columns: list[str]) -> bool:
     return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
 
 
-def _draft_pose(table: Table, found: dict[str, _ColumnsWithUnit]) -> dict[str, Any]:
-    if _number_of_columns(table, found.get("orientation", _NO_COLUMNS)) == 4:
+def _draft_pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
+    if _width_of_columns(table, found.get("orientation", _NO_COLUMNS)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
         orientation = {"columns": found[form].columns, "form": form}
@@ -400,7 +396,7 @@ def _draft_pose(table: Table, found: dict[str, _ColumnsWithUnit]) -> dict[str, A
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
-    if _number_of_columns(table, found.get("position", _NO_COLUMNS)) == 3:
+    if _width_of_columns(table, found.get("position", _NO_COLUMNS)) == 3:
         pose["position"] = _draft_quantity(table, "position", found["position"])
     return pose
 
@@ -409,6 +405,7 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
     named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
+    named = named or _clock_columns(table, plain)
     if not named:
         return {"column": _FILL_IN}
     if beside in table.columns:
@@ -429,6 +426,19 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
         "column": named[0],
         "unit": unit if unit in _ALLOWED_UNITS["time"] else _guess_time_unit(table, named[0]),
     }
+
+
+def _clock_columns(table: Table, plain: dict[str, tuple[str, str]]) -> list[str]:
+        def is_clock(name: str) -> bool:
+        values = np.asarray(table.columns[name])
+        if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:
+            return False
+        steps = np.diff(values.astype(float))
+        even = np.ptp(np.quantile(steps, [0.1, 0.9])) < steps.mean()
+        is_counter = re.search(_COUNTER_PATTERN, plain[name][0])
+        return bool((steps > 0.0).all() and even and not is_counter)
+
+    return [name for name in plain if is_clock(name)]
 
 
 def _guess_time_unit(table: Table, column: str) -> str:

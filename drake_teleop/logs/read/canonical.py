@@ -230,7 +230,7 @@ def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
         return False
     if "angular_velocity" in fields:
         speed = table.numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
-        if np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
+        if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
             return False
     if "t" not in table.columns:
         return True

@@ -158,7 +158,7 @@ def join_episodes(t: Array) -> tuple[Array, int]:
 
 
 def _to_common_clock(t: Array, time: Time) -> Array:
-    return t[0] + time.scale * (t - t[0]) + time.offset
+    return t[:1] + time.scale * (t - t[:1]) + time.offset
 
 
 def spread_shared_stamps(t: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.model_tree import link_of_frame
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport
@@ -60,9 +61,16 @@ def repair_sdf(
 def _repair_included(
     uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel | None:
-    included = _included_file((uri.text or "").strip(), file, files)
-    if included is None:
-        return None
+    """Replace an included file by its repaired text; leave a folder to Drake."""
+    address = (uri.text or "").strip()
+    included = _included_file(address, file, files)
+    if included is None:  # Drake searches in more places, and crashes on a circle through them
+        raise DrakeTeleopError(
+            f"includes {address!r}, which does not exist",
+            where=str(file),
+            remedy="correct the path, or name its package's folder: --package-path,"
+            " slave.package_paths",
+        )
     uri.text = f"file://{included.resolve()}"  # or Drake uses the working folder
     repair = {_URDF: repair_urdf, _SDF: repair_sdf}.get(included.suffix.lower())
     if repair is None or not included.is_file():
