@@ -429,7 +429,7 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
 
 
 def _clock_columns(table: Table, plain: dict[str, tuple[str, str]]) -> list[str]:
-        def is_clock(name: str) -> bool:
+    def is_clock(name: str) -> bool:
         values = np.asarray(table.columns[name])
         if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:
             return False
