@@ -176,7 +176,7 @@ def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajector
         last[iterate.start] = iterate.value
         for factor in _SHRINK_FACTORS:
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
-            if _largest_use(robot, trajectory) <= 1:
+            if _uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 checks += 1
                 break
@@ -196,15 +196,16 @@ def _small_motions(
     for factor in _SMALL_FACTORS:
         for motion in motions:
             small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home)
-            if _largest_use(robot, small) <= 1:
+            if _uses(robot, small)[:-1].max() <= 1:  # `check` measures the true clearance
                 yield small
 
 
-def _largest_use(robot: Robot, trajectory: FourierTrajectory) -> float:
+def _uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
+    """Return the largest use of each of `LIMITS` at 1 kHz; its clearance is that of capsules."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
     motions_of(robot.arm.table, *joints, motions)
     smooth, largest = np.empty((2, len(LIMITS)))
     gradients = np.empty((len(LIMITS), 3, *joints[0].shape))
     limit_uses(robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients)
-    return float(largest.max())
+    return largest
