@@ -523,7 +523,7 @@ class WristSensor(LeafSystem):
             told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._max_queued_steps > 1 and not self._is_check_due(context.get_time()):
+        if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):
             seen = self._arm_state_and_surroundings(context)
             if not self._watched.size or self._contact_level(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
@@ -531,7 +531,7 @@ class WristSensor(LeafSystem):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
-    def _is_check_due(self, time: float) -> bool:
+    def _are_samples_due(self, time: float) -> bool:
         # Inline for speed: called at every step in contact.
         margin, (held, block) = _TIME_TOLERANCE * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
