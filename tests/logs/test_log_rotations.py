@@ -71,7 +71,7 @@ def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: b
         "euler": turns.as_euler("ZYX", degrees=True),
     }[form]
     orientations = Orientations(
-        SimpleNamespace(scale=lambda unit: np.radians(1.0)),
+        SimpleNamespace(si_value=lambda unit: np.radians(1.0)),
         SimpleNamespace(columns=[], form=form, axes="ZYX", unit="deg", inverse=inverse),
         SimpleNamespace(numbers=lambda *_: columns.copy()),
         5,
