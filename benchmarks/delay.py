@@ -26,7 +26,7 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     Figures,
     Task,
-    figures,
+    figures_of_run,
     operators_intent,
     run_one_dof,
 )
@@ -73,7 +73,7 @@ def _run(method: str, wall: float, network: NetworkConfig, seed: int, task: Task
     model = dataclasses.replace(REFERENCE, wall_stiffness=wall)
     intent = operators_intent(task)
     run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed, intent=intent)
-    return figures(run, model, task)
+    return figures_of_run(run, model, task)
 
 
 def row(method: str, wall: float, round_trip: float, seeds: int) -> Row:

@@ -24,7 +24,7 @@ import numpy as np
 from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     Task,
-    figures,
+    figures_of_run,
     operators_intent,
     run_one_dof,
 )
@@ -56,7 +56,7 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
         model, PassivityConfig(method=method), NetworkConfig(delay=round_trip / 2), timeout=1.0,
         intent=operators_intent(task),
     )  # fmt: skip
-    found = figures(run, model, task)
+    found = figures_of_run(run, model, task)
     # The hand's spring, the wall's and the servo's, one behind the other.
     felt = model.force_scale / (1.0 / wall + 1.0 / model.servo_stiffness)
     undelayed = DEPTH / (1.0 / stiffness + 1.0 / felt)

@@ -37,7 +37,7 @@ from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
-    figures,
+    figures_of_run,
     operators_intent,
     run_one_dof,
 )
@@ -127,7 +127,7 @@ def architectures() -> dict[str, Any]:
             timeout=2.0,
             intent=operators_intent(task),
         )
-        of = figures(run, model, task)
+        of = figures_of_run(run, model, task)
         swing = (run.t > task.swing) & (run.t < task.swung)
         apart = np.sqrt(np.mean((run.master - run.slave)[swing] ** 2))
         error = 100.0 * abs(of.force_error) if of.stable else np.inf

@@ -23,7 +23,7 @@ from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.lab.excitation.motion_film import write_motion_film
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import RELIABLE, shortest
+from drake_teleop.lab.excitation.shortest import RELIABLE_PROBABILITY, design_shortest_motion
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance
 from drake_teleop.station.scenario import LoadScenario
@@ -109,7 +109,7 @@ def excite_command(
             )
         else:
             report = stage("Shorten the motion")
-            result = shortest(
+            result = design_shortest_motion(
                 robot,
                 tolerance,
                 harmonics=3 if harmonics is None else harmonics,
@@ -119,7 +119,7 @@ def excite_command(
             report(1.0)
             found = result.excitation
             shares = dict(zip(tolerance.entries, result.reached.tolist(), strict=True))
-            reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE}
+            reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
     summary = summarise(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}
     with output_folder(out):

@@ -22,8 +22,8 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     OneDof,
     Task,
-    figures,
-    figures_of,
+    figures_of_run,
+    figures_of_traces,
     operators_intent,
     run_one_dof,
 )
@@ -168,7 +168,7 @@ def test_longest_round_trip_without_a_method(model, longest):
     none, found = PassivityConfig(), {}
     for round_trip in (0.002, longest, longest + 0.002, 0.05):
         run = run_one_dof(model, none, NetworkConfig(delay=round_trip / 2))
-        found[round_trip] = figures(run, model)
+        found[round_trip] = figures_of_run(run, model)
     assert [result.stable for result in found.values()] == [True, True, False, False]
     assert abs(found[0.002].force_error) < 1e-3
     assert found[0.05].least_energy < -1.0
@@ -313,7 +313,7 @@ def test_rise_delay_is_never_negative(share, late, drag, expected):
     pulled = np.where((t > task.press) & (t < middle + 0.25), drag, 0.0)
     felt = np.minimum(wall(t - late), share) + (pulled if drag else 0.0)
     still = np.zeros_like(t)
-    found = figures_of(
+    found = figures_of_traces(
         t=t, master=still, slave=still, felt=felt, pressed=wall(t), energy=still, task=task
     )
     assert found.rise_delay == pytest.approx(expected, abs=2 * PERIOD, nan_ok=True)

@@ -12,7 +12,11 @@ from drake_teleop.lab.excitation.excite import sensor_motion
 from drake_teleop.lab.excitation.optimizer import Task
 from drake_teleop.lab.excitation.prediction import predicted_covariance
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import ShortestProblem, reliable_factor, shortest
+from drake_teleop.lab.excitation.shortest import (
+    ShortestProblem,
+    design_shortest_motion,
+    reliable_factor,
+)
 from drake_teleop.load.tolerance import deviations_of, errors_of, read_tolerance
 from drake_teleop.station.scenario import LoadScenario
 
@@ -63,7 +67,9 @@ def test_shortest_motion_reaches_the_tolerance_within_all_limits(
     slave: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_MAX_VAIN_ROUNDS", 0)
-    found = shortest(slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1)
+    found = design_shortest_motion(
+        slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1
+    )
     assert 3 / 15.0 <= found.excitation.trajectory.period < 0.5
     assert 0.3 < found.reached.max() <= 1.0
     assert all(use.share <= 1.0 for use in found.excitation.uses)
@@ -83,4 +89,4 @@ def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
 def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MAX_EMPTY_ROUNDS", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
-        shortest(slave, read_tolerance("inertia 0.00001 %"), starts=1)
+        design_shortest_motion(slave, read_tolerance("inertia 0.00001 %"), starts=1)

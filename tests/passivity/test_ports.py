@@ -21,7 +21,7 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     OneDofRun,
     Task,
-    figures,
+    figures_of_run,
     operators_intent,
     run_one_dof,
 )
@@ -183,7 +183,7 @@ def test_four_channels_are_transparent_without_delay():
         MEDIUM, PassivityConfig(method="four_channel"), NetworkConfig(),
         intent=operators_intent(task), timeout=1.0,
     )  # fmt: skip
-    assert abs(figures(found, MEDIUM, task).force_error) < 0.02
+    assert abs(figures_of_run(found, MEDIUM, task).force_error) < 0.02
     held = slice(3500, 3900)
     assert found.wall[held].mean() / MEDIUM.servo_stiffness < -2e-4
     np.testing.assert_allclose(found.slave[held], found.master[held], atol=1e-6)

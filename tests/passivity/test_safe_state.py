@@ -11,7 +11,7 @@ from drake_teleop.lab.comparison.one_dof import (
     PERIOD,
     OneDof,
     Task,
-    figures,
+    figures_of_run,
     operators_intent,
     run_one_dof,
 )
@@ -157,7 +157,7 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
         result = run_one_dof(model, config, forward, backward, timeout=TIMEOUT)
         assert np.isfinite(result.felt).all() and np.isfinite(result.command).all()
         assert np.abs(result.felt).max() <= 5.0 + 1e-12
-        found = figures(result, model)
+        found = figures_of_run(result, model)
         assert found.stable, found
         assert abs(found.drift) < 2e-3, found
         assert np.abs(result.felt[-1000:]).max() < 0.1

@@ -20,9 +20,9 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.progress import Stage, show_progress
-from drake_teleop.lab.comparison.decision import decide
+from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.delayed_contact import (
-    LEAVES,
+    LEAF_SPRINGS,
     delayed_contact,
     station_figures,
     vertical_traces,
@@ -33,7 +33,7 @@ from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
     covering_damping,
-    figures,
+    figures_of_run,
     run_one_dof,
 )
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
@@ -115,7 +115,7 @@ def compare_command(
             "pressed_N": [pressed for _, pressed in cell.forces],
             "leaked_J": cell.leaked,
         }
-        for (method, network), cell in decide(summary).items()
+        for (method, network), cell in decision_table(summary).items()
     ]
     import polars as pl
 
@@ -139,7 +139,7 @@ def longest_round_trip(
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
         for seed in seeds if jitter or loss else seeds[:1]:
             run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
-            if not figures(run, model).stable:
+            if not figures_of_run(run, model).stable:
                 return longest
         longest = round_trip
     return longest
@@ -259,19 +259,21 @@ def _station_study(
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
-    cases = list(itertools.product(slowest, LEAVES, methods))
+    cases = list(itertools.product(slowest, LEAF_SPRINGS, methods))
     results = _run_parallel(
         station_run,
         [(base, method, network, leaf, estimate) for network, leaf, method in cases],
         jobs,
         stage("The whole station"),
     )
-    order = {name: list(names).index for name, names in (("network", networks), ("leaf", LEAVES))}
+    order = {
+        name: list(names).index for name, names in (("network", networks), ("leaf", LEAF_SPRINGS))
+    }
     rows = sorted(
         (row for row, _ in results),
         key=lambda row: (order["network"](row["network"]), order["leaf"](row["leaf"])),
     )
-    first = next(iter(LEAVES))
+    first = next(iter(LEAF_SPRINGS))
     traces = {
         (row["network"], row["method"]): shown
         for row, shown in results

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into, quaternion_of
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of_traces
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
@@ -25,7 +25,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 _START_GAP, _PRESS_DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
 _LEAF_LENGTH, _LEAF_WIDTH = 0.12, 0.05  # m
 #: Leaves by name: thickness [m], light enough not to oscillate.
-LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
+LEAF_SPRINGS = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
@@ -80,7 +80,7 @@ def delayed_contact(
         position=[x, y, z - _START_GAP],
         length=_LEAF_LENGTH,
         width=_LEAF_WIDTH,
-        thickness=LEAVES[leaf] if isinstance(leaf, str) else thickness_of(leaf),
+        thickness=LEAF_SPRINGS[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
     )
     return (
         replace(
@@ -95,7 +95,7 @@ def delayed_contact(
     )
 
 
-def thickness_of(stiffness: float) -> float:
+def leaf_thickness(stiffness: float) -> float:
     """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
     unit = SheetSpring(length=_LEAF_LENGTH, width=_LEAF_WIDTH, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
@@ -105,13 +105,13 @@ def station_figures(result: SimulationResult, scenario: Scenario, task: Task) ->
     """Return the measures of a run: vertical motion and force, rotation of the tool, energy."""
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
-    return figures_of(
+    return figures_of_traces(
         t=result.t,
         master=result["pose_command"][:, 6],
         slave=heights,
         felt=result["force_to_master"][:, 2],
         pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
-        energy=energy_between(result, scenario),
+        energy=injected_energy(result, scenario),
         task=task,
         turned=turned,
     )
@@ -124,11 +124,11 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
         "t": result.t,
         "felt": result["force_to_master"][:, 2],
         "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
-        "energy": energy_between(result, scenario),
+        "energy": injected_energy(result, scenario),
     }
 
 
-def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
+def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
     """Return the energy (N,) from hand and environment, plus the method's initial energy [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().shares):

@@ -234,8 +234,8 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
 
-def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
-    return figures_of(
+def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
+    return figures_of_traces(
         t=run.t,
         master=run.master,
         slave=run.slave,
@@ -246,7 +246,7 @@ def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
     )
 
 
-def figures_of(
+def figures_of_traces(
     *,
     t: NDArray[np.float64],
     master: NDArray[np.float64],
@@ -267,11 +267,11 @@ def figures_of(
     """
     dt = float(t[1] - t[0])
 
-    def window(start: float, stop: float) -> slice:
+    def window_slice(start: float, stop: float) -> slice:
         return slice(round(start / dt), round(stop / dt))
 
-    hold = window(task.release - task.judged, task.release)
-    rest = window(task.end - task.judged, task.end)
+    hold = window_slice(task.release - task.judged, task.release)
+    rest = window_slice(task.end - task.judged, task.end)
     hunting = max(_peak_to_peak(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
     turning = max((_peak_to_peak(x[part]) for x in angles for part in (hold, rest)), default=0.0)
@@ -286,7 +286,7 @@ def figures_of(
         chatter=float(felt[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
-        free_force=float(np.sqrt(np.mean(felt[window(task.swing, task.swung)] ** 2))),
+        free_force=float(np.sqrt(np.mean(felt[window_slice(task.swing, task.swung)] ** 2))),
         rise_delay=_rise_delay(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
@@ -294,10 +294,10 @@ def figures_of(
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
     """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
-    return max(0.0, -float(_resistance(model, round_trip).min()))
+    return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
 
 
-def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
+def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
     s = 1j * _FREQUENCIES
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
@@ -348,7 +348,7 @@ def _simulate(
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
         x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
         v_w = (course[following, 5] - x_w) / PERIOD
-        push = _wall_push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
+        push = _wall_force(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
         wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
         load[0] = -scale * sigma * tool_mass * a_s
@@ -390,8 +390,8 @@ def _simulate(
                 v_s += dt * a_s
                 x_s += dt * v_s
             beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS * PERIOD * v_w)
-            push_then, push = push, _wall_push(wall_stiffness, wall_damping, beyond, v_s - v_w)
-            work = -_mean_positive(push_then, push) * (x_s - x_then)
+            push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
+            work = -_mean_if_same_sign(push_then, push) * (x_s - x_then)
             accounts[ACTUAL] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
@@ -410,12 +410,12 @@ def _quantise(x, resolution):
 
 
 @njit(cache=True)
-def _wall_push(stiffness, damping, depth, speed):
+def _wall_force(stiffness, damping, depth, speed):
     return stiffness * depth + (damping * speed if depth > 0.0 else 0.0)
 
 
 @njit(cache=True)
-def _mean_positive(a, b):
+def _mean_if_same_sign(a, b):
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:

@@ -20,7 +20,7 @@ from drake_teleop.lab.comparison.decision import (
     LEAKS,
     POSITION_ERROR,
     UNSTABLE,
-    decide,
+    decision_table,
 )
 from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
 from drake_teleop.station.channel.network import PRESETS
@@ -84,7 +84,7 @@ def table_cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def draw_decision(summary: Mapping[str, Any]) -> Figure:
-    methods, networks, table = summary["methods"], summary["networks"], decide(summary)
+    methods, networks, table = summary["methods"], summary["networks"], decision_table(summary)
     with plot_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
         axes = figure.subplots()
@@ -98,7 +98,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
             axes.text(
                 x,
                 y - offset,
-                f"{mark} {cell.words}",
+                f"{mark} {cell.verdict_text}",
                 color=text_colour,
                 size=9.5,
                 weight="bold",
@@ -237,13 +237,15 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console, table = Console(), decide(summary)
+    console, table = Console(), decision_table(summary)
     grid = Table(title="Rendered share of the contact force", title_justify="left", box=SIMPLE_HEAD)
     grid.add_column("Method", no_wrap=True)
     for network in summary["networks"]:
         grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")
     for method in summary["methods"]:
         cells = [table[method, network] for network in summary["networks"]]
-        grid.add_row(method, *(f"{cell.words} {cell.share}".strip() for cell in cells))
+        grid.add_row(
+            method, *(f"{cell.verdict_text} {cell.displayed_share}".strip() for cell in cells)
+        )
     console.print(grid)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -38,7 +38,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, motions_of
+from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, write_link_motions
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize
@@ -68,7 +68,7 @@ def bounding_capsule(shape: Shape) -> Capsule:
     if isinstance(shape, CapsuleShape):
         end = np.array([0.0, 0.0, shape.length() / 2])
         return Capsule(np.array([-end, end]), shape.radius())
-    points = _hull(shape)
+    points = _convex_hull_points(shape)
     middle = (points.max(axis=0) + points.min(axis=0)) / 2
     half = (points.max(axis=0) - points.min(axis=0)) / 2
     candidates = []
@@ -83,7 +83,7 @@ def bounding_capsule(shape: Shape) -> Capsule:
     return Capsule(ends, radius)
 
 
-def _hull(shape: Shape) -> Array:
+def _convex_hull_points(shape: Shape) -> Array:
     if isinstance(shape, Box):
         corners = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, 8).T
         return corners * shape.size()
@@ -166,7 +166,7 @@ class Scene:
                 rows[body] = row
         return rows
 
-    def without_neighbours(
+    def find_collision_candidates(
         self, postures: Array, start: Array | None
     ) -> tuple[dict[_Pair, Array], list[str]]:
         """Return pairs of shapes that may collide, and names of bodies that touch at the start.
@@ -229,7 +229,7 @@ class Scene:
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
-        motions_of(self.arm.table, q, 0 * q, 0 * q, motions)
+        write_link_motions(self.arm.table, q, 0 * q, 0 * q, motions)
         capsules: dict[GeometryId, tuple[int, Capsule]] = {}
         for shape in sorted(
             {shape for pair in candidates for shape in pair}, key=_identifier_number
@@ -242,7 +242,7 @@ class Scene:
             capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
             if inspector.GetName(shape).endswith(_TABLE):
                 capsules[shape] = row, _TABLE_CAPSULE
-        outer = {shape: _outermost(shape, capsules) for shape in capsules}
+        outer = {shape: _outermost_capsule(shape, capsules) for shape in capsules}
         outer_shapes = sorted({outer[shape] for shape in outer}, key=_identifier_number)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
@@ -254,7 +254,7 @@ class Scene:
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         shapes = [capsules[shape][1] for shape in outer_shapes]
         motions = empty_motions(len(postures), self.arm.num_joints)
-        motions_of(self.arm.table, postures, 0 * postures, 0 * postures, motions)
+        write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in shapes])
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
@@ -304,7 +304,9 @@ def _identifier_number(shape: GeometryId) -> int:
     return int(shape.get_value())
 
 
-def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]) -> GeometryId:
+def _outermost_capsule(
+    shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]
+) -> GeometryId:
     row, capsule = capsules[shape]
     holding = [
         (other.radius, -_identifier_number(name), name)

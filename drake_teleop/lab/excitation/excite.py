@@ -11,16 +11,16 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import Stage, show_progress
-from drake_teleop.lab.excitation.check import RATE, Use, check
+from drake_teleop.lab.excitation.check import RATE, LimitUse, check_trajectory
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
     empty_motions,
-    limit_uses,
-    motions_of,
-    sensor_vectors,
+    write_limit_uses,
+    write_link_motions,
+    write_sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import Iterate, Problem, Task, design
+from drake_teleop.lab.excitation.optimizer import Iterate, Problem, Task, minimise_criterion
 from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -52,7 +52,7 @@ class Excitation:
     criterion: str
     values: dict[str, float]
     deviations: Array
-    uses: list[Use]
+    uses: list[LimitUse]
     history: Array
     seconds: float
 
@@ -86,27 +86,27 @@ def excite(
         def report_best(done: float, best: float) -> None:
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        found = design(
+        found = minimise_criterion(
             Problem(task), seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
-        trajectory, uses = best_checked(robot, found, stage("Check it at 1 kHz"))
-    return checked_excitation(robot, criterion, found, trajectory, uses)
+        trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"))
+    return make_checked_excitation(robot, criterion, found, trajectory, uses)
 
 
-def checked_excitation(
+def make_checked_excitation(
     robot: Robot,
     criterion: str,
     found: list[Iterate],
     trajectory: FourierTrajectory,
-    uses: list[Use],
+    uses: list[LimitUse],
 ) -> Excitation:
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,
         trajectory,
         criterion,
-        criteria_of(robot, trajectory),
+        criterion_values(robot, trajectory),
         predicted_deviations(
             *sensor_motion(robot, trajectory), 1 / RATE, robot.noise, robot.limits.phi
         ),
@@ -116,13 +116,13 @@ def checked_excitation(
     )
 
 
-def best_checked(
+def find_best_within_limits(
     robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
-) -> tuple[FourierTrajectory, list[Use]]:
+) -> tuple[FourierTrajectory, list[LimitUse]]:
     """Return the best trajectory that passes the check, and its use of the limits."""
-    worst: Use | None = None
+    worst: LimitUse | None = None
     for trajectory in _candidates(found, robot):
-        uses = check(robot, trajectory, progress)
+        uses = check_trajectory(robot, trajectory, progress)
         if uses[0].share <= 1:
             return trajectory, uses
         if worst is None or uses[0].share < worst.share:
@@ -136,7 +136,7 @@ def best_checked(
     )
 
 
-def criteria_of(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
+def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
     """Return the value of every criterion over one period at 1 kHz."""
     motion = sensor_motion(robot, trajectory)
     return {
@@ -148,9 +148,9 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
     """Return s, omega, alpha (T, 3) of the sensor, in S, over one period at 1 kHz."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
-    motions_of(robot.arm.table, *joints, motions)
+    write_link_motions(robot.arm.table, *joints, motions)
     out = np.empty((3, len(motions), 3))
-    sensor_vectors(motions, out)
+    write_sensor_motion(motions, out)
     s, omega, alpha = out
     return s, omega, alpha
 
@@ -177,8 +177,10 @@ def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajector
 def _largest_use(robot: Robot, trajectory: FourierTrajectory) -> float:
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
-    motions_of(robot.arm.table, *joints, motions)
+    write_link_motions(robot.arm.table, *joints, motions)
     smooth, largest = np.empty((2, len(LIMITS)))
     gradients = np.empty((len(LIMITS), 3, *joints[0].shape))
-    limit_uses(robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients)
+    write_limit_uses(
+        robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients
+    )
     return float(largest.max())

@@ -22,18 +22,24 @@ from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import (
     Excitation,
-    best_checked,
-    checked_excitation,
+    find_best_within_limits,
+    make_checked_excitation,
     sensor_motion,
 )
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
     criterion_gradient,
-    limit_uses,
-    motions_of,
-    sensor_vectors,
+    write_limit_uses,
+    write_link_motions,
+    write_sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import Bounds, Evaluation, Problem, Task, design
+from drake_teleop.lab.excitation.optimizer import (
+    Bounds,
+    Evaluation,
+    Problem,
+    Task,
+    minimise_criterion,
+)
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     predicted_covariance,
@@ -44,7 +50,7 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
 from drake_teleop.load.trajectory import FourierTrajectory
 
-RELIABLE = 0.95
+RELIABLE_PROBABILITY = 0.95
 """Share of the records in which all numbers are within their tolerances together."""
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
@@ -68,14 +74,14 @@ _REGULARISATION = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
-class Shortest:
+class ShortestMotion:
     """Checked motion; `reached` (k,) is z d_k over the tolerances, at most 1."""
 
     excitation: Excitation
     reached: Array
 
 
-def shortest(
+def design_shortest_motion(
     robot: Robot,
     tolerance: Tolerance,
     *,
@@ -83,7 +89,7 @@ def shortest(
     seed: int = 0,
     starts: int = 24,
     progress: Callable[[float, float], None] = lambda done, best: None,
-) -> Shortest:
+) -> ShortestMotion:
     """Design and check the shortest motion that reaches a tolerance.
 
     Raises:
@@ -95,19 +101,21 @@ def shortest(
         robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
     )
     worst, around = np.inf, None
-    best: Shortest | None = None
+    best: ShortestMotion | None = None
     vain_rounds, empty_rounds = 0, 0
     for k in range(_MAX_ROUNDS):
         problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
         num_starts = starts if around is None else min(starts, _NUM_LATER_STARTS)
-        found = design(problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress)
+        found = minimise_criterion(
+            problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress
+        )
         found = [each for each in found if each.value <= _MAX_PERIOD_S]
         if not found:
             if (empty_rounds := empty_rounds + 1) == _MAX_EMPTY_ROUNDS:
                 break
             around = None
             continue
-        trajectory, uses = best_checked(robot, found)
+        trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
         covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
         reached = deviations_of(errors, covariance)
@@ -119,8 +127,8 @@ def shortest(
                 0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
             )
             if trajectory.period < shortest_period:
-                excitation = checked_excitation(robot, "period", found, trajectory, uses)
-                best = Shortest(excitation, reached)
+                excitation = make_checked_excitation(robot, "period", found, trajectory, uses)
+                best = ShortestMotion(excitation, reached)
             if vain_rounds == _MAX_VAIN_ROUNDS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
@@ -141,7 +149,7 @@ def shortest(
 
 def reliable_factor(count: int) -> float:
     """Return the factor z with which `count` numbers are within tolerance together (Sidak)."""
-    return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
+    return float(ndtri(0.5 + 0.5 * RELIABLE_PROBABILITY ** (1.0 / count)))
 
 
 class ShortestProblem(Problem):
@@ -202,14 +210,14 @@ class ShortestProblem(Problem):
         coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q, qd, qdd = self._basis @ coefficients
         q, qd, qdd = q + x[:n], qd / T, qdd / T**2
-        motions_of(task.table, q, qd, qdd, self._motions)
-        sensor_vectors(self._motions, self._vectors)
+        write_link_motions(task.table, q, qd, qdd, self._motions)
+        write_sensor_motion(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
         use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
         criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMITS)))
-        limit_uses(
+        write_limit_uses(
             task.table,
             q,
             qd,

@@ -17,7 +17,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.new_station.plan import Plan
 from drake_teleop.lab.new_station.random_postures import postures_at
-from drake_teleop.lab.new_station.text import wall_of
+from drake_teleop.lab.new_station.text import wall_of_plan
 from drake_teleop.station.slave.posture_shapes import PostureShapes
 
 _LINK_COLOURS = ((0.74, 0.77, 0.82), (0.52, 0.57, 0.65))
@@ -40,12 +40,12 @@ _DIRECTIONS = np.column_stack(
 
 def start_picture(plan: Plan, title: str) -> Figure:
     """Draw the shapes at the start; meshes as convex hulls."""
-    shapes, wall = plan.shapes, wall_of(plan)
+    shapes, wall = plan.shapes, wall_of_plan(plan)
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shade(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
-    chain = _chain(plan)
+    chain = _joint_chain_points(plan)
     points = np.vstack([surfaces.reshape(-1, 3), chain])
     lower, upper = points.min(axis=0), points.max(axis=0)
     with plot_style():
@@ -62,13 +62,13 @@ def start_picture(plan: Plan, title: str) -> Figure:
             _draw_plane(axes, lower, upper, plan.plane)
             _draw_triad(axes, shapes, _TRIAD_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
-            _fit(axes, lower, upper, plan.plane)
+            _fit_view(axes, lower, upper, plan.plane)
         figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
     return figure
 
 
 def _caption(plan: Plan) -> str:
-    gap = 1e3 * (plan.lowest[2] - wall_of(plan).position[2])
+    gap = 1e3 * (plan.lowest[2] - wall_of_plan(plan).position[2])
     plane = round(plan.plane, 2) + 0.0  # not -0
     return (
         f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m; axes of S: x red,"
@@ -135,7 +135,7 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
 
 
-def _chain(plan: Plan) -> Array:
+def _joint_chain_points(plan: Plan) -> Array:
     at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
     return np.vstack([at_start.origins[0], at_start.p_WS])
 
@@ -147,7 +147,7 @@ def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:
         axes.plot(*np.array([start, end]).T, color=colour, linewidth=2.0, zorder=10)
 
 
-def _fit(axes: Any, lower: Array, upper: Array, plane: float) -> None:
+def _fit_view(axes: Any, lower: Array, upper: Array, plane: float) -> None:
     lower = np.minimum(lower, [np.inf, np.inf, plane])
     middle, half = (lower + upper) / 2.0, 0.5 * float(max(upper - lower))
     for set_limits, m in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):

@@ -27,10 +27,10 @@ from drake_teleop.lab.new_station.random_postures import (
     Region,
     degrees_of_freedom,
     joint_margins,
+    posture_scores,
     postures_at,
     random_postures,
-    scores,
-    suitable,
+    select_suitable_postures,
     with_tool_axis,
 )
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, NewInstance
@@ -67,7 +67,7 @@ _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
 _MIN_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
-LEAST_LOAD = 0.05  #: Share of the load that weak arms have to hold.
+MIN_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
@@ -105,7 +105,7 @@ class Place(NamedTuple):
     overlaps: bool = False
 
     @property
-    def reachable(self) -> str:
+    def reachable_text(self) -> str:
         """Reachable displacements from the start, as a text."""
         directions = "up and down" if self.vertical else "in all directions"
         return f"{1e3 * self.half:g} mm {directions}"
@@ -161,13 +161,13 @@ def find_place(
     """
     R_SA = TOOL_AXES[axis]
     pointed = with_tool_axis(arm, R_SA.matrix())
-    length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
-    postures, region = suitable(random_postures(pointed), plane, length)
+    length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
+    postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = list[Place]()
     for rows in _rows_to_solve(pointed, postures, region, shapes):
         solved = _candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
-        found += [_examined(shapes, place, region) for place in solved]
+        found += [_with_largest_wall(shapes, place, region) for place in solved]
         if not all(place.overlaps for place in found):
             break
     found.sort(key=lambda place: place.score, reverse=True)
@@ -175,12 +175,15 @@ def find_place(
     best = None
     for places, vertical in ((good[:_NUM_FINALISTS], False), (found, False), (found, True)):
         if best is None or best.half == 0.0:
-            cubes = [_with_cube(pointed, place, is_free, vertical) for place in places[:_NUM_CUBES]]
+            cubes = [
+                _with_reachable_cube(pointed, place, is_free, vertical)
+                for place in places[:_NUM_CUBES]
+            ]
             best = max(cubes, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
-            f" ({_removals(region, len(postures.q))})",
+            f" ({_describe_removals(region, len(postures.q))})",
             where="new",
             remedy="check joint limits and the orientation of sensor_frame",
         )
@@ -197,7 +200,7 @@ def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     If necessary with less load, and then without any condition.
     """
     roomy = joint_margins(arm, q) > _MIN_MARGIN
-    for share in (1.0, LEAST_LOAD):
+    for share in (1.0, MIN_LOAD_SHARE):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
         strong = (np.abs(torques) < MAX_TORQUE_USE * arm.effort_limit).all(axis=1)
@@ -206,7 +209,7 @@ def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
 
 
-def _removals(region: Region, left: int) -> str:
+def _describe_removals(region: Region, left: int) -> str:
     causes = ", ".join(f"in {count} {name}" for name, count in region.removed if count)
     return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
@@ -217,7 +220,7 @@ def _rows_to_solve(
     """Yield the usable rows, the best first; then rows of all ranks whose shapes do not overlap."""
     if not len(postures.q):
         return
-    order = np.argsort(scores(arm, postures, region))[::-1]
+    order = np.argsort(posture_scores(arm, postures, region))[::-1]
     usable = order[np.isin(order, _usable_rows(arm, postures.q))]
     yield usable
     if shapes is None:
@@ -247,7 +250,7 @@ def _candidates(
         return
     solved = [solved[k] for k in _usable_rows(arm, np.array([q for q, _, _ in solved]))]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
-    merits, rooms = scores(arm, exact, region), joint_margins(arm, exact.q)
+    merits, rooms = posture_scores(arm, exact, region), joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
         yield Place(pose, by_position, q, 0.0, float(room), float(merit))
 
@@ -274,7 +277,7 @@ def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Ar
                 yield found, pose, False
 
 
-def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Place:
+def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Region) -> Place:
     """Return the place with the largest free wall; its score is reduced by the cost of overlaps."""
     if shapes is None:
         return place
@@ -303,7 +306,7 @@ def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Pla
 def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
     """Move the walls below the tool, into the space of wall and motion; return their edges."""
     plant, walls = shapes.plant, {}
-    x, y, z = lowest_point(shapes)
+    x, y, z = lowest_tool_point(shapes)
     middle = RigidTransform([x, y, z + (_WALL_ABOVE_M - _WALL_BELOW_M) / 2.0])
     for edge in WALL_EDGES_M:
         body = plant.GetBodyByName(_wall_name(edge))
@@ -312,7 +315,7 @@ def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
     return walls
 
 
-def lowest_point(shapes: PostureShapes) -> Array:
+def lowest_tool_point(shapes: PostureShapes) -> Array:
     """Return the tool's lowest point p_W (3,) [m]; without shapes its centre of mass."""
     points = shapes.points(shapes.tool_bodies)
     if not len(points):
@@ -322,7 +325,7 @@ def lowest_point(shapes: PostureShapes) -> Array:
     return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
 
 
-def extent(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
+def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
     """Return how far bodies reach beyond S along an axis of S, at least 0 [m]."""
     points = shapes.X_WS.inverse() @ shapes.points(bodies).T
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
@@ -336,9 +339,9 @@ def _merit(place: Place) -> tuple[float, float, bool, float]:
     return enough_room, enough_space, place.by_position, place.half
 
 
-def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
+def _with_reachable_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
     """Return the place with the half edge of its largest reachable cube, or 0."""
-    moves = _meets if is_free else _reaches
+    moves = _ik_reaches if is_free else _pose_reaches
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
         signs = np.vstack([np.eye(3), -np.eye(3)])
@@ -353,12 +356,12 @@ def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Pl
     return place._replace(half=largest, room=room, vertical=vertical)
 
 
-def _meets(arm: ArmModel, place: Place, displacement: Array) -> bool:
+def _ik_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
     q, status = find_posture(arm, place.pose + np.append(np.zeros(4), displacement), place.q)
     return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_TURN)
 
 
-def _reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
+def _pose_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, _ = find_posture(arm, target, place.q)
     error = np.linalg.norm(_pose(arm, q)[4:] - target[4:])

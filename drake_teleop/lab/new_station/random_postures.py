@@ -115,7 +115,9 @@ def random_postures(arm: ArmModel) -> Postures:
     return postures_at(arm, random.uniform(lower, upper, (NUM_POSTURES, arm.num_joints)))
 
 
-def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Postures, Region]:
+def select_suitable_postures(
+    postures: Postures, plane: float, tool_length: float
+) -> tuple[Postures, Region]:
     """Return the postures that suit a start, and the region on the side with most of them."""
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first
@@ -129,8 +131,8 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
         ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
         (
             "S is too near to the first joint, too far, too low or too high",
-            _within(radius / reach, _RADIUS)
-            & _within(from_first[:, 2] / reach, _HEIGHT)
+            _is_within(radius / reach, _RADIUS)
+            & _is_within(from_first[:, 2] / reach, _HEIGHT)
             & (tool_height > _MIN_TOOL_HEIGHT_M)
             & (np.abs(postures.p_WS) < _MAX_COORDINATE_M).all(axis=1),
         ),
@@ -145,24 +147,24 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
         rows = rows[met[rows]]
     angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
     sides = 2.0 * np.pi * np.arange(_NUM_SIDES) / _NUM_SIDES
-    counts = np.array([float(_on_side(angle, side).sum()) for side in sides])
+    counts = np.array([float(_is_on_side(angle, side).sum()) for side in sides])
     counts[0] *= _FRONT_ADVANTAGE
     side = float(sides[int(np.argmax(counts))])
     region = Region(plane, tool_length, first, reach, raised, side, tuple(removed))
-    return postures[rows[_on_side(angle, side)]], region
+    return postures[rows[_is_on_side(angle, side)]], region
 
 
-def _within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
+def _is_within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
     inside: NDArray[np.bool_] = (values > limits[0]) & (values < limits[1])
     return inside
 
 
-def _on_side(angle: Array, side: float) -> NDArray[np.bool_]:
+def _is_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
     near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_RAD)
     return near
 
 
-def scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
+def posture_scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
     """Return a score (k,) of each posture; the highest is the best.
 
     Distance from limits and singularities and a raised elbow increase it. Links below the base
@@ -171,7 +173,7 @@ def scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
     margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
     L = orientation_length(arm)
     sigma = np.minimum(smallest_singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
-    elbow = np.minimum(elbow_up(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
+    elbow = np.minimum(elbow_up_share(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
     origins = postures.origins[:, region.raised, 2]
     low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
@@ -211,7 +213,7 @@ def smallest_singular_values(arm: ArmModel, postures: Postures) -> Array:
     return smallest
 
 
-def elbow_up(postures: Postures, reach: float) -> Array:
+def elbow_up_share(postures: Postures, reach: float) -> Array:
     """Return the upward share (k,) of the elbow's offset from the line shoulder-wrist, -1 to 1.
 
     The elbow is the joint that is farthest from the line of the first and last joint.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import Progress, Stage
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
-from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact
+from drake_teleop.lab.run_summary import FILTER_TAIL_S, is_in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.operator.operator import Sine
@@ -81,7 +81,7 @@ class ContactMotion:
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
     """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
-    scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
+    scaled = {sigma: _scaled_wrench_at_slave(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
@@ -89,17 +89,17 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
     """Simulate the contact transition with and without the leaf spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
-    free = _simulate(without_sheet(scenario), estimate, free_stage)
-    calculated_free = _scaled(free, estimate, 0.0)
+    free = _simulate(without_leaf_spring(scenario), estimate, free_stage)
+    calculated_free = _scaled_wrench_at_slave(free, estimate, 0.0)
     return ContactMotion(
         scenario=scenario,
         touched=touched,
         free=free,
-        raw=_scaled(touched, estimate, 1.0),
-        calculated=_scaled(touched, estimate, 0.0),
-        raw_free=_scaled(free, estimate, 1.0),
+        raw=_scaled_wrench_at_slave(touched, estimate, 1.0),
+        calculated=_scaled_wrench_at_slave(touched, estimate, 0.0),
+        raw_free=_scaled_wrench_at_slave(free, estimate, 1.0),
         calculated_free=calculated_free,
-        contact=in_contact(touched),
+        contact=is_in_contact(touched),
         threshold=_THRESHOLD_OVER_FREE * float(_force_norm(calculated_free).max()),
     )
 
@@ -172,7 +172,7 @@ def contact_values(run: ContactMotion) -> Values:
         "true_s": _first_time(t, run.contact),
         "detected_s": _first_time(t, detected),
         "threshold_N": run.threshold,
-        "raw_detectable": bool(raw_excess(run).max() > 0),
+        "raw_detectable": bool(raw_force_excess(run).max() > 0),
         "false_alarm_0_6_s": bool(detected[after].any()),
         "peak_contact_N": float(force_norm.max()),
         "peak_true_contact_N": _largest_norm(run.touched["true_contact_wrench_W"][:, :3]),
@@ -184,7 +184,7 @@ def contact_values(run: ContactMotion) -> Values:
     }
 
 
-def raw_excess(run: ContactMotion) -> Array:
+def raw_force_excess(run: ContactMotion) -> Array:
     """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
@@ -219,7 +219,7 @@ def identification_values(load: LoadIdentification, scenario: Scenario) -> Value
     }
 
 
-def without_sheet(scenario: Scenario) -> Scenario:
+def without_leaf_spring(scenario: Scenario) -> Scenario:
     """Return the scenario without the leaf spring, with the next seed."""
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
@@ -234,7 +234,7 @@ def true_parameters(scenario: Scenario) -> Array:
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 
-def _scaled(result: SimulationResult, estimate: Array, sigma: float) -> Array:
+def _scaled_wrench_at_slave(result: SimulationResult, estimate: Array, sigma: float) -> Array:
     wrench, s, omega, alpha = sensor_samples(result)
     offsets, phi, no_object = estimate[:6], estimate[6:], np.zeros(10)
     scales = {"sigma_gripper": sigma, "sigma_object": sigma, "gamma": 1.0}

@@ -148,7 +148,7 @@ def values_by_full_name(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, A
     }
 
 
-def captions(summary: Mapping[str, Any]) -> dict[str, str]:
+def figure_captions(summary: Mapping[str, Any]) -> dict[str, str]:
     s = summary
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     threshold = "a threshold" if s["contact.raw_detectable"] else "no threshold"
@@ -195,7 +195,7 @@ def parameter_rows(
     return rows
 
 
-def versions() -> dict[str, str]:
+def library_versions() -> dict[str, str]:
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
 
@@ -214,8 +214,8 @@ def write_report(
         "drake_teleop.lab.reproduction",
         "report.html.j2",
         setup=dict(setup),
-        versions=versions(),
-        tiles=_tiles(summary),
+        versions=library_versions(),
+        tiles=_summary_tiles(summary),
         comparisons=compare_with_paper(summary),
         figures=[(item, png_data_url(item.png)) for item in figures],
         parameters=parameters,
@@ -225,7 +225,7 @@ def write_report(
     write_text(path, page)
 
 
-def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _summary_tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     return [
         (f"{s['free_force.peak_raw_N']:.0f}", "N", "on the sensor from moving the tool alone"),

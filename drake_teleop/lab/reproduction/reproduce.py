@@ -36,14 +36,14 @@ from drake_teleop.lab.reproduction.experiments import (
     identification_values,
     reversal_without_contact,
     true_parameters,
-    without_sheet,
+    without_leaf_spring,
 )
 from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     ReportFigure,
-    captions,
     compare_with_paper,
+    figure_captions,
     parameter_rows,
     values_by_full_name,
     write_report,
@@ -87,8 +87,8 @@ def reproduce_command(
             "contact": contact_values(contact_run),
             "identification": identification_values(load, force),
         }
-        session = {"speed": _speed(stage("Measure the speed"))}
-        pictures = draw(force_run, torque_run, contact_run, summary)
+        session = {"speed": _measure_speed(stage("Measure the speed"))}
+        pictures = draw_figures(force_run, torque_run, contact_run, summary)
         written = stage("Write figures, replay and report")
         with output_folder(out):
             _write(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
@@ -100,7 +100,7 @@ def reproduce_command(
     return summary | session
 
 
-def draw(
+def draw_figures(
     force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Values
 ) -> dict[str, Figure]:
     pictures = {
@@ -135,7 +135,7 @@ def _log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
     return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
 
 
-def _speed(progress: Progress) -> Values:
+def _measure_speed(progress: Progress) -> Values:
     scenario = LoadScenario("free_motion_force")
     cost = cpu_seconds(
         {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress
@@ -161,7 +161,7 @@ def _write(
         ("free_motion_force", force.result, force.scenario),
         ("free_motion_torque", torque.result, torque.scenario),
         ("contact_transition", contact.touched, contact.scenario),
-        ("contact_transition_without_sheet", contact.free, without_sheet(contact.scenario)),
+        ("contact_transition_without_sheet", contact.free, without_leaf_spring(contact.scenario)),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
@@ -190,7 +190,7 @@ def _captioned_figures(out: Path, figures: Values) -> list[ReportFigure]:
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",
         "fig8": "Fig. 8: contact transition",
     }
-    words = captions(figures)
+    words = figure_captions(figures)
     return [ReportFigure(title, out / f"{name}.png", words[name]) for name, title in titles.items()]
 
 

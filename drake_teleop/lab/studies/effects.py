@@ -22,10 +22,10 @@ from drake_teleop.lab.studies.level_model import (
     TOO_FEW,
     Flags,
     LevelModel,
-    comparable,
+    largest_complete_block,
     level_model,
     levels_of,
-    reasons,
+    missing_value_reasons,
 )
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Factorial:
     counts: list[int]
     seen: Flags
 
-    def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
+    def comparable_levels(self, *shown: int) -> tuple[Flags, Flags, Array]:
         """Return booleans of comparable levels (or cells of two factors) and of used combinations.
 
         The matrix (kept rows, n) maps point values to means.
@@ -58,19 +58,19 @@ class Factorial:
         )
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
-        is_compared, combinations = comparable(point >= 0)
+        is_compared, combinations = largest_complete_block(point >= 0)
         weights = np.zeros((int(is_compared.sum()), len(row)))
         points = point[is_compared][:, combinations]
         np.put_along_axis(weights, points, 1.0 / combinations.sum(), axis=1)
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        means = [self.compared(factor)[2] for factor in range(len(self.counts))]
+        means = [self.comparable_levels(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        mean, half = interval(weights @ table)
+        mean, half = seed_interval(weights @ table)
         return mean, np.hypot(half, self._missing_seed_widths(table, weights))
 
     def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
@@ -114,7 +114,7 @@ def fill_missing(values: Array) -> Array:
     return np.where(known, values, of_point[:, None] + of_seed)
 
 
-def interval(table: Array) -> tuple[Array, Array]:
+def seed_interval(table: Array) -> tuple[Array, Array]:
     """Return means (n,) over the seeds of a table (n, seeds), and half widths; nan is ignored."""
     count = np.isfinite(table).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -188,7 +188,7 @@ class PairMeans:
     fitted: bool
 
 
-def estimated(
+def estimate_means(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
     """Return the means of values (N,) at each of `count` levels; nan is ignored."""
@@ -199,13 +199,13 @@ def estimated(
     np.add.at(runs, (levels[known], seed[known]), 1.0)
     with np.errstate(invalid="ignore"):
         table = sums / runs
-    mean, half = interval(table)
+    mean, half = seed_interval(table)
     # Seeds without some level are excluded: they would shift all other levels.
-    _, effect_half = interval(table - table.mean(axis=0))
+    _, effect_half = seed_interval(table - table.mean(axis=0))
     return Estimate(mean, half, effect_half)
 
 
-def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
+def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
     """Return the main effects on all measures: one row per measure, factor and level."""
     import polars as pl
 
@@ -273,7 +273,7 @@ class _MeasureData:
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW] * count, 0
         if self.model is not None:
-            is_compared, combinations, weights = self.model.compared(factor)
+            is_compared, combinations, weights = self.model.comparable_levels(factor)
             if is_compared.sum() > 1:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
@@ -292,7 +292,7 @@ class _MeasureData:
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        is_compared, combinations, weights = self.model.compared(first, second)
+        is_compared, combinations, weights = self.model.comparable_levels(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
@@ -316,7 +316,7 @@ class _MeasureData:
 
     def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
         runs = np.bincount(cell, minlength=len(compared))
-        return reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
+        return missing_value_reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
 
 def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
@@ -324,11 +324,11 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
     table = np.full((points.height, len(seeds)), np.nan)
-    table[point, seed] = numbers(rows, measure)
+    table[point, seed] = measure_values(rows, measure)
     return points, table
 
 
-def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
+def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
     """Return all points with their means of the `PARETO` measures; None if the study lacks one."""
     import polars as pl
 
@@ -340,19 +340,20 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
     seeds, complete = rows["seed"].to_numpy(), np.ones(len(order), dtype=bool)
     means = []
     for name in PARETO:
-        values = numbers(rows, name)
+        values = measure_values(rows, name)
         complete &= np.bincount(index, ~np.isfinite(values), len(order)) == 0
-        found = estimated(values, index, seeds, len(order))
+        found = estimate_means(values, index, seeds, len(order))
         points = points.with_columns(
             pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half)
         )
         means.append(found.mean)
     return points.with_columns(
-        pl.Series("complete", complete), pl.Series("front", front(np.column_stack(means), complete))
+        pl.Series("complete", complete),
+        pl.Series("front", is_on_pareto_front(np.column_stack(means), complete)),
     )
 
 
-def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return True at complete points that no other dominates; columns of `values` are minimised."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
@@ -363,10 +364,10 @@ def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def varied_factors(study: Study) -> list[Factor]:
-    return [factor for factor in study.factors if len(factor.listed()) > 1]
+    return [factor for factor in study.factors if len(factor.listed_values()) > 1]
 
 
-def numbers(rows: pl.DataFrame, measure: str) -> Array:
+def measure_values(rows: pl.DataFrame, measure: str) -> Array:
     """Return the values (N,) of a measure in all rows; nan where missing."""
     import polars as pl
 

@@ -64,7 +64,7 @@ def default_measures() -> list[str]:
     return list(_OF_EVERY_RUN)
 
 
-def measured(
+def evaluate_measures(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
     """Return the measures `names` of one run; `force_threshold` in N."""

@@ -16,7 +16,13 @@ from drake_teleop.common.files import write_picture
 from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.studies import effects
 from drake_teleop.lab.studies.design import Study
-from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied_factors
+from drake_teleop.lab.studies.effects import (
+    PARETO,
+    measure_values,
+    pair_means,
+    pareto_table,
+    varied_factors,
+)
 from drake_teleop.lab.studies.level_model import (
     CONFIDENCE,
     NO_RUN,
@@ -38,7 +44,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
     """Write the pictures that apply to a study into `out`; delete all other PNG files there."""
     for old in out.glob("*.png"):
         old.unlink()
-    measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]
+    measures = [name for name in study.measures if np.isfinite(measure_values(rows, name)).any()]
     pictures: dict[str, Figure | None] = {}
     if measures and varied_factors(study):
         pictures["main_effects"] = main_effects(study, rows, measures)
@@ -81,7 +87,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
     _label_levels(axes, found.names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
-        bar = _hatched(found.why[level], (level - 0.5, 0.0))
+        bar = _hatched_cell(found.why[level], (level - 0.5, 0.0))
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
     if np.isnan(found.mean).all():
@@ -105,14 +111,14 @@ def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str
     return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
 
 
-def _hatched(why: str, corner: tuple[float, float]) -> Rectangle:
+def _hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
     return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
 
 
 def _legend(figure: Figure, reasons: Iterable[str]) -> None:
     names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
     if names:
-        patches = [_hatched(why, (0.0, 0.0)) for why in names]
+        patches = [_hatched_cell(why, (0.0, 0.0)) for why in names]
         figure.legend(patches, names, loc="outside lower left", ncols=len(names))
 
 
@@ -129,7 +135,7 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
         for axes, found in zip(grid.ravel(), maps, strict=False):
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             for row, column in np.argwhere(np.isnan(found.mean)):
-                axes.add_patch(_hatched(found.why[row, column], (column - 0.5, row - 0.5)))
+                axes.add_patch(_hatched_cell(found.why[row, column], (column - 0.5, row - 0.5)))
             axes.grid(False)
             _label_levels(axes, found.names[1])
             axes.set_yticks(range(len(found.names[0])), found.names[0])
@@ -147,7 +153,7 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
 
 def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     """Draw effort over time and over force overshoot; return None without complete points."""
-    points = pareto(study, rows)
+    points = pareto_table(study, rows)
     if points is None or not points["complete"].any():
         return None
     points = points.filter("complete")

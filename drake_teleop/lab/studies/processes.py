@@ -75,26 +75,26 @@ def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> 
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
     while left:
-        marked = store.marked(suspicious)
+        marked = store.chunks_started_at_least(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
                 yield _run_alone(run, chunk, store)
         left = [chunk for chunk in left if chunk[0]["run"] not in marked]
         done: set[int] = set()
         try:
-            for found in _parallel(jobs)(_task(run, chunk, store) for chunk in left):
+            for found in _joblib_pool(jobs)(_task(run, chunk, store) for chunk in left):
                 done.add(found[0]["run"])
                 yield found
         except BrokenExecutor as error:
             suspicious = 1
-            if not store.marked(suspicious):
+            if not store.chunks_started_at_least(suspicious):
                 raise DrakeTeleopError(
                     f"processes ended before their first run ({error})"
                 ) from error
         left = [chunk for chunk in left if chunk[0]["run"] not in done]
 
 
-def _parallel(jobs: int) -> Any:
+def _joblib_pool(jobs: int) -> Any:
     from joblib import Parallel
 
     # joblib also warns when it replaces processes that use much memory; a crash raises an error.
@@ -121,19 +121,19 @@ def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
     for row in chunk:
         try:
             # With one job joblib would run it in this process.
-            found += next(_parallel(2)([_task(run, [row], store)]))
+            found += next(_joblib_pool(2)([_task(run, [row], store)]))
         except BrokenExecutor:
             found.append(row | {"error": PROCESS_ENDED})
-    store.unmark(chunk[0]["run"])
+    store.clear_starts(chunk[0]["run"])
     return found
 
 
 def _run_marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
-    store.mark(chunk[0]["run"])
+    store.count_start(chunk[0]["run"])
     try:
         return run(chunk)
     finally:
-        store.unmark(chunk[0]["run"])
+        store.clear_starts(chunk[0]["run"])
 
 
 def _end_with_parent(parent: int) -> None:
@@ -218,7 +218,7 @@ def _wrong_version(worker: str, found: Any, expected: str) -> DrakeTeleopError:
     )
 
 
-def _on_same_version(run: Run) -> Run:
+def _check_version_before_run(run: Run) -> Run:
     """Return `run` with a check of the version, for workers that join later."""
     version, expected = _version_reader(), __version__
 
@@ -235,14 +235,14 @@ def _on_same_version(run: Run) -> Run:
 def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
     from distributed import as_completed
 
-    run = _on_same_version(run)
+    run = _check_version_before_run(run)
     futures = client.map(run, chunks, pure=False)
     chunk_of = dict(zip(futures, chunks, strict=True))
     for future in as_completed(futures):
-        yield _rows_of(future, chunk_of.pop(future), run, client)
+        yield _rows_of_future(future, chunk_of.pop(future), run, client)
 
 
-def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
+def _rows_of_future(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
     from distributed import KilledWorker
 
     try:
@@ -251,5 +251,5 @@ def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
         if len(chunk) == 1:
             return [chunk[0] | {"error": PROCESS_ENDED}]
         alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
-        found = [row for part, rows in alone for row in _rows_of(part, rows, run, client)]
+        found = [row for part, rows in alone for row in _rows_of_future(part, rows, run, client)]
     return found

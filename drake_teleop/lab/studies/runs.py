@@ -89,7 +89,7 @@ def run_study(
                 counter.start(stage("Study"), workers.count)
                 new = points
                 while new:
-                    finished = store.finished()
+                    finished = store.finished_chunks()
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
                     for found in workers.rows_of(run, left):

@@ -62,7 +62,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         for part in Store(folder / "runs.parquet").parts():
             _link(part, store.folder / part.name, store.folder)
     store.remove_damaged_parts()
-    finished = store.finished()
+    finished = store.finished_chunks()
     missing = [k for k, chunk in enumerate(chunks) if chunk[0]["run"] not in finished]
     if missing:
         count = max(shard.total for shard in shards)

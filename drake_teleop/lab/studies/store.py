@@ -30,7 +30,7 @@ class Store:
 
     folder: Path
 
-    def finished(self) -> set[int]:
+    def finished_chunks(self) -> set[int]:
         """Return the first run of each stored chunk."""
         return set(map(_first_run, self.parts()))
 
@@ -48,7 +48,7 @@ class Store:
     def write(self, rows: pl.DataFrame) -> None:
         write_table(self.folder / _PART.format(rows["run"][0]), rows, aside=self.folder)
 
-    def mark(self, run: int) -> None:
+    def count_start(self, run: int) -> None:
         """Count one more start of the chunk whose first run is `run`."""
         path = self._marks / str(run)
         with wrap_write_errors(path):
@@ -56,10 +56,10 @@ class Store:
             with path.open("ab") as mark:
                 mark.write(b".")
 
-    def unmark(self, run: int) -> None:
+    def clear_starts(self, run: int) -> None:
         (self._marks / str(run)).unlink(missing_ok=True)
 
-    def marked(self, times: int) -> set[int]:
+    def chunks_started_at_least(self, times: int) -> set[int]:
         """Return the first runs of unfinished chunks with at least `times` starts."""
         marks = (mark for mark in self._marks.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
@@ -104,7 +104,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     """
     store = Store(out / "runs.parquet")
     make_folder(store.folder)
-    with claimed(out, identity):
+    with locked_folder(out, identity):
         store.remove_damaged_parts()
         yield store
         with suppress(OSError):  # missing, or with marks
@@ -112,7 +112,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
 
 
 @contextmanager
-def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
+def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
     """Lock the existing folder `out`; raise an error if its content is from other inputs."""
     handle = os.open(out, os.O_RDONLY)
     try:

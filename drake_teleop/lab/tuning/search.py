@@ -18,7 +18,7 @@ from drake_teleop.common.progress import Progress, show_progress
 from drake_teleop.lab.studies.design import Factor, Study, Value
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
-    AS_GIVEN,
+    KEEP_GAMMA,
     MAX_REST_FORCE_N,
     MIN_SHARE,
     SEARCH_MEASURES,
@@ -69,7 +69,7 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
     given = execute(
-        "as_given", _study([AS_GIVEN], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES), trial
+        "as_given", _study([KEEP_GAMMA], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES), trial
     )
     quiet = execute(
         "noise", _study(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES), trial
@@ -109,7 +109,7 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
         )
     _, chosen, inside = found[0]
     walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
-    limits = execute("limits", _study_of(dataclasses.asdict(chosen), ends, walls), trial)
+    limits = execute("limits", _study_of_settings(dataclasses.asdict(chosen), ends, walls), trial)
     return Found(chosen, search, given, inside, limits)
 
 
@@ -129,14 +129,14 @@ def _station_limit(
     hands = list(dict.fromkeys(ends))
     tries = 0
 
-    def rows_at(gamma: float) -> list[Row]:
+    def run_at_gamma(gamma: float) -> list[Row]:
         nonlocal tries
         tried = dataclasses.asdict(settings) | {"gamma": margin * gamma}
         rows: list[Row] = []
         # The stiffest wall first: it fails more often.
         for wall in dict.fromkeys(trial.stated.walls[::-1]):
             name = f"station_{settings.method}_{tries}_{wall:.0f}"
-            rows += execute(name, _study_of(tried, hands, [wall]), trial)
+            rows += execute(name, _study_of_settings(tried, hands, [wall]), trial)
             if not all(meets_requirements(row, margin) for row in rows):
                 rows = []
                 break
@@ -145,7 +145,7 @@ def _station_limit(
 
     gamma, failed, inside = settings.gamma, 0.0, []
     for _ in range(1 + _HALVINGS):
-        inside = rows_at(gamma)
+        inside = run_at_gamma(gamma)
         if inside:
             break
         gamma, failed = gamma / 2, gamma
@@ -153,7 +153,7 @@ def _station_limit(
         return gamma, []
     while failed > _BISECTION_RATIO * gamma:
         middle = float(np.sqrt(gamma * failed))
-        if rows := rows_at(middle):
+        if rows := run_at_gamma(middle):
             gamma, inside = middle, rows
         else:
             failed = middle
@@ -166,16 +166,16 @@ def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
     return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)
 
 
-def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
+def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
     """Return a function that runs or continues a named study in a folder of `out`."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:
 
-            def named(_: str) -> Progress:
+            def name_progress(_: str) -> Progress:
                 return stage(f"Trials {name}")
 
-            found = run_study(study, out / name, work, basis, jobs=jobs, progress=named)
+            found = run_study(study, out / name, work, basis, jobs=jobs, progress=name_progress)
         for row in found.rows(named=True):
             if row["error"]:
                 raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
@@ -202,7 +202,7 @@ def _load_force(trial: StationTrial) -> float:
     return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
-def _study_of(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
+def _study_of_settings(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
     gamma, sigma, low_pass = (settings[key] for key in ("gamma", "sigma_inertia", "low_pass_hz"))
     return _study([settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES)
 

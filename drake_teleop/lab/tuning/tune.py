@@ -22,7 +22,12 @@ from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
-from drake_teleop.lab.tuning.search import Found, meets_requirements, search_settings, studies_in
+from drake_teleop.lab.tuning.search import (
+    Found,
+    make_study_executor,
+    meets_requirements,
+    search_settings,
+)
 from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import commented, write_scenario
@@ -74,7 +79,7 @@ def tune(
         "stated": dataclasses.asdict(stated),
         "estimate": load.estimate.tolist(),
     }
-    found = search_settings(trial, studies_in(out, basis, jobs, shown))
+    found = search_settings(trial, make_study_executor(out, basis, jobs, shown))
     tuned = dataclasses.replace(
         replace(found.settings.apply(base, stated), simulation=given.simulation),
         operator=given.operator,

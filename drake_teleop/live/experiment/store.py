@@ -13,7 +13,7 @@ import polars as pl
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, write_table
 from drake_teleop.common.version import __version__
-from drake_teleop.lab.studies.store import claimed
+from drake_teleop.lab.studies.store import locked_folder
 from drake_teleop.live.experiment.design import Experiment
 
 #: Largest valid participant number.
@@ -100,5 +100,5 @@ def open_results(folder: Path, experiment: Experiment) -> Iterator[Store]:
     """Yield the results in a folder, locked for this process."""
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}
-    with claimed(folder, identity):
+    with locked_folder(folder, identity):
         yield Store(folder)
