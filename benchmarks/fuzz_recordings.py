@@ -34,7 +34,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
-from drake_teleop.live.inputs import INPUTS, Inputs, read_inputs
+from drake_teleop.live.inputs import INPUTS_FILE, Inputs, read_inputs
 from drake_teleop.live.record import Record, versions_and_digest
 from drake_teleop.robots import lines
 from drake_teleop.robots.recording import Recorder
@@ -303,16 +303,16 @@ def killed(path: Path) -> None:
             for ms in range(10**6):
                 record.write(ms, Inputs(x=ms % 1000))
         os._exit(0)
-    while not (folder / INPUTS).exists() and not os.waitpid(child, os.WNOHANG)[0]:
+    while not (folder / INPUTS_FILE).exists() and not os.waitpid(child, os.WNOHANG)[0]:
         time.sleep(1e-4)
     time.sleep(1e-6 * min(abs(microseconds), 30_000))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    text = (folder / INPUTS).read_text()
+    text = (folder / INPUTS_FILE).read_text()
     if text.count("\n") < 4:
         return
     changes = read_inputs(
-        folder / INPUTS, versions_and_digest(LoadScenario(folder / "scenario.yaml"))
+        folder / INPUTS_FILE, versions_and_digest(LoadScenario(folder / "scenario.yaml"))
     )
     expected = [(0, 0), *((ms, ms % 1000) for ms in range(1, len(changes)))]
     if [(ms, inputs.x) for ms, inputs in changes] != expected:

@@ -141,9 +141,9 @@ def test_parameters_of_a_registered_method_are_checked(folder):
 
 
 def test_a_live_session_records_the_registered_name(folder):
-    before = Inputs().changed({"method": 99}).method
+    before = Inputs().with_changes({"method": 99}).method
     register_from(folder / "parts.py")
-    inputs = Inputs().changed({"method": 99})
+    inputs = Inputs().with_changes({"method": 99})
     assert inputs.method == before + 1
     assert chosen_scenario(Scenario(), None, inputs).passivity.method == "share"
     path = folder / "inputs.csv"

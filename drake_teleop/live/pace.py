@@ -27,15 +27,15 @@ class Pace:
         self._starts: deque[float] = deque(maxlen=_STATISTICS_SLICES)
         self.start(now)
 
-    def start(self, now: float) -> None:
+    def restart(self, now: float) -> None:
         self._due = now
         self._starts.clear()
 
-    def wait(self, now: float) -> float:
+    def time_to_next_slice(self, now: float) -> float:
         """Return the time until the next slice is due [s]."""
         return self._due - now
 
-    def begin(self, now: float) -> None:
+    def begin_slice(self, now: float) -> None:
         late = now - self._due
         if late > _MAX_LATENESS_S:
             self.given_up += late
@@ -45,7 +45,7 @@ class Pace:
         self._due += self._slice * self.slow
 
     @property
-    def factor(self) -> float:
+    def real_time_factor(self) -> float:
         """Simulated over elapsed time of the last 400 slices; 0 at first."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0

@@ -55,7 +55,7 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
-    """Return the loop without delay, cut at the displayed force; see `cut_map` for errors."""
+    """Return the loop without delay, cut at the displayed force; errors as `cut_period_map`."""
     M = cut_period_map(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()

@@ -53,8 +53,8 @@ def delayed_contact(
 ) -> tuple[Scenario, Task]:
     """Return the scenario with this task and the task's times.
 
-    `leaf` is a key of `LEAVES` or a stiffness [N/m]; `depth` [m] is the intended displacement of
-    the hand beyond the contact.
+    `leaf` is a key of `LEAF_SPRINGS` or a stiffness [N/m]; `depth` [m] is the hand's intended
+    displacement beyond the contact.
     """
     task = task or task_for_round_trip(sum(line.delay for line in channel.lines()))
     settle = 0.5
