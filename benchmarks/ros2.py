@@ -85,7 +85,7 @@ def peer(stack: ExitStack, *words: str, **options: Any) -> subprocess.Popen[str]
 
 def processing(folder: Path, seconds: float) -> dict[str, float]:
     """Times of one pass of the loop, and of the way to the receiver."""
-    from drake_teleop.robots.compensate import run
+    from drake_teleop.robots.compensate import compensate_stream
     from drake_teleop.robots.compensator import Compensator
     from drake_teleop.robots.connections import open_sink, open_source
     from drake_teleop.robots.ros2_messages import MessageConverter
@@ -130,7 +130,7 @@ def processing(folder: Path, seconds: float) -> dict[str, float]:
 
         sink.write, source.read = timed, until  # type: ignore[method-assign]
         compensator = Compensator(load, source.dt, wait=getattr(source, "wait", 0))
-        counts = run(source, compensator, sink)
+        counts = compensate_stream(source, compensator, sink)
         echo.kill()
         heard.seek(0)
         rows = [json.loads(line) for line in heard.read().splitlines()[:-1]]

@@ -30,7 +30,7 @@ from drake_teleop.live.device_packets import (
 )
 from drake_teleop.live.haply import HaplyDevice
 from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
-from drake_teleop.robots.udp import endpoint
+from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIPS
 
 _PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
@@ -64,7 +64,7 @@ class DeviceClient:
         self.behind: deque[float] = deque(maxlen=_MAX_AGES)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect(endpoint(address))
+        self._socket.connect(host_and_port(address))
         self._socket.setblocking(False)
         self._command: ForceCommand | None = None
         self._last_tick: float | None = None

@@ -28,7 +28,7 @@ from drake_teleop.live.device_packets import (
     unpack_state,
 )
 from drake_teleop.live.inputs import ANGLE_UNIT_RAD, LENGTH_UNIT_M
-from drake_teleop.robots.udp import THIS_MACHINE, endpoint, listening
+from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
 _CLIENT_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS = 256  # packets per poll
@@ -47,14 +47,14 @@ class DeviceLink:
     """
 
     def __init__(self, address: str) -> None:
-        host, port = endpoint(address)
+        host, port = host_and_port(address)
         if not _is_loopback(host):
             raise DrakeTeleopError(
                 "is not an address of this machine (other senders could move the arm)",
                 where=address,
                 remedy="use udp://127.0.0.1:PORT, and run the device's client on this machine",
             )
-        self._socket = listening(host, port)
+        self._socket = open_udp_receiver(host, port)
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
         self.refused = self.lost = 0
@@ -195,10 +195,10 @@ class DeviceConnection:
                 where=address,
                 remedy="use udp://127.0.0.1:PORT or haply://localhost:10001",
             )
-        self.link = DeviceLink(address if kind == "udp" else f"udp://{THIS_MACHINE}:0")
+        self.link = DeviceLink(address if kind == "udp" else f"udp://{LOCALHOST}:0")
         self._client: subprocess.Popen[bytes] | None = None
         if kind == "haply":
-            station = f"udp://{THIS_MACHINE}:{self.link.port}"
+            station = f"udp://{LOCALHOST}:{self.link.port}"
             client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
             self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
