@@ -25,7 +25,7 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     Task,
     figures_of_run,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -54,7 +54,7 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
     )
     run = run_one_dof(
         model, PassivityConfig(method=method), NetworkConfig(delay=round_trip / 2), timeout=1.0,
-        intent=operators_intent(task),
+        intent=operator_intent(task),
     )  # fmt: skip
     found = figures_of_run(run, model, task)
     # The hand's spring, the wall's and the servo's, one behind the other.

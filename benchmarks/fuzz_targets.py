@@ -610,7 +610,7 @@ def _command_line(path: Path) -> None:
     said = io.StringIO()
     words = [word.replace("\0", "") for word in json.loads(path.read_bytes())]
     with contextlib.redirect_stderr(said):
-        status = cli._run(words)
+        status = cli._run_with_exit_status(words)
     line = said.getvalue().rstrip("\n")
     refused = line.startswith("error: ") and len(line) <= LONGEST_LINE and "\n" not in line
     if refused:

@@ -32,7 +32,7 @@ def experiment_command(
     with open_results(out, experiment) as store:
         try:
             if simulated:
-                _simulate(experiment, scenarios, store, simulated)
+                _simulate_participants(experiment, scenarios, store, simulated)
             else:
                 from drake_teleop.live.experiment.server import serve_experiment
 
@@ -62,7 +62,9 @@ def next_participant(store: Store, trials: int, wanted: int | None = None) -> in
     return number
 
 
-def _simulate(experiment: Experiment, scenarios: list[Scenario], store: Store, count: int) -> None:
+def _simulate_participants(
+    experiment: Experiment, scenarios: list[Scenario], store: Store, count: int
+) -> None:
     from drake_teleop.live.experiment.simulated import make_all_apparatus, simulate_participant
 
     stations = make_all_apparatus(experiment, scenarios)

@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.one_dof import (
     Task,
     figures_of_run,
     figures_of_traces,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -198,7 +198,7 @@ def test_same_seed_gives_same_run():
 
 def test_energy_balances_agree_with_spring_and_inertia():
     task = Task(swing=0.1, swung=0.7, press=0.7, pressed=1.0, release=1.3, released=1.5, end=2.0)
-    model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operators_intent(task), 10
+    model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operator_intent(task), 10
     scale = model.gamma * model.force_scale
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
     spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave, 0.0) ** 2

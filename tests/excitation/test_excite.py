@@ -17,7 +17,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from shown import type_in
 
-from drake_teleop.cli.excitation import draw
+from drake_teleop.cli.excitation import draw_trajectory
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
@@ -717,7 +717,7 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
 
 
 def test_picture_of_a_shortest_motion_states_its_period(short):
-    figure = draw(dataclasses.replace(short, criterion="period"))
+    figure = draw_trajectory(dataclasses.replace(short, criterion="period"))
     assert figure.axes[3].get_title("left") == "period down to 2.4"
 
 

@@ -15,7 +15,7 @@ from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import (
     ShortestProblem,
     design_shortest_motion,
-    reliable_factor,
+    sidak_factor,
 )
 from drake_teleop.load.tolerance import deviations_of, errors_of, read_tolerance
 from drake_teleop.station.scenario import LoadScenario
@@ -35,9 +35,9 @@ def problem_of(slave: Robot, times: float = 1.0) -> ShortestProblem:
 
 
 def test_reliable_factor_grows_with_the_number_of_tolerances() -> None:
-    assert reliable_factor(1) == pytest.approx(1.96, abs=0.001)
+    assert sidak_factor(1) == pytest.approx(1.96, abs=0.001)
     assert pytest.approx(0.95, abs=1e-3) == (1 - 2 * 0.0025573) ** 10
-    assert reliable_factor(10) == pytest.approx(2.7996, abs=1e-3)
+    assert sidak_factor(10) == pytest.approx(2.7996, abs=1e-3)
 
 
 def test_gradients_equal_finite_differences(slave: Robot) -> None:

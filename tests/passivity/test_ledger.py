@@ -19,7 +19,7 @@ from drake_teleop.lab.comparison.one_dof import (
     OneDofRun,
     Task,
     figures_of_run,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -200,7 +200,7 @@ def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
     """Without initial energy and without information about the hand."""
     task = Task(press=3.5, pressed=4.5, release=9.0, released=10.0, end=12.5, judged=1.0)
     network = NetworkConfig(delay=delay, jitter=0.5 if loss else 0.0, loss=loss, burst=0.08)
-    pressing = operators_intent(task)
+    pressing = operator_intent(task)
     axis = model(grip, wall)
     run = run_one_dof(axis, CHARGED_BY_DRAG, network, timeout=PATIENT, intent=pressing)
     found = figures_of_run(run, axis, task)

@@ -12,7 +12,7 @@ from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
     figures_of_run,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -272,7 +272,7 @@ def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, 
 
     def found(method):
         passivity = PassivityConfig(method=method)
-        run = run_one_dof(model, passivity, network, intent=operators_intent(task))
+        run = run_one_dof(model, passivity, network, intent=operator_intent(task))
         return figures_of_run(run, model, task)
 
     charged, strict = found("charged_tdpa"), found("tdpa")

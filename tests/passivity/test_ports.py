@@ -22,7 +22,7 @@ from drake_teleop.lab.comparison.one_dof import (
     OneDofRun,
     Task,
     figures_of_run,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -181,7 +181,7 @@ def test_four_channels_are_transparent_without_delay():
     task = Task(press=0.5, pressed=1.5, release=4.0, released=5.0, end=6.0, judged=1.0)
     found = run_one_dof(
         MEDIUM, PassivityConfig(method="four_channel"), NetworkConfig(),
-        intent=operators_intent(task), timeout=1.0,
+        intent=operator_intent(task), timeout=1.0,
     )  # fmt: skip
     assert abs(figures_of_run(found, MEDIUM, task).force_error) < 0.02
     held = slice(3500, 3900)

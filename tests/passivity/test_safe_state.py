@@ -12,7 +12,7 @@ from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
     figures_of_run,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -82,7 +82,7 @@ def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
     """
     model = OneDof(wall_stiffness=1000.0)
     task = Task()
-    intent = np.concatenate([operators_intent(task), operators_intent(task)])
+    intent = np.concatenate([operator_intent(task), operator_intent(task)])
     felt, wall = [], []
     for spans in ([(8.0, 9.0)], []):
         result = run_one_dof(

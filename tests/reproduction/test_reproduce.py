@@ -20,10 +20,10 @@ from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
     contact_values,
-    free_motion,
     free_values,
     ideal_values,
     raw_force_excess,
+    simulate_free_motion,
 )
 from drake_teleop.lab.reproduction.report import (
     compare_with_paper,
@@ -42,7 +42,13 @@ pytestmark = pytest.mark.long
 FORCE_SCALE = 1 / 17.5
 
 
-EXPERIMENTS = ("identify_load", "free_motion", "ideal_motion", "contact_motion", "_speed")
+EXPERIMENTS = (
+    "identify_load",
+    "simulate_free_motion",
+    "simulate_ideal_motion",
+    "simulate_contact",
+    "_measure_speed",
+)
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +316,7 @@ def eliminate(mutated, wrench, offsets, s, omega, alpha, phi):
 
 @pytest.fixture(scope="module")
 def ideal_run(run, results):
-    return results["ideal_motion"][0]
+    return results["simulate_ideal_motion"][0]
 
 
 def ideal_rows(values):
@@ -363,7 +369,7 @@ def test_wrong_mass_increases_the_residual():
     )
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     estimate[6:] *= 1.1
-    motion = free_motion(scenario, estimate, lambda done: None)
+    motion = simulate_free_motion(scenario, estimate, lambda done: None)
     assert tuple(motion.scaled) == SIGMAS
     figures = free_values(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)

@@ -102,8 +102,8 @@ def test_effects_table_lists_excluded_combinations():
 def test_pictures_hatch_empty_cells_with_a_legend():
     rows = rows_of(TOUCH)
     main, pairs = (
-        pictures.main_effects(TOUCH, rows, [EFFORT]),
-        pictures.interactions(TOUCH, rows, EFFORT),
+        pictures.draw_main_effects(TOUCH, rows, [EFFORT]),
+        pictures.draw_interactions(TOUCH, rows, EFFORT),
     )
     empty = sum(fails(*point) for point in itertools.product(SIGMAS, GAMMAS))
     for figure, hatched in ((main, 1), (pairs, empty)):

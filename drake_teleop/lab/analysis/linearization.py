@@ -236,7 +236,7 @@ def linearize(
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
     period = _Period(scenario, load_estimate)
     x, A, C = period.find_rest_state(np.asarray(displacement, dtype=float))
-    B = period.input_derivative(x)
+    B = period.differentiate_by_input(x)
     affects = _states_affecting_outputs(A, C)
     names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
     D = np.zeros((len(C), B.shape[1]))
@@ -466,7 +466,7 @@ class _Period:
         self._sensor.take_samples(self._context("wrist_sensor"))
         return self.get_state()
 
-    def _outputs(self) -> Array:
+    def _evaluate_outputs(self) -> Array:
         pose, state = (
             self._evaluate_output("kinematic_scaling", "pose_command"),
             self._slave_state(),
@@ -517,7 +517,7 @@ class _Period:
     def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MAX_NEWTON_STEPS):
-            A, C = self.derivative(x)
+            A, C = self.differentiate_by_state(x)
             free = slave & _states_affecting_outputs(A, C)
             self._set_state(x)
             moved = self._run_one_period() - x
@@ -533,7 +533,7 @@ class _Period:
             remedy="choose another operating point",
         )
 
-    def derivative(self, x: Array) -> tuple[Array, Array]:
+    def differentiate_by_state(self, x: Array) -> tuple[Array, Array]:
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
         self._apply_inputs(np.zeros(24))
         for k, step in enumerate(self._steps):
@@ -542,13 +542,13 @@ class _Period:
                 displaced = x.copy()
                 displaced[k] += sign * step
                 self._set_state(displaced)
-                outputs.append(self._outputs())
+                outputs.append(self._evaluate_outputs())
                 ends.append(self._run_one_period())
             A[:, k] = (ends[0] - ends[1]) / (2 * step)
             C[:, k] = (outputs[0] - outputs[1]) / (2 * step)
         return A, C
 
-    def input_derivative(self, x: Array) -> Array:
+    def differentiate_by_input(self, x: Array) -> Array:
         B = np.empty((len(x), 24))
         pose, tool = np.full(6, self._command_step), np.full(6, _UNIT_STEP)
         for k, step in enumerate(

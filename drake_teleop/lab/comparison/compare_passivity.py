@@ -29,8 +29,8 @@ from drake_teleop.lab.comparison.delayed_contact import (
 )
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
-    Figures,
     OneDof,
+    RunMeasures,
     Task,
     covering_damping,
     figures_of_run,
@@ -160,7 +160,7 @@ def station_run(
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     """Run the whole station once with a leaf spring; return its table row and its traces."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
-    names = [entry.name for entry in dataclasses.fields(Figures)]
+    names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
@@ -186,7 +186,7 @@ def station_run(
 
 def _run_to_end_or_hold(
     station: Diagram, scenario: Scenario, task: Task
-) -> tuple[SimulationResult, Figures]:
+) -> tuple[SimulationResult, RunMeasures]:
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()

@@ -6,11 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from drake_teleop.lab.comparison.one_dof import TIP
+from drake_teleop.lab.comparison.one_dof import TIP_DISTANCE_M
 from drake_teleop.station.oscillation import MAX_FAST_FORCE_N
 
-UNSTABLE, POSITION_ERROR, CHATTERS = "unstable", "position error", "chatters"
-LEAKS, HOLDS = "leaks", "holds"
+VERDICT_UNSTABLE, VERDICT_POSITION_ERROR, VERDICT_CHATTERS = (
+    "unstable",
+    "position error",
+    "chatters",
+)
+VERDICT_LEAKS, VERDICT_HOLDS = "leaks", "holds"
 MAX_DRIFT_M, MIN_LEAK_J = 5e-3, 1e-3  #: m; J
 
 
@@ -26,7 +30,7 @@ class MethodResult:
 
     @property
     def verdict_text(self) -> str:
-        if self.verdict != LEAKS or self.leaked is None:
+        if self.verdict != VERDICT_LEAKS or self.leaked is None:
             return self.verdict
         number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")
         return f"leaks {_format_two_digits(number)} {unit}"
@@ -55,14 +59,16 @@ def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodRe
 
 def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> MethodResult:
     if not all(run["stable"] for run in runs):
-        return MethodResult(UNSTABLE, unrest=tuple(map(_motion_in_hold, runs)))
+        return MethodResult(VERDICT_UNSTABLE, unrest=tuple(map(_motion_in_hold, runs)))
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
-        return MethodResult(POSITION_ERROR, forces, leaked=leaked)
+        return MethodResult(VERDICT_POSITION_ERROR, forces, leaked=leaked)
     if max(run["fast_force"] for run in runs) > MAX_FAST_FORCE_N:
-        return MethodResult(CHATTERS, forces, leaked=leaked)
-    return MethodResult(LEAKS if leaked > MIN_LEAK_J else HOLDS, forces, leaked=leaked)
+        return MethodResult(VERDICT_CHATTERS, forces, leaked=leaked)
+    return MethodResult(
+        VERDICT_LEAKS if leaked > MIN_LEAK_J else VERDICT_HOLDS, forces, leaked=leaked
+    )
 
 
 def _motion_in_hold(run: Mapping[str, Any]) -> str:
@@ -70,7 +76,7 @@ def _motion_in_hold(run: Mapping[str, Any]) -> str:
         return "at rest"
     if run["hunting"] is None:
         return "ended early"
-    if TIP * run["turning"] > run["hunting"]:
+    if TIP_DISTANCE_M * run["turning"] > run["hunting"]:
         return f"turns by {_format_two_digits(1e3 * run['turning'])} mrad"
     return f"moves by {_format_two_digits(1e3 * run['hunting'])} mm"
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into, quaternion_of
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of_traces
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
@@ -101,7 +101,7 @@ def leaf_thickness(stiffness: float) -> float:
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
 
-def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
+def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
     """Return the measures of a run: vertical motion and force, rotation of the tool, energy."""
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
@@ -141,13 +141,13 @@ def _slave_motion(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     arm = slave_arm(scenario)
     q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
-    poses = _poses(arm.table, q)
+    poses = _sensor_poses(arm.table, q)
     rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
     return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
 
 
 @njit(cache=True)
-def _poses(arm, q):
+def _sensor_poses(arm, q):
     R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
     for k in range(q.shape[0]):
         forward_kinematics(arm, q[k], R, p)

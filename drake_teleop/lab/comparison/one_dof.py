@@ -37,7 +37,7 @@ HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST = 0.5e-3  # m, peak to peak at rest
-TIP = 0.2  #: m, from the wrist to the tool's tip
+TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
 _REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest position, intended depth
 
 
@@ -128,7 +128,7 @@ class OneDofRun:
 
 
 @dataclass(frozen=True)
-class Figures:
+class RunMeasures:
     """Measures of one run of the task."""
 
     #: True: at rest in hold and end, within 0.5 mm about a parabola, also at a rotating tool's tip.
@@ -174,7 +174,7 @@ def run_one_dof(
         slave_mass=[model.believed_mass * model.slave_mass] * 2,
     )
     p = methods.parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
-    intent = operators_intent() if intent is None else intent
+    intent = operator_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
     # The channel's command belongs to the next step; here it is used at once.
     playout = forward.playout + PERIOD if forward.playout > 0 else 0.0
@@ -217,7 +217,7 @@ def run_one_dof(
     return OneDofRun(t, master, slave, command, felt, pushed, *rest)
 
 
-def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
+def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
     """Return the intended position [m] and velocity [m/s] (N, 2) of a task; the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION)
@@ -234,7 +234,7 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
 
-def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
+def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
     return figures_of_traces(
         t=run.t,
         master=run.master,
@@ -256,7 +256,7 @@ def figures_of_traces(
     energy: NDArray[np.float64],
     task: Task,
     turned: NDArray[np.float64] | None = None,
-) -> Figures:
+) -> RunMeasures:
     """Return the measures of a run of the task from equidistant arrays (N,).
 
     Args:
@@ -278,8 +278,10 @@ def figures_of_traces(
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.released + 2.0) / dt), len(t) - 1)
     start = round(task.press / dt)
-    return Figures(
-        stable=bool(hunting < _MAX_MOTION_AT_REST and turning < _MAX_MOTION_AT_REST / TIP),
+    return RunMeasures(
+        stable=bool(
+            hunting < _MAX_MOTION_AT_REST and turning < _MAX_MOTION_AT_REST / TIP_DISTANCE_M
+        ),
         hunting=hunting,
         turning=turning,
         felt_force=abs(steady),

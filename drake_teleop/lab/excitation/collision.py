@@ -58,7 +58,7 @@ class Capsule:
         return Capsule(X.multiply(self.ends.T).T, self.radius)
 
     def contains(self, other: Capsule) -> bool:
-        distances = _distances(self.ends, other.ends)
+        distances = _distances_to_segment(self.ends, other.ends)
         return bool(np.all(distances + other.radius <= self.radius + 1e-9))
 
 
@@ -76,7 +76,7 @@ def bounding_capsule(shape: Shape) -> Capsule:
         for share in (0.0, 0.4, 0.6, 0.8, 0.9, 1.0):
             end = share * axis * half
             ends = np.array([middle - end, middle + end])
-            radius = float(_distances(ends, points).max())
+            radius = float(_distances_to_segment(ends, points).max())
             length = 2 * share * float(axis @ half)
             candidates.append((np.pi * radius**2 * (length + 4 / 3 * radius), ends, radius))
     _, ends, radius = min(candidates, key=lambda candidate: candidate[0])
@@ -101,7 +101,7 @@ def _convex_hull_points(shape: Shape) -> Array:
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
 
 
-def _distances(ends: Array, points: Array) -> Array:
+def _distances_to_segment(ends: Array, points: Array) -> Array:
     along = ends[1] - ends[0]
     length = float(along @ along)
     share = np.clip((points - ends[0]) @ along / length, 0, 1) if length > 0 else 0 * points[:, 0]
@@ -237,7 +237,7 @@ class Scene:
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
-            X_LB = X_WB if row < 0 else _pose(motions[0, row]).InvertAndCompose(X_WB)
+            X_LB = X_WB if row < 0 else _transform_of_motion(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
             capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
             if inspector.GetName(shape).endswith(_TABLE):
@@ -316,7 +316,7 @@ def _outermost_capsule(
     return max(holding, key=lambda entry: entry[:2])[2]
 
 
-def _pose(motion: Array) -> RigidTransform:
+def _transform_of_motion(motion: Array) -> RigidTransform:
     return RigidTransform(RotationMatrix(motion[12:].reshape(3, 3)), motion[9:12])
 
 

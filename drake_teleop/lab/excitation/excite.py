@@ -70,7 +70,7 @@ def excite(
 ) -> Excitation:
     """Design an excitation trajectory with `harmonics` harmonics in Eq. (9), and check it.
 
-    `criterion` is a name in `CRITERIA`, `period` in s; `design` explains seed, starts, seconds.
+    `criterion` is a name in `CRITERIA`, `period` in s; `minimise_criterion` explains seed, starts, seconds.
     """
     task = Task(
         robot.arm.table,
@@ -121,7 +121,7 @@ def find_best_within_limits(
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
     """Return the best trajectory that passes the check, and its use of the limits."""
     worst: LimitUse | None = None
-    for trajectory in _candidates(found, robot):
+    for trajectory in _feasible_candidates(found, robot):
         uses = check_trajectory(robot, trajectory, progress)
         if uses[0].share <= 1:
             return trajectory, uses
@@ -155,7 +155,7 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
     return s, omega, alpha
 
 
-def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
+def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
     """Yield trajectories within the limits at 1 kHz, best first."""
     ranked = sorted(found, key=lambda iterate: iterate.value)
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)

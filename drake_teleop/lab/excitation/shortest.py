@@ -4,7 +4,7 @@ The logarithm of the period T is an unknown and is minimised; the tolerance is o
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
-with standard deviations d_k after one period and z of `reliable_factor`.
+with standard deviations d_k after one period and z of `sidak_factor`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def design_shortest_motion(
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = errors_of(tolerance, robot.limits.phi) * reliable_factor(len(tolerance.entries))
+    errors = errors_of(tolerance, robot.limits.phi) * sidak_factor(len(tolerance.entries))
     factor = np.ones(len(errors))
     task = Task(
         robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
@@ -147,7 +147,7 @@ def design_shortest_motion(
     )
 
 
-def reliable_factor(count: int) -> float:
+def sidak_factor(count: int) -> float:
     """Return the factor z with which `count` numbers are within tolerance together (Sidak)."""
     return float(ndtri(0.5 + 0.5 * RELIABLE_PROBABILITY ** (1.0 / count)))
 
@@ -169,7 +169,7 @@ class ShortestProblem(Problem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = white_noise(robot.noise, robot.limits.phi)
+        self._noise = white_noise_densities(robot.noise, robot.limits.phi)
         self._roots = np.sqrt(robot.noise.white[:6])
         samples, n = self._vectors.shape[1], len(task.home)
         self._gradients = np.empty((2 + len(LIMITS), 3, samples, n))
@@ -248,9 +248,9 @@ class ShortestProblem(Problem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the standard deviations (k,) in white noise, over the required ones."""
-        return np.sqrt(self._variances(self._rows(*motion), period)[0])
+        return np.sqrt(self._variances(self._regression_rows(*motion), period)[0])
 
-    def _rows(self, s: Array, omega: Array, alpha: Array) -> Array:
+    def _regression_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
@@ -273,7 +273,7 @@ class ShortestProblem(Problem):
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
         """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V."""
-        rows = self._rows(*self._vectors)
+        rows = self._regression_rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
@@ -285,7 +285,7 @@ class ShortestProblem(Problem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def white_noise(noise: SensorNoise, phi: Array) -> Array:
+def white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
     """Return the white noise densities (6, 6) of wrench and motion, relative to the wrench's."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:

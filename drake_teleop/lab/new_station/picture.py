@@ -25,15 +25,17 @@ _BASE_COLOUR, _TOOL_COLOUR, _WALL_COLOUR = (0.36, 0.38, 0.42), (0.84, 0.37, 0.0)
 _WALL_THICKNESS_M = 0.1
 _LIGHT = np.array([0.35, -0.5, 0.8])
 _VIEWS = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth, from the direction of the tool
-_CELLS = 8  # divisions of the wall in the picture
+_WALL_DIVISIONS = 8  # divisions of the wall in the picture
 _TRIAD_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
-_TURNS = np.arange(0.5, 250.0)
+_SPIRAL_STEPS = np.arange(0.5, 250.0)
 _DIRECTIONS = np.column_stack(
     [
-        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.cos(np.pi * (1.0 + 5.0**0.5) * _TURNS),
-        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.sin(np.pi * (1.0 + 5.0**0.5) * _TURNS),
-        1.0 - _TURNS / 125.0,
+        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
+        * np.cos(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
+        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
+        * np.sin(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
+        1.0 - _SPIRAL_STEPS / 125.0,
     ]
 )
 
@@ -111,8 +113,14 @@ def _hull_triangles(points: Array) -> Array:
 def _box_triangles(top: Array, size: Array) -> Array:
     """Return small triangles (k, 3, 3) of a box, which sort by depth better than large ones."""
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
-    cells = np.array(list(product(range(_CELLS), range(_CELLS), range(2)))) / [_CELLS, _CELLS, 2]
-    pieces = [_hull_triangles(cell + corners / [_CELLS, _CELLS, 2]) for cell in cells]
+    cells = np.array(list(product(range(_WALL_DIVISIONS), range(_WALL_DIVISIONS), range(2)))) / [
+        _WALL_DIVISIONS,
+        _WALL_DIVISIONS,
+        2,
+    ]
+    pieces = [
+        _hull_triangles(cell + corners / [_WALL_DIVISIONS, _WALL_DIVISIONS, 2]) for cell in cells
+    ]
     unit = np.concatenate(pieces)
     is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
     triangles: Array = top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))

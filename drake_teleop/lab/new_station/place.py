@@ -88,7 +88,7 @@ class Place(NamedTuple):
         q: (n,) joint positions at the start [rad].
         half: half edge of the reachable cube around the start [m].
         room: smallest distance of a joint to its limit, over half the joint's range.
-        score: merit of the posture, see `scores`, without the cost of overlaps.
+        score: merit of the posture, see `posture_scores`, without the cost of overlaps.
         wall: edge of the wall that the arm does not touch [m].
         vertical: True if the arm can only move up and down by `half`.
         overlaps: True if shapes of the arm overlap.
@@ -239,7 +239,7 @@ def _candidates(
 ) -> Iterator[Place]:
     """Yield starts near postures; `is_free`: with the tool exactly down."""
     if not is_free:  # position and orientation are coupled
-        solved = [(q, _pose(arm, q), False) for q in postures.q]
+        solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
     else:
         solved = [
             start
@@ -255,7 +255,7 @@ def _candidates(
         yield Place(pose, by_position, q, 0.0, float(room), float(merit))
 
 
-def _pose(arm: ArmModel, q: Array) -> Array:
+def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
     pose = np.empty(7)
     pose_into(arm.table, q, pose)
     return pose
@@ -364,13 +364,13 @@ def _ik_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
 def _pose_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, _ = find_posture(arm, target, place.q)
-    error = np.linalg.norm(_pose(arm, q)[4:] - target[4:])
+    error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
     return bool(error < _MAX_RELATIVE_ERROR * np.linalg.norm(displacement))
 
 
 _MIN_COS = 0.75  # smallest cosine of the angle between tool and axis
 #: Opposite of each axis.
-OPPOSITE = {axis: axis[1:] if axis.startswith("-") else f"-{axis}" for axis in TOOL_AXES}
+OPPOSITE_AXIS = {axis: axis[1:] if axis.startswith("-") else f"-{axis}" for axis in TOOL_AXES}
 _ROUNDING_M = 1e-9
 _MIN_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
 

@@ -12,7 +12,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.place import (
     MAX_TORQUE_USE,
     MIN_LOAD_SHARE,
-    OPPOSITE,
+    OPPOSITE_AXIS,
     TOOL_AXES,
     Place,
     TrialWalls,
@@ -155,7 +155,7 @@ def _find_start(
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
     for axis in dict.fromkeys((natural, "z", *TOOL_AXES)):
-        if axis == OPPOSITE[natural] and axis != "z":
+        if axis == OPPOSITE_AXIS[natural] and axis != "z":
             continue
         if is_stand_in:
             slave.tool = _stand_in_tool(axis, _rod_length(shapes, axis))

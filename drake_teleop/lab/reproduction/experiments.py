@@ -78,14 +78,14 @@ class ContactMotion:
     threshold: float
 
 
-def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
+def simulate_free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
     """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
     scaled = {sigma: _scaled_wrench_at_slave(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
-def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
+def simulate_contact(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
     """Simulate the contact transition with and without the leaf spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
@@ -104,7 +104,7 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
     )
 
 
-def ideal_motion(progress: Progress) -> IdealMotion:
+def simulate_ideal_motion(progress: Progress) -> IdealMotion:
     """Simulate a free movement that moves and rotates the tool about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4

@@ -117,9 +117,9 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
                    1e3 * s["contact.true_s"], "ms", 205, 235),
         _range_row("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
                    delay_ms, "ms", 0, 10),
-        _answer_row("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
+        _yes_no_row("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
                     s["contact.raw_detectable"], False),
-        _answer_row("Fig. 8: false alarm at about 600 ms", "no contact there",
+        _yes_no_row("Fig. 8: false alarm at about 600 ms", "no contact there",
                     s["contact.false_alarm_0_6_s"], False),
         _range_row("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
                    share, "", 0, 0.7),
@@ -247,7 +247,7 @@ def _range_row(
     return Comparison(what, paper, _format_value(value, unit), origin, bounds.strip(), holds)
 
 
-def _answer_row(what: str, paper: str, value: bool, expected: bool) -> Comparison:
+def _yes_no_row(what: str, paper: str, value: bool, expected: bool) -> Comparison:
     words, holds = {True: "yes", False: "no"}, bool(value) == expected
     return Comparison(what, paper, words[bool(value)], "found", words[expected], holds)
 

@@ -27,14 +27,14 @@ from drake_teleop.lab.reproduction.experiments import (
     ContactMotion,
     FreeMotion,
     Values,
-    contact_motion,
     contact_values,
-    free_motion,
     free_values,
-    ideal_motion,
     ideal_values,
     identification_values,
     reversal_without_contact,
+    simulate_contact,
+    simulate_free_motion,
+    simulate_ideal_motion,
     true_parameters,
     without_leaf_spring,
 )
@@ -76,10 +76,14 @@ def reproduce_command(
             )
         )
         load = identify_load(identification_scenario(force, seed), stage)
-        force_run = free_motion(force, load.estimate, stage("Fig. 6: vertical free motion"))
-        torque_run = free_motion(torque, load.estimate, stage("Fig. 7: horizontal free motion"))
-        ideal_run = ideal_motion(stage("Rotation about all axes, ideal sensor"))
-        contact_run = contact_motion(contact, load.estimate, stage)
+        force_run = simulate_free_motion(
+            force, load.estimate, stage("Fig. 6: vertical free motion")
+        )
+        torque_run = simulate_free_motion(
+            torque, load.estimate, stage("Fig. 7: horizontal free motion")
+        )
+        ideal_run = simulate_ideal_motion(stage("Rotation about all axes, ideal sensor"))
+        contact_run = simulate_contact(contact, load.estimate, stage)
         summary = {
             "free_force": free_values(force_run, _FORCE_Z, "N"),
             "free_torque": free_values(torque_run, _TORQUE_X, "Nm"),
@@ -91,7 +95,7 @@ def reproduce_command(
         pictures = draw_figures(force_run, torque_run, contact_run, summary)
         written = stage("Write figures, replay and report")
         with output_folder(out):
-            _write(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
+            _write_results(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
             write_json(out / "session.json", session)
             write_json(out / "summary.json", summary)
         written(1.0)
@@ -146,7 +150,7 @@ def _measure_speed(progress: Progress) -> Values:
     }
 
 
-def _write(
+def _write_results(
     out: Path,
     seed: int,
     summary: Values,

@@ -240,7 +240,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, Ma
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
     data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
-    return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
+    return [] if data.is_empty else [found for pair in pairs if (found := data.pair_means(*pair))]
 
 
 class _MeasureData:
@@ -278,16 +278,16 @@ class _MeasureData:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
-                compared = self._combinations(combinations, factor)
-            why = self._reasons(is_compared & (is_compared.sum() > 1), levels.index)
+                compared = self._count_combinations(combinations, factor)
+            why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        left_out = self._combinations(np.ones(1), factor) - compared
+        left_out = self._count_combinations(np.ones(1), factor) - compared
         return MainEffect(
             levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
             self.fitted,
         )  # fmt: skip
 
-    def pair(self, first: int, second: int) -> PairMeans | None:
+    def pair_means(self, first: int, second: int) -> PairMeans | None:
         if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
             return None
         a, b = self.levels[first], self.levels[second]
@@ -299,9 +299,9 @@ class _MeasureData:
         cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
-        why = np.array(self._reasons(is_compared, cell)).reshape(shape)
-        compared = self._combinations(combinations, first, second)
-        left_out = self._combinations(np.ones(1), first, second) - compared
+        why = np.array(self._missing_value_reasons(is_compared, cell)).reshape(shape)
+        compared = self._count_combinations(combinations, first, second)
+        left_out = self._count_combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
         names = a.names, b.names
         return PairMeans(fields, names, mean.reshape(shape), why, compared, left_out, self.fitted)
@@ -310,11 +310,11 @@ class _MeasureData:
     def fitted(self) -> bool:
         return not isinstance(self.model, Factorial)
 
-    def _combinations(self, combinations: NDArray[Any], *shown: int) -> int:
+    def _count_combinations(self, combinations: NDArray[Any], *shown: int) -> int:
         others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
         return round(np.mean(combinations) * math.prod(others))
 
-    def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
+    def _missing_value_reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
         runs = np.bincount(cell, minlength=len(compared))
         return missing_value_reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 

@@ -116,7 +116,7 @@ class LevelModel:
     solve: Array
 
     def comparable_levels(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the same as `Factorial.compared`, with a matrix from coefficients to means."""
+        """Return the same as in `Factorial`, with a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
         shape = [len(self.factors[factor].names) for factor in factors]
@@ -219,7 +219,7 @@ def level_model(
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:
         levels = [levels_of(f, c, parts) for f, c in zip(factors, columns, strict=True)]
-        model = _model(levels, products, known, by_chance)
+        model = _build_model(levels, products, known, by_chance)
         if model is not None:
             found = model
             if model.X.shape[1] <= len(model.X) / 2:
@@ -227,7 +227,7 @@ def level_model(
     return found
 
 
-def _model(
+def _build_model(
     factors: list[Levels], products: bool, known: Flags, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())

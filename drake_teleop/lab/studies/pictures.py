@@ -47,10 +47,10 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
     measures = [name for name in study.measures if np.isfinite(measure_values(rows, name)).any()]
     pictures: dict[str, Figure | None] = {}
     if measures and varied_factors(study):
-        pictures["main_effects"] = main_effects(study, rows, measures)
+        pictures["main_effects"] = draw_main_effects(study, rows, measures)
         if len(varied_factors(study)) > 1:
-            pictures |= {f"interactions_{m}": interactions(study, rows, m) for m in measures}
-    pictures["pareto"] = pareto_front(study, rows)
+            pictures |= {f"interactions_{m}": draw_interactions(study, rows, m) for m in measures}
+    pictures["pareto"] = draw_pareto_front(study, rows)
     written = []
     for name, picture in pictures.items():
         if picture is not None:
@@ -59,7 +59,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
     return written
 
 
-def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
+def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
     factors, fitted, reasons = varied_factors(study), False, set[str]()
     with plot_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
@@ -76,7 +76,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
         for axes, factor in zip(grid[-1], factors, strict=True):
             axes.set_xlabel(factor.field)
         figure.suptitle(f"Main effects{_effects_caption(study, fitted)}", x=0.01, ha="left")
-        _legend(figure, reasons)
+        _draw_reason_legend(figure, reasons)
     return figure
 
 
@@ -115,14 +115,14 @@ def _hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
     return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
 
 
-def _legend(figure: Figure, reasons: Iterable[str]) -> None:
+def _draw_reason_legend(figure: Figure, reasons: Iterable[str]) -> None:
     names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
     if names:
         patches = [_hatched_cell(why, (0.0, 0.0)) for why in names]
         figure.legend(patches, names, loc="outside lower left", ncols=len(names))
 
 
-def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
+def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
     maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None
@@ -147,11 +147,11 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
         figure.colorbar(drawn, ax=grid, label=measure)
         words = ", fitted: levels of each, and products" if maps[0].fitted else ""
         figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
-        _legend(figure, set().union(*(found.why.ravel() for found in maps)))
+        _draw_reason_legend(figure, set().union(*(found.why.ravel() for found in maps)))
     return figure
 
 
-def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
+def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     """Draw effort over time and over force overshoot; return None without complete points."""
     points = pareto_table(study, rows)
     if points is None or not points["complete"].any():

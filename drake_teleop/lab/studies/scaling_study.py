@@ -81,8 +81,8 @@ def scaling_study_command(
             progress=progress, yes=yes,
         )  # fmt: skip
         rows[name] = Store(out / name / "runs.parquet").read()
-    tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
-    sigmas, gammas = _axes()
+    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASKS}
+    sigmas, gammas = _scale_axes()
     answers = {
         selection: rate_scales(tables, criteria) for selection, criteria in SELECTIONS.items()
     }
@@ -95,8 +95,8 @@ def scaling_study_command(
     }
     with output_folder(out, "answer.json"):
         write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
-        write_picture(out / "answer.png", criteria_picture(rows, sigmas, gammas))
-        write_picture(out / "choice.png", choice_picture(answers, sigmas, gammas))
+        write_picture(out / "answer.png", draw_criteria(rows, sigmas, gammas))
+        write_picture(out / "choice.png", draw_best_scales(answers, sigmas, gammas))
         write_json(out / "answer.json", summary)
     if not quiet:
         _print(summary, out)
@@ -136,20 +136,20 @@ def _relative_means(table: Array, weights: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
         means = sums / np.einsum("sgk,dk->dsg", known.astype(float), weights)
-    return means / means[:, -1, _reference(), None, None]
+    return means / means[:, -1, _index_of_gamma_1(), None, None]
 
 
-def _axes() -> tuple[list[float], list[float]]:
+def _scale_axes() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
     return factors[_SIGMA], factors[_GAMMA]
 
 
-def _reference() -> int:
-    return _axes()[1].index(1.0)
+def _index_of_gamma_1() -> int:
+    return _scale_axes()[1].index(1.0)
 
 
-def _tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
-    sigmas, gammas = _axes()
+def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
+    sigmas, gammas = _scale_axes()
     seeds = rows["seed"].n_unique()
     count = len(gammas) if _GAMMA in rows.columns else 1
     measures = {"success": "success"} | {name: CRITERIA[name] for name in TASKS[task]}
@@ -221,7 +221,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     return table
 
 
-def criteria_picture(
+def draw_criteria(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
     tasks = [task for task in TASKS if "force" in TASKS[task]]
@@ -249,7 +249,7 @@ def criteria_picture(
     return figure
 
 
-def choice_picture(
+def draw_best_scales(
     answers: dict[str, ScaleRating], sigmas: list[float], gammas: list[float]
 ) -> Figure:
     known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])

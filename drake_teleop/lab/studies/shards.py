@@ -60,7 +60,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         folder = shard.folder(out)
         check_identity(folder, identity)
         for part in Store(folder / "runs.parquet").parts():
-            _link(part, store.folder / part.name, store.folder)
+            _link_file(part, store.folder / part.name, store.folder)
     store.remove_damaged_parts()
     finished = store.finished_chunks()
     missing = [k for k, chunk in enumerate(chunks) if chunk[0]["run"] not in finished]
@@ -77,7 +77,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         )
 
 
-def _link(part: Path, path: Path, aside: Path) -> None:
+def _link_file(part: Path, path: Path, aside: Path) -> None:
     if path.exists():
         return
     with whole_file(path, aside=aside) as temporary:

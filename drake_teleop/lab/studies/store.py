@@ -50,22 +50,22 @@ class Store:
 
     def count_start(self, run: int) -> None:
         """Count one more start of the chunk whose first run is `run`."""
-        path = self._marks / str(run)
+        path = self._start_counts_folder / str(run)
         with wrap_write_errors(path):
-            self._marks.mkdir(exist_ok=True)
+            self._start_counts_folder.mkdir(exist_ok=True)
             with path.open("ab") as mark:
                 mark.write(b".")
 
     def clear_starts(self, run: int) -> None:
-        (self._marks / str(run)).unlink(missing_ok=True)
+        (self._start_counts_folder / str(run)).unlink(missing_ok=True)
 
     def chunks_started_at_least(self, times: int) -> set[int]:
         """Return the first runs of unfinished chunks with at least `times` starts."""
-        marks = (mark for mark in self._marks.glob("*") if mark.name.isdecimal())
+        marks = (mark for mark in self._start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
     @property
-    def _marks(self) -> Path:
+    def _start_counts_folder(self) -> Path:
         return self.folder.with_name("running")
 
     def read(self) -> pl.DataFrame:

@@ -22,7 +22,7 @@ from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
     figures_of_run,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.lab.studies.design import Values
@@ -227,7 +227,7 @@ class GammaSearch:
             forward,
             dataclasses.replace(backward, delay=backward.delay + added),
             seed=seed,
-            intent=operators_intent(task),
+            intent=operator_intent(task),
         )
         found = figures_of_run(run, model, task)
         hold = (run.t >= task.release - task.judged) & (run.t < task.release)

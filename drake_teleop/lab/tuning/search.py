@@ -45,7 +45,7 @@ Execute = Callable[[str, Study, Any], list[Row]]
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """Result of the search.
 
     Attributes:
@@ -62,17 +62,21 @@ class Found:
     limits: list[Row]
 
 
-def search_settings(trial: StationTrial, execute: Execute) -> Found:
+def search_settings(trial: StationTrial, execute: Execute) -> SearchResult:
     """Return the stable settings with the smallest detection threshold."""
     base, stated = trial.base, trial.stated
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
     given = execute(
-        "as_given", _study([KEEP_GAMMA], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES), trial
+        "as_given",
+        _study_of_lists([KEEP_GAMMA], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
+        trial,
     )
     quiet = execute(
-        "noise", _study(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES), trial
+        "noise",
+        _study_of_lists(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES),
+        trial,
     )
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
@@ -110,7 +114,7 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
     _, chosen, inside = found[0]
     walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
     limits = execute("limits", _study_of_settings(dataclasses.asdict(chosen), ends, walls), trial)
-    return Found(chosen, search, given, inside, limits)
+    return SearchResult(chosen, search, given, inside, limits)
 
 
 def _best_of_each_method(search: list[Row]) -> list[Row]:
@@ -204,10 +208,12 @@ def _load_force(trial: StationTrial) -> float:
 
 def _study_of_settings(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
     gamma, sigma, low_pass = (settings[key] for key in ("gamma", "sigma_inertia", "low_pass_hz"))
-    return _study([settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES)
+    return _study_of_lists(
+        [settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES
+    )
 
 
-def _study(
+def _study_of_lists(
     methods: list[str],
     gamma: float,
     sigma: float,

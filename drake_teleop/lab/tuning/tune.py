@@ -23,7 +23,7 @@ from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_st
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
 from drake_teleop.lab.tuning.search import (
-    Found,
+    SearchResult,
     make_study_executor,
     meets_requirements,
     search_settings,
@@ -107,7 +107,7 @@ def tune(
 
 
 def _summary(
-    found: Found, tuned: Scenario, stated: StatedSet, network: str | None
+    found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
     at_edge = [row for row in found.limits if row["wall"] <= stated.walls[1]]
     scale = tuned.force_scaling.force_scale
@@ -135,13 +135,13 @@ def _summary(
         "settings": settings,
         "stated": about,
         "figures": figures,
-        "sentences": _sentences(found.settings, figures, about, scale),
+        "sentences": _result_sentences(found.settings, figures, about, scale),
         "search": found.search,
         "trials": [*found.given, *found.inside, *found.limits],
     }
 
 
-def _sentences(
+def _result_sentences(
     chosen: Settings, figures: dict[str, Any], about: dict[str, Any], scale: float
 ) -> list[str]:
     low, high = (1e-3 * wall for wall in about["walls"])
@@ -170,7 +170,7 @@ def _sentences(
     return [*lines, last]
 
 
-def draw_trade_off(found: Found, summary: dict[str, Any]) -> Figure:
+def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
     """Draw the detection threshold against the margin of gamma for each method."""
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))
