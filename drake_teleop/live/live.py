@@ -260,7 +260,7 @@ class Live:
             self._session.apply_inputs(self._limit_motion(self._requested.with_changes(by_device)))
         except _FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
-            if self._requested.station == present.station:
+            if self._requested.station_choices == present.station_choices:
                 self.stopped = one_line(str(error))
             else:  # there is no such station: keep the present one
                 self._refusal = one_line(str(error))

@@ -25,7 +25,7 @@ class Pace:
         self._slice = slice_s
         self._lateness: deque[float] = deque(maxlen=_STATISTICS_SLICES)
         self._starts: deque[float] = deque(maxlen=_STATISTICS_SLICES)
-        self.start(now)
+        self.restart(now)
 
     def restart(self, now: float) -> None:
         self._due = now

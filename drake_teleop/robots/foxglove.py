@@ -41,7 +41,7 @@ class _Channel:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH, wrench.tolist(), strict=True))
-        self._channel.log_wrench(json.dumps(data).encode(), log_time=ns)
+        self._channel.log(json.dumps(data).encode(), log_time=ns)
 
     def close(self) -> None:
         self._channel.close()

@@ -61,7 +61,7 @@ class ContactAndLoadMonitor:
         self._covariance = finite_covariance(self._phi, load.covariance)
         self._fallback, self._dt = np.zeros(10), dt
         self.restart(load.offsets)
-        self.flags(np.concatenate([load.offsets, np.zeros(9)]))  # loads compiled code
+        self.reading_flags(np.concatenate([load.offsets, np.zeros(9)]))  # loads compiled code
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
@@ -126,7 +126,7 @@ class StreamContactDetector:
             floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
         ).settings
         self.restart()
-        self.flags(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
+        self.contact_flag(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
         self.restart()
 
     def restart(self) -> None:

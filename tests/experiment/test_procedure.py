@@ -76,7 +76,7 @@ def test_participant_continues_with_the_same_levels(tmp_path):
     first.advance_phase()
     first.finish_interval(IntervalResult(first.current_level))
     again = Procedure(SMALL, 3, cut)
-    assert (again.phase, again.number) == ("consent", 17)
+    assert (again.phase, again.trial_number) == ("consent", 17)
     go_through(again, rng, 2.0)
     assert cut.participant_file(3).read_bytes() == whole.participant_file(3).read_bytes()
     assert len(cut.read_rows(3)) == len(plan_trials(SMALL, 3))

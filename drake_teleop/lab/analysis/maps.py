@@ -43,7 +43,7 @@ class StabilityMap:
     x: Array  #: (nx,) values of the first parameter
     y: Array  #: (ny,) values of the second parameter
     unstable: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
-    force_distortion: Array  #: (ny, nx), valid only where the loop is stable
+    distortion: Array  #: (ny, nx), valid only where the loop is stable
     boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step
 
     @property

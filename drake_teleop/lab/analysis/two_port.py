@@ -74,7 +74,7 @@ def scattering_matrix(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0,
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return the reference impedances b [N s/m] of master and slave port for `scattering_matrix`."""
+    """Return the reference impedances b [N s/m] of both ports for `scattering_matrix`."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(

@@ -70,7 +70,7 @@ def excite(
 ) -> Excitation:
     """Design an excitation trajectory with `harmonics` harmonics in Eq. (9), and check it.
 
-    `criterion` is a name in `CRITERIA`, `period` in s; `minimise_criterion` explains seed, starts, seconds.
+    `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
     task = Task(
         robot.arm.table,

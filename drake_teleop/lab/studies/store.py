@@ -108,7 +108,7 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
         store.remove_damaged_parts()
         yield store
         with suppress(OSError):  # missing, or with marks
-            store._marks.rmdir()
+            store._start_counts_folder.rmdir()
 
 
 @contextmanager

@@ -91,7 +91,7 @@ class Target(NamedTuple):
 
     def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
         """Return a C initializer of `wrench_compensator_settings`."""
-        loop = self.loop(largest, **scales)
+        loop = self.make_compensator(largest, **scales)
         values = {
             "sigma_weight": 0.0,
             "sigma_inertia": 0.0,
