@@ -1,4 +1,4 @@
-"""Identification of the load in simulation from samples of the wrist sensor (paper, section IV)."""
+"""Load identification in simulation (paper, section IV)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class LoadIdentification:
     Attributes:
         estimate: (16,) final recursive estimate of Eq. (7): sensor offsets [N, N m], then phi.
         batch: estimate by batch total least squares from the same record.
-        kappa_w10: condition number of the excitation, see `excitation.criteria`.
+        kappa_w10: condition number, see `excitation.criteria`.
         real_time_factor: simulated time over elapsed time.
     """
 
@@ -76,7 +76,7 @@ class LoadIdentification:
         )
 
     def noise_floor(self, arm: ArmModel) -> NoiseFloor:
-        """Return the noise floor of the contact wrench, fitted to this motion without contact."""
+        """Return the noise floor of the contact wrench in this motion."""
         usable = self.result["saturated"][:, 0] == 0
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
@@ -87,7 +87,7 @@ class LoadIdentification:
 
     @property
     def recursive_against_batch(self) -> float:
-        """Largest difference of recursive and batch estimate, in standard deviations."""
+        """Largest difference of both estimates in standard deviations."""
         batch = np.concatenate([self.batch.offsets, self.batch.phi])
         return float(np.max(np.abs(self.estimate - batch) / self.batch.standard_deviations))
 

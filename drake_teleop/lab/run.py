@@ -48,7 +48,7 @@ class RecordedDrive(Protocol):
 
     @property
     def load(self) -> IdentifiedLoad | None:
-        """Load identified before the session; None if the load was estimated during the session."""
+        """Load identified before the session; None if estimated during it."""
 
     def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
         """Simulate the recorded session again."""
@@ -142,8 +142,7 @@ def run_scenario(
 ) -> ScenarioRun:
     """Run a scenario; estimate the load during the run, or use the cached or newly identified load.
 
-    If it is estimated and there is no intended motion or task, the slave runs an excitation
-    trajectory.
+    An estimation without intended motion or task uses an excitation trajectory.
 
     Args:
         progress: True shows progress bars; or a `Stage` that receives the progress.

@@ -45,7 +45,7 @@ class ScenarioRun:
 
 
 def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True in true contact; gaps shorter than `FILTER_TAIL_S` are closed."""
+    """Return true contact (N,); gaps shorter than `FILTER_TAIL_S` are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -53,7 +53,7 @@ def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return the contact wrench (N, 6) [N, N m] in S, calculated with the final load estimate."""
+    """Return the contact wrench (N, 6) [N, N m] in S with the final load estimate."""
     estimate = result["load_estimate"][-1]
     check_identified("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)

@@ -1,4 +1,4 @@
-"""Forces, energy, contact and warnings of a running station, for the browser page."""
+"""Forces, energy, contact and warnings for the browser page."""
 
 from __future__ import annotations
 
@@ -49,7 +49,6 @@ def _joints_at_limit_bits(values, limits):
 
 @njit(cache=True)
 def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Add the work at hand and tool in new rows to `energy` (2,) [J]."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -66,7 +65,7 @@ def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Calculator of the values that the browser page shows, from the log's rows."""
+    """Calculator of the page's values from the log's rows."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)

@@ -1,4 +1,4 @@
-"""Master side of a real haptic device, in place of operator, simulated device and force display."""
+"""Master side of a real haptic device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inputs of a live session as integers, so that the record is exactly the simulated input."""
+"""Inputs of a live session as integers, exactly as recorded."""
 
 from __future__ import annotations
 

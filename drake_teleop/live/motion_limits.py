@@ -88,7 +88,6 @@ class _Axis:
         return self._at
 
     def _max_braking_speed(self, distance: float) -> float:
-        """Return the speed from which the axis can just stop within `distance`."""
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

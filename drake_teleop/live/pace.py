@@ -1,4 +1,4 @@
-"""Timing of simulation slices: simulated time follows a clock, or visibly falls behind."""
+"""Timing of simulation slices by a clock."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Pace:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's garbage collector, whose pauses would delay slices, in this context."""
+    """Disable Python's garbage collector, which would delay slices."""
     gc.collect()
     gc.freeze()
     gc.disable()

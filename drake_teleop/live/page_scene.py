@@ -1,4 +1,4 @@
-"""3D scene of a live session for its page: the objects once, then their poses."""
+"""3D scene of a live session for its page."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ class LiveDrive:
             thread.join()
 
     def _stop_threads(self) -> None:
-        """Stop all threads within 4 s; Python may crash at exit while compiled code runs."""
+        """Stop all threads; Python may crash at exit while compiled code runs."""
         self._stop.set()
         end = time.monotonic() + _END_TIMEOUT_S
         for thread in self._threads:

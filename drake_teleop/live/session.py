@@ -1,4 +1,4 @@
-"""Station that is simulated in slices of time and takes its inputs between them."""
+"""Station that is simulated in slices and takes inputs between them."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log, with missing signals of channel and contact detection added."""
+    """Return the log with missing signals added."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))

@@ -1,4 +1,4 @@
-"""Simulated haptic device in a simulated hand, for tests and for trying a link."""
+"""Simulated haptic device in a simulated hand."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> Evaluation:
-    """Identify the load of a record and compare its uncertainty with the tolerance."""
+    """Identify a record's load; compare its uncertainty with the tolerance."""
     count, found, why = len(tolerance.entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)

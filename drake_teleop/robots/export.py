@@ -70,7 +70,7 @@ def export_text(
     sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> tuple[str, list[str]]:
-    """Return the text in the format `to`, and warnings of dropped or unidentified values.
+    """Return the text in the format `to`, and warnings.
 
     `sensor_pose` is x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame of the export;
     `sign` is -1 if the sensor reports the wrench of load on sensor (usual), else 1.

@@ -1,4 +1,4 @@
-"""Recorders that collect the samples of a stream and write them as a log."""
+"""Recorders that write the samples of a stream as a log."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ _RATE_TOLERANCE = 0.05
 
 
 class StreamContactDetector:
-    """Contact detector with the noise floor of a log of free motion, after the causal low-pass."""
+    """Contact detector with the noise floor of a free-motion log."""
 
     def __init__(
         self,

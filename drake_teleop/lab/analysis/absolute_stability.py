@@ -39,7 +39,7 @@ def llewellyn_parameter(H: Complex) -> Real:
 
 
 def is_absolutely_stable(H: Complex) -> Flags:
-    """Return True at frequencies where the station is stable with any passive hand and wall."""
+    """Return where the station is stable with any passive hand and wall."""
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h12 * h21) + np.abs(h11 * h22)
     return (
@@ -67,7 +67,7 @@ def raisbeck_criterion(H: Complex) -> Real:
 
 
 def is_passive(H: Complex) -> Flags:
-    """Return True at frequencies where the station absorbs power for every input."""
+    """Return where the station absorbs power for every input."""
     h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
     return (
@@ -187,7 +187,7 @@ def impedance_range_of_grips() -> ImpedanceRange:
 def can_oscillate(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Flags:
-    """Return True at frequencies where some hand and environment of the ranges oscillate (T57).
+    """Return where some hand and environment of the ranges oscillate (T57).
 
     If all are False on a dense grid, the pairs are all stable or all unstable.
     """
@@ -205,7 +205,7 @@ def can_oscillate(
 
 
 def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange) -> Real:
-    """Return per frequency the softest wall [N/m] with which some hand of the range oscillates."""
+    """Return the softest wall [N/m] with which some hand of the range oscillates."""
     h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
@@ -236,7 +236,7 @@ def _edge_crossings(
 def bounded_singular_value(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Real:
-    """Return mu per frequency; below 1 no hand and environment of the ranges can oscillate."""
+    """Return mu; below 1 no hand and environment of the ranges can oscillate."""
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))

@@ -1,7 +1,7 @@
 """Loop of the sampled one-axis model, cut at the displayed force (T60).
 
 The loop is L(z) z^(-D) for a round trip of D hand periods. Multipliers are eigenvalues over a
-period; the argument principle counts the unstable ones.
+period.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Numbers in the summary of `drake-teleop analyze`, one function for each section."""
+"""Numbers in the summary of `drake-teleop analyze`, by section."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest motion of the linearised Diagram and of the one-axis model."""
+    """Return stability and slowest motion of linearised Diagram and one-axis model."""
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
     one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
@@ -123,7 +123,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """Return criteria of stability and passivity with any passive hand and environment."""
+    """Return criteria for any passive hand and environment."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = scale_slave_power(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
@@ -155,7 +155,7 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """Return displayed and ideal impedance in free motion and at the wall, and tracking figures."""
+    """Return displayed and ideal impedances, and tracking figures."""
     fitted = OMEGA <= _FIT_BAND
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}

@@ -226,8 +226,8 @@ def linearize(
 ) -> Linearization:
     """Return the scenario's Diagram, linearised at rest with its loops cut.
 
-    Intended motion, network and passivity method have no effect. `displacement` moves the master
-    from its start [m], in B; the slave follows.
+    Intended motion, network and passivity method have no effect. `displacement` of the master [m]
+    is in B.
     """
     check_scenario(scenario)
     if load_estimate is not None:

@@ -36,7 +36,7 @@ _DISTORTION_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, delibera
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Stability, and distortion of the force at the hand, over a grid of two parameters."""
+    """Stability and force distortion at the hand, over two parameters."""
 
     x_name: str
     y_name: str

@@ -29,7 +29,7 @@ _MAX_EVENTS = 1000
 
 @dataclass(frozen=True)
 class Sampling:
-    """Rates of the station; default: those of the shipped scenarios, with the ideal sensor."""
+    """Rates of the station; default: the shipped scenarios with the ideal sensor."""
 
     hand_hz: float = 2000.0  #: of haptic device and channel
     joint_control_hz: float = 2000.0

@@ -177,7 +177,7 @@ def draw_nyquist(curves: Curves) -> Figure:
 
 
 def draw_passive_loads(curves: Curves) -> Figure:
-    """Draw Llewellyn's parameter, the norm of the scattering matrix, and mu over frequency."""
+    """Draw Llewellyn's parameter, the scattering norm, and mu."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
     ratio = power_ratio(axis)
     scaled = scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
@@ -240,7 +240,7 @@ def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
 
 
 def draw_maps(curves: Curves, grip: str) -> Figure:
-    """Draw the stability maps with the limits of all grips; distortion is that of `grip`."""
+    """Draw the stability maps; the distortion is that of `grip`."""
     with plot_style():
         rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))

@@ -78,7 +78,6 @@ def sampled_poles(
 def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
-    """Return state matrix (..., 2, 2) and input vector (..., 2) of the device over a sample."""
     from scipy.linalg import expm
 
     _positive_array(mass, "mass of the device")

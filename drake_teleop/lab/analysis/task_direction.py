@@ -1,4 +1,4 @@
-"""Parameters of the one-axis model along a task direction, from the scenario's true models.
+"""Parameters of the one-axis model along a task direction.
 
 One axis represents the station if a contact force causes no rotation, as along the tool.
 """
@@ -56,8 +56,8 @@ def task_direction(
 ) -> TaskDirection:
     """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
 
-    `displacement` moves the master from its start [m], in B; the slave follows. Without
-    `load_estimate` (16,) the tool mass has no error.
+    `displacement` of the master [m] is in B. Without `load_estimate` (16,) the tool mass has no
+    error.
     """
     check_scenario(scenario)
     n_W = finite_array("direction", direction, 3)

@@ -55,7 +55,7 @@ class ZWidth(NamedTuple):
 
 
 def transmitted_z_width(H: Complex) -> ZWidth:
-    """Return the impedances displayed in free motion and at a rigid wall, which may be infinite."""
+    """Return the impedances displayed in free motion and at a rigid wall."""
     h11, h12, h21, h22 = matrix_entries(H)
     with np.errstate(divide="ignore", invalid="ignore"):
         rigid = np.where(h22 == 0, np.inf, h11 - h12 * h21 / h22)
@@ -68,7 +68,7 @@ WEBER_FRACTION = 0.23
 
 
 def is_difference_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
-    """Return True where a human can distinguish the displayed impedance from the ideal."""
+    """Return where a human distinguishes the displayed impedance from the ideal."""
     return np.abs(felt / ideal - 1) > WEBER_FRACTION
 
 

@@ -1,8 +1,7 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies use the same channel: the whole station presses on leaf springs (`delayed_contact`);
-in one degree of freedom, a hand lets go and taps (`release_and_taps`), and the longest stable round
-trip is found for three walls (`one_dof`).
+Three studies: the whole station presses on leaf springs (`delayed_contact`), a hand lets go and
+taps (`release_and_taps`), and the longest stable round trip (`one_dof`).
 """
 
 from __future__ import annotations
@@ -146,7 +145,7 @@ def longest_round_trip(
 
 
 def station_base(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment, with the comparison's rates and step sizes."""
+    """Return the scenario without environment, with the comparison's rates."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_STEP),
@@ -158,7 +157,7 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """Run the whole station once with a leaf spring; return its table row and its traces."""
+    """Press on a leaf spring; return the table row and the traces."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]

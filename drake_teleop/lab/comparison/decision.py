@@ -1,4 +1,4 @@
-"""Decision table: the first verdict of docs/delay.md that applies to a method and network."""
+"""Decision table: the first applicable verdict of docs/delay.md."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class MethodResult:
 
     @property
     def displayed_share(self) -> str:
-        """Displayed force over contact force at the worst leaf spring, as text; "" if unstable."""
+        """Displayed over contact force at the worst leaf spring; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.forces if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
 def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
-    """Return the table (method, network) -> cell from the `station` and `hands` of a summary."""
+    """Return the table (method, network) -> cell of a summary."""
     return {
         (row["method"], row["network"]): _summarise_runs(
             [

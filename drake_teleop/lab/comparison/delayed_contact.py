@@ -1,4 +1,4 @@
-"""Task of the whole station for each method and network: swing, press on a leaf spring, rest."""
+"""Task of the whole station: swing, press on a leaf spring, rest."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LEAF_SPRINGS = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the times of the task for a round trip [s]; waiting times increase with it."""
+    """Return the times of the task for a round trip [s]."""
     return Task(
         swing=0.3,
         swung=1.8,
@@ -102,7 +102,7 @@ def leaf_thickness(stiffness: float) -> float:
 
 
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
-    """Return the measures of a run: vertical motion and force, rotation of the tool, energy."""
+    """Return the measures of a run."""
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
     return figures_of_traces(

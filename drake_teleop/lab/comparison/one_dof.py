@@ -1,4 +1,4 @@
-"""One degree of freedom of the station: plant, task and measures, for thousands of runs.
+"""One degree of freedom of the station: plant, task and measures.
 
 The station's own `channel_step` connects hand and slave along x at 1 kHz, with held forces.
 """
@@ -95,7 +95,7 @@ at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 
 @dataclass(frozen=True)
 class OneDofRun:
-    """Time series (N,) of a run, one entry for each period.
+    """Time series (N,) of a run.
 
     `accounts` (N, 4) is the energy [J] that entered the station so far at four places, at the
     master's scale. In a passive station, HAND plus any other place never falls below
@@ -218,7 +218,7 @@ def run_one_dof(
 
 
 def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
-    """Return the intended position [m] and velocity [m/s] (N, 2) of a task; the wall is at 0."""
+    """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION)
     fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))

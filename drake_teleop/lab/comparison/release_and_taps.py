@@ -1,4 +1,4 @@
-"""A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`)."""
+"""A hand that lets go while it presses, and one that taps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EVALUATED_S = 2.0  # s, evaluated after letting go
 
 @dataclass(frozen=True)
 class ReleaseAndTaps:
-    """Measures of one method over one network after release and during taps, all >= 0."""
+    """Measures after release and during taps, all >= 0."""
 
     release_force: float  #: mean force on the hand in the last 0.1 s before release [N]
     release_speed: float  #: largest speed of the device in the 2 s after release [m/s]

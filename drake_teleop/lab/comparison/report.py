@@ -170,7 +170,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw over time the energy from hand and environment, plus the method's initial energy."""
+    """Draw the energy from hand and environment over time."""
 
     def draw_run_energy(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)

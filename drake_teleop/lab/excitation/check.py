@@ -48,7 +48,7 @@ def check_trajectory(
     trajectory: FourierTrajectory,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[LimitUse]:
-    """Return the use of every limit by one period of a trajectory, largest first."""
+    """Return the use of every limit by one period, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
     before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
     qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
@@ -63,7 +63,7 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[LimitUse]:
-    """Return the use of every limit by a motion of T samples and n joints, largest first."""
+    """Return the use of every limit by (T, n) joint motions, largest first."""
     names, limits = robot.arm.joint_names, robot.limits
     motion = _evaluate_bodies(robot, q, qd, qdd, progress)
     uses = [

@@ -139,7 +139,7 @@ class Scene:
 
     Args:
         reserve: (10,) parameters phi of an additional load on the sensor.
-        visuals_count: True: visual shapes also count as collision shapes.
+        visuals_count: whether visual shapes also collide.
     """
 
     def __init__(
@@ -158,7 +158,6 @@ class Scene:
         self._rows = self._link_rows()
 
     def _link_rows(self) -> dict[BodyIndex, int]:
-        """Return the link of every body, as a row of `link_motions` (-1: world)."""
         rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
@@ -171,8 +170,7 @@ class Scene:
     ) -> tuple[dict[_Pair, Array], list[str]]:
         """Return pairs of shapes that may collide, and names of bodies that touch at the start.
 
-        Excluded are pairs that are on one link, always near, at a constant distance, or in
-        contact in the posture `start`.
+        Pairs on one link, always near, at constant distance, or in contact at `start` are excluded.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -290,7 +288,7 @@ def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
 def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_Pair, Array]) -> None:
     """Exclude pairs that are near at a constant distance, and fill in their distances.
 
-    One query of Drake takes up to 0.1 s for two round shapes with the same axis.
+    Drake's query is slow for them.
     """
     for (a, b), of_pair in distances.items():
         first = of_pair[:_FIRST_POSTURES]
@@ -334,7 +332,6 @@ def _add_load(
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
-    """Add visual shapes as collision shapes where needed; replace half spaces by plates."""
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))

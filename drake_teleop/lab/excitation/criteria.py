@@ -76,7 +76,7 @@ class Criterion:
         self._columns = columns
 
     def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
-        """Return scaled regression rows (6 T, c) and the information (c, c) per sample."""
+        """Return scaled rows (6 T, c) and the information (c, c) per sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
             V = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)

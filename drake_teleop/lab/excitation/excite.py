@@ -40,7 +40,7 @@ class Excitation:
     """Trajectory that passed the check.
 
     Attributes:
-        values: value of every criterion over one period at 1 kHz.
+        values: value of every criterion.
         deviations: (16,) predicted standard deviations of offsets and phi with the heaviest load.
         uses: use of every limit, largest first.
         history: (K, 2) number of evaluations, best criterion so far.
@@ -119,7 +119,7 @@ def make_checked_excitation(
 def find_best_within_limits(
     robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
-    """Return the best trajectory that passes the check, and its use of the limits."""
+    """Return the best trajectory that passes the check, and its uses."""
     worst: LimitUse | None = None
     for trajectory in _feasible_candidates(found, robot):
         uses = check_trajectory(robot, trajectory, progress)
@@ -137,7 +137,7 @@ def find_best_within_limits(
 
 
 def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
-    """Return the value of every criterion over one period at 1 kHz."""
+    """Return the value of every criterion at 1 kHz."""
     motion = sensor_motion(robot, trajectory)
     return {
         name: Criterion(name, robot.scales).value(*motion, trajectory.period) for name in CRITERIA
@@ -156,7 +156,6 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
 
 
 def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
-    """Yield trajectories within the limits at 1 kHz, best first."""
     ranked = sorted(found, key=lambda iterate: iterate.value)
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)
     checks = 0

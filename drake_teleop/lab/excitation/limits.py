@@ -34,7 +34,7 @@ _FAR_DISTANCE_M = 1.0
 
 
 class Limits(NamedTuple):
-    """Limits of an excitation. The use of a limit is a share; a use of 1 reaches the limit.
+    """Limits of an excitation; a use of 1 reaches a limit.
 
     Attributes:
         q_middle, q_half: (n,) middle and half of the joint ranges [rad]; half may be inf.
@@ -47,7 +47,7 @@ class Limits(NamedTuple):
         capsule_ends: (C, 2, 3) end points of each capsule in the link's frame [m].
         capsule_radius: (C,) radii [m].
         pairs: (K, 2) pairs of capsules with a minimum distance.
-        distances: (K,) these distances [m]; negative where capsules are much larger than shapes.
+        distances: (K,) these distances [m], possibly negative.
         clearance: minimum distance of the true shapes [m].
     """
 

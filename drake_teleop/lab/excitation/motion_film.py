@@ -88,7 +88,6 @@ def _link_poses(
 
 
 def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
-    """Add visual shapes; for bodies without them collision shapes and bones."""
     plant, inspector = robot.plant, robot.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))

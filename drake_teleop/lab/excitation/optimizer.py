@@ -94,7 +94,7 @@ class Problem:
         return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion around the home or a random posture."""
+        """Return the unknowns of a random motion."""
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
@@ -108,7 +108,7 @@ class Problem:
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
     def bounds(self, x: Array) -> Bounds | None:
-        """Return the bounds of the unknowns in a descent from x; None: unbounded."""
+        """Return the bounds of the unknowns; None: unbounded."""
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
@@ -167,7 +167,7 @@ _MIN_IMPROVEMENT = 0.995
 
 @dataclass(frozen=True)
 class Iterate:
-    """Feasible trajectory, the best of its start when found after `seconds` of thread CPU time."""
+    """Feasible trajectory, found after `seconds` of thread CPU time."""
 
     seconds: float
     evaluations: int
@@ -186,8 +186,7 @@ def minimise_criterion(
 ) -> list[Iterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    `seconds` of thread CPU time replace the number of `starts`; the result is then not
-    reproducible.
+    `seconds` of thread CPU time replace `starts`; then runs differ.
     """
     search = _Search(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):
@@ -231,7 +230,6 @@ class _Search:
         self._start_time = time.thread_time()
 
     def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
-        """Yield the best random motions of each batch, best first."""
         while True:
             batch = [
                 self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_NUM_CANDIDATES)

@@ -74,7 +74,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """Return the station's slave with tool, environment, and a table at z = 0."""
+    """Return the station's slave with surroundings and a table at z = 0."""
     check_scenario(scenario)
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
@@ -184,7 +184,6 @@ def _make_robot(
     assumptions: list[str],
     folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
-    """Return the robot with its limits; `box` is middle and half size in W [m]."""
     arm = scene.arm
     middle, half = arm.middle, (arm.upper - arm.lower) / 2
     random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))

@@ -179,7 +179,7 @@ class ShortestProblem(Problem):
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion and period, or a variation of `around`."""
+        """Return the unknowns of a random motion, or a variation of `around`."""
         if self._around is not None and near_home:
             other = _COEFFICIENT_SPREAD * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
@@ -193,7 +193,7 @@ class ShortestProblem(Problem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return bounds of the unknowns; only the last, the log of the period, is bounded."""
+        """Return bounds of the unknowns; only log T is bounded."""
         shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
         around = (
             np.clip(x[-1] + step, shortest_period, largest)
@@ -272,7 +272,6 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
-        """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V."""
         rows = self._regression_rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
         logs = 0.5 * np.log(variances)
@@ -286,7 +285,7 @@ class ShortestProblem(Problem):
 
 
 def white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
-    """Return the white noise densities (6, 6) of wrench and motion, relative to the wrench's."""
+    """Return the white noise densities (6, 6), relative to the wrench's."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
         at_So = np.eye(6)

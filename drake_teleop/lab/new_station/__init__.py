@@ -1,7 +1,7 @@
 """`drake-teleop new DIR --arm FILE --sensor-frame NAME`: creation of a station with a custom arm.
 
-The command finds a start pose with the tool down, chooses scales that match the device, writes a
-commented scenario and a picture of the start, and runs it: free motion, then contact with a wall.
+It finds a start pose, chooses scales, writes a commented scenario and a picture, and runs it: free
+motion, then contact with a wall.
 """
 
 from __future__ import annotations

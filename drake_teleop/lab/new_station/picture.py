@@ -1,4 +1,4 @@
-"""Picture of a new station at its start: arm, tool, wall and base plane, from two sides."""
+"""Picture of a new station at its start, from two sides."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _hull_triangles(points: Array) -> Array:
 
 
 def _box_triangles(top: Array, size: Array) -> Array:
-    """Return small triangles (k, 3, 3) of a box, which sort by depth better than large ones."""
+    """Return small triangles (k, 3, 3), which sort better by depth than large ones."""
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
     cells = np.array(list(product(range(_WALL_DIVISIONS), range(_WALL_DIVISIONS), range(2)))) / [
         _WALL_DIVISIONS,

@@ -1,8 +1,7 @@
 """Start of an arm with the tool down, chosen among random postures.
 
-Postures are ranked by distance to joint limits and singularities, elbow up, and overlaps of shapes.
-Of the best, the one with the largest reachable cube is the start. The tool is along an axis of S,
-the z axis of frame A; S and A are the same for tools along z_S.
+Among the best postures (`posture_scores`), the one with the largest reachable cube is the start.
+The tool is along an axis of S, the z axis of frame A; S and A are the same for tools along z_S.
 """
 
 from __future__ import annotations
@@ -84,12 +83,12 @@ class Place(NamedTuple):
 
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
-        by_position: True if the position is sufficient to specify the pose in a scenario.
+        by_position: True if the position specifies the pose.
         q: (n,) joint positions at the start [rad].
         half: half edge of the reachable cube around the start [m].
         room: smallest distance of a joint to its limit, over half the joint's range.
         score: merit of the posture, see `posture_scores`, without the cost of overlaps.
-        wall: edge of the wall that the arm does not touch [m].
+        wall: edge of the free wall [m].
         vertical: True if the arm can only move up and down by `half`.
         overlaps: True if shapes of the arm overlap.
     """
@@ -117,7 +116,7 @@ class Place(NamedTuple):
 
     @property
     def home(self) -> list[float]:
-        """Joint positions for the field `slave.home`; empty if the position is sufficient."""
+        """Joint positions for `slave.home`; empty if the position is sufficient."""
         return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
@@ -152,7 +151,7 @@ def find_place(
     plane: float = 0.0,
     axis: str = "z",
 ) -> Place:
-    """Find a start with the tool down and reachable space in all directions.
+    """Find a start with the tool down.
 
     Args:
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
@@ -217,7 +216,6 @@ def _describe_removals(region: Region, left: int) -> str:
 def _rows_to_solve(
     arm: ArmModel, postures: Postures, region: Region, shapes: PostureShapes | None
 ) -> Iterator[NDArray[np.intp]]:
-    """Yield the usable rows, the best first; then rows of all ranks whose shapes do not overlap."""
     if not len(postures.q):
         return
     order = np.argsort(posture_scores(arm, postures, region))[::-1]
@@ -237,7 +235,6 @@ def _rows_to_solve(
 def _candidates(
     arm: ArmModel, postures: Postures, region: Region, is_free: bool
 ) -> Iterator[Place]:
-    """Yield starts near postures; `is_free`: with the tool exactly down."""
     if not is_free:  # position and orientation are coupled
         solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
     else:
@@ -326,7 +323,7 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
 
 
 def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
-    """Return how far bodies reach beyond S along an axis of S, at least 0 [m]."""
+    """Return the reach of bodies beyond S along an axis of S [m]."""
     points = shapes.X_WS.inverse() @ shapes.points(bodies).T
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
@@ -340,7 +337,6 @@ def _merit(place: Place) -> tuple[float, float, bool, float]:
 
 
 def _with_reachable_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
-    """Return the place with the half edge of its largest reachable cube, or 0."""
     moves = _ik_reaches if is_free else _pose_reaches
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
@@ -385,14 +381,14 @@ def nearest_axis(direction: Array) -> str:
 
 
 def last_joint_axis(arm: ArmModel) -> str:
-    """Return the axis of S along the last joint, directed away from the joint; empty if none is."""
+    """Return the axis of S along the last joint, away from it; empty if none is."""
     row = arm.table[arm.num_joints]
     along = row[ROTATION:TRANSLATION].reshape(3, 3)[2]
     return nearest_axis(-along if row[TRANSLATION + 2] < -_ROUNDING_M else along)
 
 
 def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) -> str:
-    """Return the lines of the model that make the tool axis z_S; empty if it is z_S."""
+    """Return model lines that make the tool axis z_S; empty if it is."""
     if axis == "z":
         return ""
     R_SA = TOOL_AXES[axis]

@@ -54,16 +54,16 @@ class Plan:
     """Start, scales and motions of a new station.
 
     Args:
-        tool: stand-in for a missing tool; None: the model or a file contains the tool.
+        tool: stand-in for a missing tool, or None.
         tool_mass: mass beyond the sensor [kg].
         own_tool: True if the model contains the tool.
         swing: amplitude of the slave in free motion [m].
         lowest: (3,) position in W of the tool's lowest point at the start [m].
-        tip: (3,) p_STip of this point if the tool is not along z_S, else empty [m].
+        tip: (3,) p_STip of this point [m]; empty along z_S.
         axis_note: advice on unusual axes of the sensor frame.
         overlaps: sentences about overlaps of shapes at the start.
         plane: height of the base plane [m].
-        weak_joints: joints whose torque limits in the model cannot hold the arm.
+        weak_joints: joints whose torque limits cannot hold the arm.
         shapes: shapes of arm and tool, at the start.
     """
 
@@ -204,7 +204,6 @@ def _stand_in_tool(axis: str, length: float) -> Tool:
 
 
 def _rod_length(shapes: PostureShapes, axis: str) -> float:
-    """Return the length of a rod that ends beyond the other shapes on the sensor's link [m]."""
     end = extent_beyond_sensor(shapes, shapes.sensor_link() - {shapes.tool_body}, axis)
     return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
 

@@ -1,4 +1,4 @@
-"""Random postures of an arm, and the conditions on a start posture that each one meets."""
+"""Random postures of an arm, and conditions on a start posture."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _GOOD_MARGIN, _GOOD_SINGULAR_VALUE, _GOOD_ELBOW = 0.3, 0.05, 0.7
 
 @dataclass(frozen=True, eq=False)
 class Postures:
-    """Joint positions with the frames that they give; arrays with a row for each posture.
+    """Joint positions and their frames, with a row for each posture.
 
     Attributes:
         q: (k, n) joint positions [rad, m].
@@ -62,9 +62,9 @@ class Region:
         tool_length: distance of the tool's end from S [m].
         first: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
-        raised: (n,) True for joints that belong above the base plane, and not to a mobile base.
+        raised: (n,) True for joints above the base plane, not of a mobile base.
         side: direction of the region about z_W, from x_W [rad].
-        removed: number of random postures that each condition removed, in this order.
+        removed: number of postures that each condition removed.
     """
 
     plane: float
@@ -118,7 +118,7 @@ def random_postures(arm: ArmModel) -> Postures:
 def select_suitable_postures(
     postures: Postures, plane: float, tool_length: float
 ) -> tuple[Postures, Region]:
-    """Return the postures that suit a start, and the region on the side with most of them."""
+    """Return suitable postures, and the region on the side with most of them."""
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first
     radius = np.hypot(from_first[:, 0], from_first[:, 1])
@@ -167,8 +167,7 @@ def _is_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
 def posture_scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
     """Return a score (k,) of each posture; the highest is the best.
 
-    Distance from limits and singularities and a raised elbow increase it. Links below the base
-    plane and distance of the sensor from the preferred place decrease it.
+    It combines limits, singularities, elbow, base plane and preferred place.
     """
     margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
     L = orientation_length(arm)
@@ -201,7 +200,7 @@ def _singular_values(arm: ArmModel, postures: Postures) -> Array:
 
 
 def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
-    """Return in how many directions the sensor can move, which may be fewer than the joints."""
+    """Return the number of directions in which the sensor can move."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
     values = _singular_values(arm, few)
     return int((values > _ROUNDING * values[:, :1]).sum(axis=1).max())
@@ -232,7 +231,7 @@ def elbow_up_share(postures: Postures, reach: float) -> Array:
 
 
 def with_tool_axis(arm: ArmModel, R_SA: Array) -> ArmModel:
-    """Return the arm with the frame A, whose z is the tool axis, instead of S."""
+    """Return the arm with the frame A instead of S."""
     table = arm.table.copy()
     R = table[-1, ROTATION:TRANSLATION].reshape(3, 3) @ R_SA
     table[-1, ROTATION:TRANSLATION] = R.ravel()

@@ -1,4 +1,4 @@
-"""Experiments of the paper and their values: free movements (Figs. 6, 7), contact (Fig. 8)."""
+"""The paper's experiments: free movements (Figs. 6, 7), contact (Fig. 8)."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: Stage) -> Conta
 
 
 def simulate_ideal_motion(progress: Progress) -> IdealMotion:
-    """Simulate a free movement that moves and rotates the tool about all axes."""
+    """Simulate a movement along and about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
     )
@@ -134,7 +134,7 @@ def simulate_ideal_motion(progress: Progress) -> IdealMotion:
 
 
 def ideal_values(run: IdealMotion) -> Values:
-    """Return the errors of the calculated load wrench, by elimination and by regressor."""
+    """Return the errors of the calculated load wrench."""
     load = regressor(*run.motion) @ run.phi
     left = np.concatenate(
         [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]
@@ -250,7 +250,7 @@ def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
 
 
 def reversal_without_contact(run: ContactMotion) -> float | None:
-    """Return the time of the largest raw force after the contact [s]; None without contact."""
+    """Return the time of the largest raw force after contact [s], or None."""
     t, force_norm = run.touched.t, _force_norm(run.raw)
     window = _contact_window(run)
     if not window.any():

@@ -1,4 +1,4 @@
-"""Figs. 6 to 8 from plain arrays, with the paper's layout and equal scales in all subplots."""
+"""Figs. 6 to 8 from arrays, in the paper's layout."""
 
 from __future__ import annotations
 

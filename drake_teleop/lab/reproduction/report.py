@@ -35,7 +35,7 @@ _VERDICTS_OF_FOUND = ("agrees", "differs")
 
 @dataclass(frozen=True)
 class Comparison:
-    """Row of the table that compares paper and reproduction.
+    """Row that compares paper and reproduction.
 
     Args:
         origin: "set" if the scenario was chosen to match the paper's value; else "found".
@@ -78,7 +78,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """Row of the identification table: identified and true value of a parameter, in `unit`."""
+    """Row of the identification table, in `unit`."""
 
     symbol: str
     index: str
@@ -90,7 +90,7 @@ class ParameterRow:
 
 
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
-    """Return the rows of the table that compares paper and reproduction."""
+    """Return the rows that compare paper and reproduction."""
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     share = s["contact.peak_contact_N"] / s["contact.peak_inertial_N"]
@@ -131,7 +131,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return as text the rows whose values are outside the accepted range."""
+    """Return the rows outside the accepted range as text."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
@@ -209,7 +209,7 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures; equal runs give equal pages."""
+    """Write the HTML page with embedded figures."""
     page = render_page(
         "drake_teleop.lab.reproduction",
         "report.html.j2",

@@ -1,4 +1,4 @@
-"""`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order."""
+"""`drake-teleop reproduce`: the paper's experiments, Figs. 6 to 8."""
 
 from __future__ import annotations
 

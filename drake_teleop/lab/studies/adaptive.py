@@ -1,7 +1,6 @@
 """Choice of the next points of an adaptive design by expected improvement (Jones 1998).
 
-In a batch, the predicted mean replaces a chosen point's value ("kriging believer", Ginsbourger
-2010).
+A batch uses the "kriging believer" (Ginsbourger 2010).
 """
 
 from __future__ import annotations

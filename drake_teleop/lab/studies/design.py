@@ -1,4 +1,4 @@
-"""Content of a study file, and its design points: the sets of factor values to simulate."""
+"""Content of a study file, and its design points."""
 
 import itertools
 import math
@@ -41,7 +41,7 @@ class Factor:
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def listed_values(self) -> Sequence[Value]:
-        """Return the values of a factorial design: the list, or `levels` numbers of the range."""
+        """Return the list, or `levels` numbers of the range."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
@@ -210,7 +210,7 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """Return one table row, still without measures, for each run of the points."""
+        """Return one table row without measures for each run."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values

@@ -191,7 +191,7 @@ class PairMeans:
 def estimate_means(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """Return the means of values (N,) at each of `count` levels; nan is ignored."""
+    """Return the means of values (N,) at `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -206,7 +206,7 @@ def estimate_means(
 
 
 def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects on all measures: one row per measure, factor and level."""
+    """Return the main effects by measure, factor and level."""
     import polars as pl
 
     table = [
@@ -329,7 +329,7 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
 
 
 def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return all points with their means of the `PARETO` measures; None if the study lacks one."""
+    """Return all points with their means of `PARETO`; None if one is missing."""
     import polars as pl
 
     if not set(PARETO) <= set(study.measures) or rows.is_empty():
@@ -354,7 +354,7 @@ def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return True at complete points that no other dominates; columns of `values` are minimised."""
+    """Return complete points that no other dominates; columns are minimised."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]

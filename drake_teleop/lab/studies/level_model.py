@@ -27,10 +27,9 @@ TOO_FEW = "too few points"
 
 
 def largest_complete_block(there: Flags) -> tuple[Flags, Flags]:
-    """Return the rows and columns of the largest complete block of a table with missing values.
+    """Return rows and columns of the largest complete block.
 
-    `there` (rows, columns) is True where a level (row) has a value at a combination of the other
-    factors (column).
+    `there` is True where a level (row) has a value at a combination (column).
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
@@ -213,8 +212,8 @@ def level_model(
 ) -> LevelModel | None:
     """Return a regression model that the points determine, or None.
 
-    `known` (n,) is True where the measure has a value; `by_chance` is True if combinations of
-    levels without points are missing by chance.
+    `known` (n,): the measure has a value; `by_chance`: combinations without points are missing by
+    chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:

@@ -1,7 +1,7 @@
 """Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
-If a run ends its process, the rows of its chunk are run one by one; a row that ends its process
-again gets an error. With one job, this ends the study.
+If a run ends its process, its chunk runs row by row; a row that ends it again gets an error. With
+one job, this ends the study.
 """
 
 from __future__ import annotations

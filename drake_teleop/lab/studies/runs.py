@@ -143,7 +143,7 @@ class StudyProgress:
         self._report()
 
     def add_finished_runs(self, rows: Chunk) -> None:
-        """Count finished runs and their times, for the first ones without `ONE_TIME_COST`."""
+        """Count finished runs and their times."""
         self.done += len(rows)
         for row in rows:
             if _SECONDS in row:  # missing if the run ended its process

@@ -51,7 +51,7 @@ def parse_shard(text: str) -> Shard:
 
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
-    """Link the parts of all shards in `out` into its table, which then has the bytes of one run."""
+    """Link the parts of all shards in `out` into its table."""
     names = [_FOLDER.fullmatch(path.name) for path in (out / "shards").glob("*")]
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:

@@ -54,7 +54,6 @@ class StationWork:
         return ScenarioFromData(_apply_changes(self.data, changes), self.where)
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return the measures of one run, and `ONE_TIME_COST` [s]."""
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])

@@ -1,4 +1,4 @@
-"""Trials of settings, in the whole station or one axis: a hand swings, presses and holds."""
+"""Trials of settings: a hand swings, presses and holds."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class StationTrial:
 
 @dataclass(frozen=True)
 class GammaSearch:
-    """Work of a study: the largest gamma that is stable in one axis at all corners of the set.
+    """Work of a study: the largest stable gamma in one axis at all corners.
 
     `caps`: largest gamma by low-pass [Hz].
     """
@@ -197,7 +197,6 @@ class GammaSearch:
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
     def _linear_limit(self, axis: Any, settings: Settings) -> float:
-        """Return the largest gamma without a method, from the sampled one-axis loop."""
         sampling = sampling_of_scenario(self.base)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
@@ -211,7 +210,7 @@ class GammaSearch:
     def share_in_one_axis(
         self, axis: Axis, settings: Settings, gamma: float, grip: str, wall: float, seed: int
     ) -> float:
-        """Return the rendered share of the contact force; 0 if the axis does not come to rest."""
+        """Return the rendered share of the contact force; 0: unstable."""
         forward, backward = self.base.channel.lines()
         hand = GRIPS[grip]
         shown = {entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(Axis)}
@@ -236,7 +235,7 @@ class GammaSearch:
 
 
 def short_task(round_trip: float) -> Task:
-    """Return the times of a swing, a rest and a press that is held, for a round trip [s]."""
+    """Return the times of swing, rest and held press for a round trip [s]."""
     pressed = 1.8 + 2 * round_trip
     release = pressed + _REST_S + _JUDGED_S + 2 * round_trip
     return Task(

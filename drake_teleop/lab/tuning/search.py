@@ -128,7 +128,6 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
 def _station_limit(
     settings: Settings, trial: StationTrial, execute: Execute
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma that is stable in the station with the margin, and its rows."""
     margin, ends = trial.stated.requirements.margin, [c[0] for c in trial.stated.corners]
     hands = list(dict.fromkeys(ends))
     tries = 0
@@ -165,13 +164,13 @@ def _station_limit(
 
 
 def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
-    """Return True if the station comes to rest, is quiet, and renders the contact force."""
+    """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
     return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)
 
 
 def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
-    """Return a function that runs or continues a named study in a folder of `out`."""
+    """Return a function that runs a named study in a folder of `out`."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:
@@ -189,7 +188,6 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
 
 
 def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
-    """Return the row with gamma, reduced by the margin, and the predicted detection threshold."""
     gamma = row["gamma_limit"] / trial.stated.requirements.margin
     human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
     masked = row["sigma_inertia"] * scale * _load_force(trial)
@@ -201,7 +199,6 @@ def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -
 
 
 def _load_force(trial: StationTrial) -> float:
-    """Return the rms of the load's inertial force in the swing of the trial [N]."""
     amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
     return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 

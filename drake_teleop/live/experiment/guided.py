@@ -35,7 +35,7 @@ HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the rows of a log with zero wrenches, so that the 3D scene shows no arrows."""
+    """Return a log's rows with zero wrenches."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
 

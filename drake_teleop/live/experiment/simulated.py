@@ -1,4 +1,4 @@
-"""Simulated participants: an observer with noise compares rendered forces of a scripted hand."""
+"""Simulated participants: a noisy observer with a scripted hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trials of an experiment on disk: `participants/03.csv`, complete after each trial."""
+"""Trials on disk: `participants/03.csv`, complete after each trial."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of the C99 kernel for an identified load, with a test vector from Python."""
+"""C99 kernel for an identified load, with a test vector from Python."""
 
 from __future__ import annotations
 

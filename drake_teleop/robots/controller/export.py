@@ -1,4 +1,4 @@
-"""Export of an identified load with the compensation itself, as a folder of files."""
+"""Export of an identified load with the compensation."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _PLATFORMS = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 
 def fmu_files(target: Target) -> Files:
-    """Return two FMUs by name: sources, and binaries for Linux if there is a C compiler."""
+    """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
     compiler = shutil.which("cc")
     if platform.system() != "Linux" or platform.machine() != "x86_64":
         compiler = None
