@@ -283,17 +283,14 @@ def _sqlite(r: Recording, folder: Path) -> Files:
 
 @dataclass(frozen=True)
 class Format:
-    """Format: its program, its writer, and lines (old, new) that the user changes in the draft."""
+    """Format: program, writer, and the words (old, new) that the user replaces in the draft."""
 
     name: str
     write: Callable[[Recording, Path], Files]
     edits: tuple[tuple[str, str], ...] = ()
 
 
-_SCALES = (
-    ("columns: [Fx, Fy, Fz]", "columns: [Fx, Fy, Fz]\n    scale: 1e-4"),
-    ("columns: [Tx, Ty, Tz]", "columns: [Tx, Ty, Tz]\n    scale: 1e-5"),
-)
+_SCALES = (("scale: FILL IN", "scale: 1e-4"), ("scale: FILL IN", "scale: 1e-5"))
 FORMATS = (
     Format("PlotJuggler, CSV of two topics", _plotjuggler),
     Format("UR, CSV of RTDE", _ur),
@@ -320,8 +317,7 @@ def solved(form: Format, seed: int, folder: Path) -> dict[str, Any]:
     """Return what the user types and gets: commands, words of YAML, and errors."""
     truth = record(seed)
     row: dict[str, Any] = {"format": form.name, "seed": seed, "commands": 2,
-                           "words": sum(len(new.split()) - len(old.split())
-                                        for old, new in form.edits)}  # fmt: skip
+                           "words": len(form.edits)}  # fmt: skip
     try:
         first, *others = form.write(truth, folder)
         inspect_command(first, folder / "out", others=others, quiet=True)
@@ -329,7 +325,7 @@ def solved(form: Format, seed: int, folder: Path) -> dict[str, Any]:
         text = draft.read_text(encoding="utf-8")
         for old, new in form.edits:
             assert old in text, text
-            text = text.replace(old, new)
+            text = text.replace(old, new, 1)
         draft.write_text(text, encoding="utf-8")
         found = detect_log(draft)
     except DrakeTeleopError as error:
@@ -339,7 +335,7 @@ def solved(form: Format, seed: int, folder: Path) -> dict[str, Any]:
     inside = ~found.eliminated.edge
     error = (found.eliminated.contact[:, :3] - exact)[inside]
     return row | {
-        "mass_error_%": 100 * (phi[0] / truth.mass - 1),
+        "mass_error_%": float(100 * (phi[0] / truth.mass - 1)),
         "contact_rms_N": float(np.sqrt((error**2).mean())),
         "contacts": int((np.diff(found.touched.astype(int)) == 1).sum()),
         "findings": [x.name for x in found.eliminated.findings],

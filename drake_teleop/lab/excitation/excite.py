@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import accumulate
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import accumulate, chain
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from drake_teleop.load.trajectory import FourierTrajectory
 _SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Smallest ratio of the criteria of successive candidates of one descent; maximum number of checks.
 _CANDIDATE_RATIO, _MAX_CHECKS = 1.05, 30
+# If no candidate passes: amplitudes of motions about the start posture, and their number.
+_SMALL_FACTORS, _NUM_SMALL = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12), 2
 _HULL_ADVICE = (
     "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
     " touch in its start posture are ignored"
@@ -86,11 +88,13 @@ def excite(
         def report_best(done: float, best: float) -> None:
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
+        problem = Problem(task)
         found = minimise_criterion(
-            Problem(task), seed=seed, starts=starts, seconds=seconds, progress=report_best
+            problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
         )
         report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
-        trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"))
+        small = _small_motions(robot, found, problem, seed)
+        trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
     return make_checked_excitation(robot, criterion, found, trajectory, uses)
 
 
@@ -111,17 +115,25 @@ def make_checked_excitation(
             *sensor_motion(robot, trajectory), 1 / RATE, robot.noise, robot.limits.phi
         ),
         uses,
-        np.array([(it.evaluations, value) for it, value in zip(found, best, strict=True)]),
-        found[-1].seconds,
+        np.array([(it.evaluations, value) for it, value in zip(found, best, strict=True)]).reshape(
+            -1, 2
+        ),
+        found[-1].seconds if found else 0.0,
     )
 
 
 def find_best_within_limits(
-    robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
+    robot: Robot,
+    found: list[Iterate],
+    progress: Callable[[float], None] = lambda done: None,
+    others: Iterable[FourierTrajectory] = (),
 ) -> tuple[FourierTrajectory, list[LimitUse]]:
-    """Return the best trajectory that passes the check, and its uses."""
+    """Return the best trajectory that passes the check, and its uses.
+
+    If none of `found` passes, `others` are checked in their order.
+    """
     worst: LimitUse | None = None
-    for trajectory in _feasible_candidates(found, robot):
+    for trajectory in chain(_feasible_candidates(found, robot), others):
         uses = check_trajectory(robot, trajectory, progress)
         if uses[0].share <= 1:
             return trajectory, uses
@@ -171,6 +183,22 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
                 break
         if checks == _MAX_CHECKS:
             return
+
+
+def _small_motions(
+    robot: Robot, found: list[Iterate], problem: Problem, seed: int
+) -> Iterator[FourierTrajectory]:
+    """Yield motions about the start posture, ever smaller."""
+    best = sorted(found, key=lambda iterate: iterate.value)[:_NUM_SMALL]
+    motions = [iterate.trajectory for iterate in best]
+    rng = np.random.default_rng(seed)
+    random = (problem.candidate(rng, near_home=True) for _ in range(_NUM_SMALL))
+    motions += [problem.trajectory(x) for x in random]
+    for factor in _SMALL_FACTORS:
+        for motion in motions:
+            small = replace(motion.scaled(factor), q0=robot.home)
+            if _largest_use(robot, small) <= 1:
+                yield small
 
 
 def _largest_use(robot: Robot, trajectory: FourierTrajectory) -> float:

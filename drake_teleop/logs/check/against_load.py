@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,7 @@ from drake_teleop.logs.check.corrections import (
     edit_field,
     load_edits,
     try_edit,
+    with_opposite_sign,
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
@@ -43,6 +45,9 @@ MIN_IMPROVEMENT = 4.0
 """Smallest factor by which an edit must reduce the unexplained share."""
 _FALSE_ALARMS, _TESTED_EDITS = 1e-6, 50
 _CUTOFF_HZ = 15.0
+_ALREADY_SIGNED = ("sign", "swapped axes")  # mirrored axes are a cause that `identify` names
+_FREE_SHARE = 0.75
+"""Share of a record that is without contact, if any is."""
 _MAX_SAMPLES = 1500
 
 
@@ -67,31 +72,42 @@ class LoadFit:
         return self.mass > 0 and self.unexplained < GOOD_SHARE + self.noise
 
 
-def load_fit(log: Log) -> LoadFit:
-    """Fit a load and constant offsets to a log, after a low-pass of 15 Hz."""
+def load_fit(log: Log, kept_share: float = 1.0) -> LoadFit:
+    """Fit a load and offsets to the share of a log that fits best, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_passed(log, cutoff).only(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
-    w = wrench - wrench.mean(axis=0)
     scale = _scale(wrench)
     V = regressor(*(x[rows] for x in smooth.motion))
     if "weight" in log.free and smooth.gravity is not None:
         rest = np.zeros_like(smooth.gravity[rows])
         V = np.dstack([V, regressor(-smooth.gravity[rows], rest, rest)[..., :4]])
-    V = (V - V.mean(axis=0)) / scale[:, None]
-    matrix = V.reshape(-1, V.shape[2])
-    size = np.linalg.norm(matrix, axis=0) + 1e-12
-    theta = np.linalg.lstsq(matrix / size, (w / scale).ravel(), rcond=1e-6)[0] / size
-    total = float((w / scale).var(axis=0).sum()) + 1e-30
-    unexplained = float((w / scale - V @ theta).var(axis=0).sum()) / total
+    V, w = V / scale[:, None], wrench / scale
+    theta = _least_squares(V, w)
+    if kept_share < 1.0:
+        errors = w - V @ theta
+        errors = np.linalg.norm(errors - np.median(errors, axis=0), axis=1)
+        best = errors <= np.quantile(errors, kept_share)
+        V, w = V[best], w[best]
+        theta = _least_squares(V, w)
+    total = float(w.var(axis=0).sum()) + 1e-30
+    unexplained = float((w - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
         return LoadFit(unexplained, float(theta[0]), independent=max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
     noise = passed * float(((white_noise(log.wrench) / scale) ** 2).sum()) / total
-    independent = 2 * cutoff * float(log.t[-1] - log.t[0])
+    independent = 2 * cutoff * kept_share * float(log.t[-1] - log.t[0])
     return LoadFit(unexplained, float(theta[0]), noise, independent)
+
+
+def _least_squares(V: Array, w: Array) -> Array:
+    V = V - V.mean(axis=0)
+    matrix = V.reshape(-1, V.shape[2])
+    size = np.linalg.norm(matrix, axis=0) + 1e-12
+    right = (w - w.mean(axis=0)).ravel()
+    return np.asarray(np.linalg.lstsq(matrix / size, right, rcond=1e-6)[0] / size)
 
 
 def unexplained_share(wrench: Array, residual: Array) -> float:
@@ -129,10 +145,10 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.thin(description)
 
-    def fitted(edited: Description) -> LoadFit:
+    def fitted(edited: Description, kept_share: float = 1.0) -> LoadFit:
         # A wrong description may cause a wrong delay.
         log = _edit_wrench(thin, description, edited) or data.thin(edited)
-        fits = [load_fit(undelayed(log, shift)) for shift in {0.0, delay or 0.0}]
+        fits = [load_fit(undelayed(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fitted(description)
@@ -143,17 +159,10 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
         edits += _clock_edits(description, thin)
     if not given.good:
         edits = [*load_edits(description), *edits]
-    found: list[tuple[LoadFit, Finding | None, Description]] = []
-    for finding, edited in edits:
-        fit = try_edit(fitted, edited)
-        if fit is not None and fit.mass > 0:
-            found.append((fit, finding, edited))
-    # A negative mass is impossible: an equally good fit with a positive one suffices.
-    limit = (
-        given.unexplained * 1.01 if given.mass < 0 else given.unexplained / decisive_factor(given)
-    )
-    limit = min(limit, VALID_SHARE + given.noise)
-    found = [entry for entry in found if entry[0].unexplained < limit]
+    found = _better_edits(fitted, given, edits)
+    if not found and not given.good and not log.static:  # contact may hide what fits
+        without_contact = partial(fitted, kept_share=_FREE_SHARE)
+        found = _better_edits(without_contact, without_contact(description), edits)
     if not found and given.good:
         return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
@@ -170,6 +179,30 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
     message = "; just as possible: ".join([finding.message, *others.values()])
     first = Finding(finding.name, message, finding.fields)
     return [first, *lag_finding(description, delay)], delay
+
+
+def _better_edits(
+    fitted: Callable[[Description], LoadFit],
+    given: LoadFit,
+    edits: list[tuple[Finding | None, Description]],
+) -> list[tuple[LoadFit, Finding | None, Description]]:
+    """Return the edits with which a load of positive mass explains the wrench far better.
+
+    If there is none, each is tried with the opposite sign of the wrench.
+    """
+    positive, negative = [], []
+    for finding, edited in edits:
+        fit = try_edit(fitted, edited)
+        if fit is not None and fit.mass > 0:
+            positive.append((fit, finding, edited))
+        elif fit is not None and finding is not None and finding.name not in _ALREADY_SIGNED:
+            both = with_opposite_sign(finding, edited)
+            negative.append((replace(fit, mass=-fit.mass), *both))
+    # A negative mass is impossible: an equally good fit with a positive one suffices.
+    valid, decisive = VALID_SHARE + given.noise, given.unexplained / decisive_factor(given)
+    limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
+    found = [entry for entry in positive if entry[0].unexplained < limit]
+    return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
 
 
 def _is_delay_significant(log: Log, delay: float | None) -> bool:

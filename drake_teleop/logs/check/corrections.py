@@ -121,6 +121,15 @@ def pose_edits(description: Description) -> Iterator[Edit]:
         yield _edit(description, "degrees", text, {f"{where}.unit": unit})
 
 
+def with_opposite_sign(finding: Finding, description: Description) -> Edit:
+    """Return an edit that also inverts the sign of the wrench."""
+    stream = "static" if description.static else "wrench"
+    path, sign = f"{stream}.sign", -getattr(description, stream).sign
+    text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"
+    changed = edit_field(description, path, sign)
+    return Finding(finding.name, text, finding.fields | {path: sign}), changed
+
+
 def try_edit(function: Callable[[Description], Any], edited: Description) -> Any:
     """Return `function(edited)`, or None if the edited description cannot be read."""
     try:

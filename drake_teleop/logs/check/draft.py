@@ -326,8 +326,12 @@ def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Colum
             words, unit = plain[name]
             whole = _Columns([name], unit)
             fits = _width(table, whole) == width
-            if kind not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
-                found[kind] = whole
+            form = kind
+            if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
+                words = words[:-5]
+                form = "quaternion_xyzw" if plain[name][0].endswith("xyzw") else kind
+            if form not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
+                found[form] = whole
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
         for kind, places in _HOMOGENEOUS.items():
             found[kind] = _Columns([f"{name}[{k}]" for k in places], "")
