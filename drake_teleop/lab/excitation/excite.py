@@ -177,7 +177,7 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
         last[iterate.start] = iterate.value
         for factor in _SHRINK_FACTORS:
             trajectory = iterate.trajectory.scaled(factor)
-            if _largest_use(robot, trajectory) <= 1:
+            if _largest_uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 checks += 1
                 break
@@ -197,11 +197,14 @@ def _small_motions(
     for factor in _SMALL_FACTORS:
         for motion in motions:
             small = replace(motion.scaled(factor), q0=robot.home)
-            if _largest_use(robot, small) <= 1:
+            if (
+                _largest_uses(robot, small)[:-1].max() <= 1
+            ):  # `check_trajectory` measures true clearance
                 yield small
 
 
-def _largest_use(robot: Robot, trajectory: FourierTrajectory) -> float:
+def _largest_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
+    """Return the largest use of each of `LIMITS` at 1 kHz; its clearance is that of capsules."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
     write_link_motions(robot.arm.table, *joints, motions)
@@ -210,4 +213,4 @@ def _largest_use(robot: Robot, trajectory: FourierTrajectory) -> float:
     write_limit_uses(
         robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients
     )
-    return float(largest.max())
+    return largest
