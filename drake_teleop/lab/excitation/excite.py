@@ -197,9 +197,8 @@ def _small_motions(
     for factor in _SMALL_FACTORS:
         for motion in motions:
             small = replace(motion.scaled(factor), q0=robot.home)
-            if (
-                _largest_uses(robot, small)[:-1].max() <= 1
-            ):  # `check_trajectory` measures true clearance
+            # `check_trajectory` measures the true clearance.
+            if _largest_uses(robot, small)[:-1].max() <= 1:
                 yield small
 
 
