@@ -38,6 +38,7 @@ RUNS = {
     "literature_peg": "benchmarks/literature.py --only peg --json FILE",
     "live": "benchmarks/live.py --json FILE",
     "live_slices": "benchmarks/live.py --slices --seconds 3 --json FILE",
+    "formats": "benchmarks/formats.py --json FILE",
     "load_change": "benchmarks/load_change.py --json FILE",
     "mujoco_wrench": "benchmarks/mujoco_wrench.py --json FILE",
     "peers": "benchmarks/peers.py --json FILE",
@@ -320,6 +321,18 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *("three motions, poses or IMU, 600 records", "logs.md", "planted_causes_good"),
         lambda f: sum(f["figures"]["all"][x] for x in OUTCOMES[1:]),
         *("", 0.0, 0.0),
+    ),
+    Claim(
+        *(LOGS, "Two commands lead from a file to the mass and the contact force"),
+        "18 formats; largest error of the mass, after the words of YAML that the page states",
+        *("log-description.md", "formats"),
+        lambda f: max(abs(row.get("mass_error_%", math.inf)) for row in f["rows"]),
+        *("%", 0.0, 1.0),
+    ),
+    Claim(
+        *(LOGS, "and a contact force close to the sensor's noise"),
+        *("the same; largest rms error over the noise of a channel", "log-description.md"),
+        *("formats", lambda f: max(row["contact_rms_N"] for row in f["rows"]) / 0.08, "", 0.0, 1.2),
     ),
     Claim(
         *(LOGS, "Planted faults of episodes of a dataset are named"),

@@ -1,7 +1,7 @@
 """How much does a user type from a file of each usual format to the mass and the contact force?
 
-`python benchmarks/formats.py [--only PATTERN] [--seeds 1] [--json FILE] [--page FILE]` writes the
-same recording, 30 s at 100 Hz with two pushes, as 17 programs write it: their names, units, axes
+`python benchmarks/formats.py [--only PATTERN] [--seeds 1] [--json FILE]` writes the
+same recording, 30 s at 100 Hz with two pushes, as 18 programs write it: their names, units, axes
 and files. `inspect` drafts a description, and `detect` of that draft, with the words of YAML that
 the row states, gives the load and the contact force. Errors are against the truth: of the mass, and
 the rms of the contact force over that of the noise.
@@ -90,7 +90,7 @@ def _plotjuggler(r: Recording, folder: Path) -> Files:
 
 
 def _ur(r: Recording, folder: Path) -> Files:
-    """Rotation vector; the robot's force in the base, which the load exerts on the sensor."""
+    """Rotation vector; the wrench of the sensor, `ft_raw_wrench`."""
     names = ["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))]
     names += [f"ft_raw_wrench_{k}" for k in range(6)]
     rotvec = r.rotation.as_rotvec()
@@ -141,7 +141,7 @@ def _german(r: Recording, folder: Path) -> Files:
 
 
 def _tum(r: Recording, folder: Path) -> Files:
-    """A trajectory `timestamp tx ty tz qx qy qz qw` without header, and a table of the sensor."""
+    """A trajectory `timestamp tx ty tz qx qy qz qw`, and a table of the sensor."""
     pose = r.columns("timestamp tx ty tz qx qy qz qw", r.position, r.xyzw)
     pose.write_csv(folder / "pose.csv")
     r.columns("timestamp fx fy fz tx ty tz", r.wrench).write_csv(folder / "ft.csv")
@@ -202,7 +202,7 @@ def _json(r: Recording, folder: Path) -> Files:
 
 
 def _hdf5(r: Recording, folder: Path) -> Files:
-    """Arrays `obs/...` of one demonstration."""
+    """Arrays `obs/...` of one demonstration; quaternions without an order."""
     import h5py
 
     with h5py.File(folder / "demo.hdf5", "w") as file:
@@ -290,7 +290,11 @@ class Format:
     edits: tuple[tuple[str, str], ...] = ()
 
 
-_SCALES = (("scale: FILL IN", "scale: 1e-4"), ("scale: FILL IN", "scale: 1e-5"))
+_SCALES = (
+    ("scale: FILL IN", "scale: 1e-4"),
+    ("scale: FILL IN", "scale: 1e-5"),
+    ("sign: 1", "sign: -1"),
+)
 FORMATS = (
     Format("PlotJuggler, CSV of two topics", _plotjuggler),
     Format("UR, CSV of RTDE", _ur),
