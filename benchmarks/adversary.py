@@ -48,7 +48,7 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     OneDof,
     OneDofRun,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -262,7 +262,7 @@ def known(names: tuple[str, ...]) -> dict[str, dict[str, list[float]]]:
     hand[9000:] = 0.0
     steady = NetworkConfig(delay=0.05)
     bursts = NetworkConfig(delay=0.05, jitter=0.2, distribution="gamma", loss=0.3, burst=0.08)
-    usual = operators_intent()
+    usual = operator_intent()
     times = PERIOD * np.arange(len(usual), dtype=np.float64)
 
     def outages(seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

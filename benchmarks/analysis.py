@@ -44,7 +44,7 @@ from drake_teleop.lab.analysis.period_map import (
     RECEIVED,
     SAMPLE,
     Sampling,
-    cut_map,
+    cut_period_map,
     delay_steps,
     sampled_two_port,
 )
@@ -231,7 +231,7 @@ def continuous_margin(axis: OneAxis) -> float:
     omega = np.geomspace(0.1, 1e3, 200_000)
     s = 1j * omega
     wall, device = environment_impedance(axis, s), device_impedance(axis, s)
-    felt = two_port.transmitted_impedance(two_port.hybrid(axis, s), wall) - device
+    felt = two_port.transmitted_impedance(two_port.hybrid_matrix(axis, s), wall) - device
     loop = -felt / (hand_impedance(axis, s) + device)
     crossed = np.diff(np.abs(loop) > 1)
     lags = np.angle(loop[1:][crossed]) % (2 * np.pi) / omega[1:][crossed]
@@ -240,7 +240,7 @@ def continuous_margin(axis: OneAxis) -> float:
 
 def grows(axis: OneAxis, sampling: Sampling) -> bool:
     """Whether an eigenvalue of the closed loop with its registers is outside the unit circle."""
-    M, registers = cut_map(axis, sampling), 2 * delay_steps(axis, sampling)
+    M, registers = cut_period_map(axis, sampling), 2 * delay_steps(axis, sampling)
     n = len(M) - 3
     closed = np.diag(np.ones(n + registers - 1), -1)
     closed[: n + 1] = 0.0
@@ -320,20 +320,20 @@ def seconds(call: Callable[[], Any], rounds: int) -> float:
 def analyse(axis: OneAxis, omega: Array) -> None:
     """One axis: absolute stability, passivity, bounded loads, margins, transparency, sampled."""
     s = 1j * omega
-    H = two_port.hybrid(axis, s)
+    H = two_port.hybrid_matrix(axis, s)
     wall = environment_impedance(axis, s)
     felt = two_port.transmitted_impedance(H, wall)
-    transparency.is_noticed(felt, transparency.ideal_impedance(axis, s, wall))
-    transparency.apparent(felt, omega)
-    transparency.transmitted_width(H)
-    scaled = two_port.power_scaled(H, two_port.power_ratio(axis))
-    absolute_stability.llewellyn(H)
+    transparency.is_difference_noticed(felt, transparency.ideal_impedance(axis, s, wall))
+    transparency.fit_apparent_impedance(felt, omega)
+    transparency.transmitted_z_width(H)
+    scaled = two_port.scale_slave_power(H, two_port.power_ratio(axis))
+    absolute_stability.llewellyn_criterion(H)
     absolute_stability.required_damping(H)
-    absolute_stability.raisbeck(scaled)
-    S = two_port.scattering(scaled)
+    absolute_stability.raisbeck_criterion(scaled)
+    S = two_port.scattering_matrix(scaled)
     absolute_stability.scattering_norm(S)
     absolute_stability.structured_singular_value(S)
-    hands, walls = absolute_stability.range_of_grips(), WALL_RANGE
+    hands, walls = absolute_stability.impedance_range_of_grips(), WALL_RANGE
     absolute_stability.can_oscillate(H, omega, hands, walls)
     absolute_stability.bounded_singular_value(H, omega, hands, walls)
     loop = cut_loop(axis, JR3)

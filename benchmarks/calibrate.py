@@ -38,7 +38,7 @@ from drake_teleop.load.tolerance import (
     values_of_required,
 )
 from drake_teleop.robots.calibration import Evaluation, calibrate
-from drake_teleop.robots.recording import Recorder
+from drake_teleop.robots.recording import ReadingRecorder
 from drake_teleop.robots.streams import Reading
 
 Array = NDArray[np.float64]
@@ -171,7 +171,7 @@ def study(name: str, until: str, loads: int, folder: Path) -> dict[str, float]:
         if name == "poses":
             stream, keeps = posed(rng, phi, SECONDS)
         else:
-            stream, keeps = stream_of(rng, phi, t, motion or hand(rng, t)), Recorder()
+            stream, keeps = stream_of(rng, phi, t, motion or hand(rng, t)), ReadingRecorder()
         looks = calibrate(stream, keeps, folder / keeps.file, tolerance)
         for at in looks:
             if at.found is not None:

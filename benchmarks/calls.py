@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from drake_teleop.lab.analysis.cut_loop import cut_loop, delay_margin, unstable_multipliers
+from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop, delay_margin
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
@@ -104,7 +104,7 @@ def margin_grid() -> tuple[float, float]:
 
     def margins(delay: Any, stiffness: Any) -> None:
         loop = cut_loop(OneAxis(wall_stiffness=stiffness), Sampling())
-        unstable_multipliers(loop, delay)
+        count_unstable_multipliers(loop, delay)
         delay_margin(loop)
 
     return grid(margins, np.linspace(0, 0.2, N), np.geomspace(100, 1e5, N))

@@ -26,7 +26,7 @@ import numpy as np
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.compensate import run
+from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Compensated, Reading
 from drake_teleop.robots.udp import READING, UdpSink, UdpSource, pack_reading
@@ -114,7 +114,7 @@ def measured(rate: float, seconds: float, kind: type[Compensator]) -> dict[str, 
         while not (first := timed.read(1.0)):
             pass
         clock, cpu = time.perf_counter(), time.process_time()
-        run(timed, loop, timed)
+        compensate_stream(timed, loop, timed)
         clock, cpu = time.perf_counter() - clock, time.process_time() - cpu
         sender.join()
         timed.close()

@@ -41,7 +41,7 @@ from drake_teleop.lab.identification import (
     sensor_samples,
     slave_arm,
 )
-from drake_teleop.lab.run_summary import in_contact
+from drake_teleop.lab.run_summary import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.channel.channel import Channel
@@ -90,7 +90,7 @@ def papers_contact(progress: Callable[..., None]) -> dict[str, Any]:
         scenario = detecting("contact_transition", simulation__seed=seed)
         known = identified(scenario, seed + 100)
         result = run(scenario, known)
-        touched = in_contact(result)
+        touched = is_in_contact(result)
         start = float(result.t[touched.argmax()])
         delays.append(onset(result, "contact", start))
         false += int(result["contact"][result.t < start].sum())
@@ -143,7 +143,7 @@ def arrivals(progress: Callable[..., None]) -> dict[str, Any]:
 def arrival(plain: Scenario, known: Known, line: Any, delay: float) -> dict[str, Any]:
     channel = Channel(**dataclasses.asdict(line), timeout=0.2)
     result = run(replace(plain, channel=channel, simulation__duration=0.8 + 2.0 * delay), known)
-    touched = in_contact(result)
+    touched = is_in_contact(result)
     start = float(result.t[touched.argmax()])
     slave, hand = (onset(result, x, start) for x in ("contact", "contact_at_hand"))
     return {

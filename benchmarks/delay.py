@@ -24,10 +24,10 @@ import numpy as np
 
 from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
-    Figures,
+    RunMeasures,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -69,11 +69,11 @@ class Row:
     least_energy: float
 
 
-def _run(method: str, wall: float, network: NetworkConfig, seed: int, task: Task) -> Figures:
+def _run(method: str, wall: float, network: NetworkConfig, seed: int, task: Task) -> RunMeasures:
     model = dataclasses.replace(REFERENCE, wall_stiffness=wall)
-    intent = operators_intent(task)
+    intent = operator_intent(task)
     run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed, intent=intent)
-    return figures(run, model, task)
+    return figures_of_run(run, model, task)
 
 
 def row(method: str, wall: float, round_trip: float, seeds: int) -> Row:

@@ -33,7 +33,7 @@ from drake_teleop.live.device_packets import DeviceState, pack_state, unpack_sta
 from drake_teleop.live.haply import read_message
 from drake_teleop.live.live import Live
 from drake_teleop.live.pace import without_garbage_collection
-from drake_teleop.live.scenarios import live_scenario, with_device
+from drake_teleop.live.scenarios import live_scenario, with_task_space_device
 from drake_teleop.live.session import Session
 from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.environment.solids import Wall
@@ -67,14 +67,16 @@ def linked(seconds: float) -> tuple[dict[str, float], np.ndarray]:
         number = -1
         while device.poll() is None:
             began, cpu = time.perf_counter(), time.thread_time()
-            state = link.poll(began)
+            state = link.receive_state(began)
             if state is None or state.number == number:
                 time.sleep(5e-5)
                 continue
             if number < 0:
                 start, waited_before = began, waited()
             number = state.number
-            link.send(np.array([0.0, 0.0, max(-WALL * state.position[2], 0.0), 0.0, 0.0, 0.0]))
+            link.send_wrench(
+                np.array([0.0, 0.0, max(-WALL * state.position[2], 0.0), 0.0, 0.0, 0.0])
+            )
             spent.append((time.perf_counter() - began, time.thread_time() - cpu))
             behind.append(state.behind)
         lasted = time.perf_counter() - start
@@ -106,7 +108,7 @@ def silent() -> dict[str, float]:
         for k in range(300):
             x = x + random.normal(0.0, 1e-4, 3)
             age = _TICK * max(k - 150, 0)
-            force = guard.tick(x, wrench, age, _TICK)
+            force = guard.limit_wrench(x, wrench, age, _TICK)
             if age >= 0.05:
                 largest = max(largest, float(np.abs(force).max()))
     return {"silent_50_ms_largest_n": largest}
@@ -128,8 +130,8 @@ def pressed(stiffness: float, grip: str, late: np.ndarray, *, observe: bool) -> 
         heights.append(virtual.position[2])
         newest = max(newest, len(heights) - 1 - int(late[k % len(late)]))  # never an older one
         push = max(-stiffness * heights[newest], 0.0)
-        force = guard.tick(virtual.position, (0.0, 0.0, push, 0.0, 0.0, 0.0), 0.0, _TICK)
-        virtual.move(force[:3], _TICK)
+        force = guard.limit_wrench(virtual.position, (0.0, 0.0, push, 0.0, 0.0, 0.0), 0.0, _TICK)
+        virtual.simulate_motion(force[:3], _TICK)
         least = min(least, virtual.energy)
         if 0.65 < (0.5 * _TICK * k) % 1.0 < 0.8 and k > 2000:
             resting.append(virtual.position[2])
@@ -156,7 +158,7 @@ def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
     The wall and the tool's ball make 6 kN/m at the hand, if the arm were rigid.
     """
     ball, scale = 4e5, 1 / 17.5
-    scenario = live_scenario(with_device(LoadScenario("contact_transition")))
+    scenario = live_scenario(with_task_space_device(LoadScenario("contact_transition")))
     felt = WALL / (scale * scenario.kinematic_scaling.translation_scale)
     wall = Wall(position=[0.55, 0.0, 0.247], stiffness=1 / (1 / felt - 1 / ball))
     scenario = replace(
@@ -169,14 +171,14 @@ def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
     wrench, least, resting = np.zeros(6), 0.0, []
     for k in range(800):
         place = {"z": 1e5 * (virtual.position[2] - start), "held": 1, "clutch": 1}
-        session.apply(session.inputs.changed(place))
+        session.apply_inputs(session.inputs.with_changes(place))
         session.advance(2)
         session.new_rows()
         for _ in range(2):
-            force = guard.tick(virtual.position, tuple(wrench), 2e-3, _TICK)
-            virtual.move(force[:3], _TICK)
+            force = guard.limit_wrench(virtual.position, tuple(wrench), 2e-3, _TICK)
+            virtual.simulate_motion(force[:3], _TICK)
             least = min(least, virtual.energy)
-        wrench = session.force()
+        wrench = session.device_wrench()
         if k > 700:
             resting.append(virtual.position[2])
     return least, float(np.ptp(resting))
@@ -210,24 +212,24 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
 
 def driven(seconds: float) -> dict[str, float]:
     """The whole station under the device, in real time, without a page."""
-    scenario = live_scenario(with_device(LoadScenario("contact_transition")))
+    scenario = live_scenario(with_task_space_device(LoadScenario("contact_transition")))
     load, clock = identified_load(scenario), time.perf_counter
     link = DeviceLink("udp://127.0.0.1:0")
     live = Live(scenario, load, None, lambda rows: {}, clock(), link)
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "device.json"
         device = client(link.port, seconds + 2.0, told, "--depth", "0.075", "--grip", "medium")
-        while live.is_idle or link.silent(clock()):  # until it has begun
+        while live.is_idle or link.is_silent(clock()):  # until it has begun
             live.tick(clock)
             time.sleep(1e-3)
         live.join(1, clock())
         end, lost, late = clock() + seconds, live.pace.given_up, []
         while clock() < end:
-            if live.pace.wait(clock()) <= 0:
-                late.append(-live.pace.wait(clock()))
+            if live.pace.time_to_next_slice(clock()) <= 0:
+                late.append(-live.pace.time_to_next_slice(clock()))
             live.tick(clock)
             time.sleep(live.wait(clock()))
-        figures = link.figures(clock())
+        figures = link.link_statistics(clock())
         device.wait()
         found = json.loads(told.read_text())
         lost = live.pace.given_up - lost

@@ -24,8 +24,8 @@ import numpy as np
 from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -54,9 +54,9 @@ def hold(case: tuple[str, str, float, float]) -> dict[str, float]:
     )
     run = run_one_dof(
         model, PassivityConfig(method=method), NetworkConfig(delay=round_trip / 2), timeout=1.0,
-        intent=operators_intent(task),
+        intent=operator_intent(task),
     )  # fmt: skip
-    found = figures(run, model, task)
+    found = figures_of_run(run, model, task)
     # The hand's spring, the wall's and the servo's, one behind the other.
     felt = model.force_scale / (1.0 / wall + 1.0 / model.servo_stiffness)
     undelayed = DEPTH / (1.0 / stiffness + 1.0 / felt)

@@ -24,10 +24,15 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from drake_teleop.lab.excitation.check import check
+from drake_teleop.lab.excitation.check import check_trajectory
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
-from drake_teleop.lab.excitation.excite import best_checked, criteria_of, excite, sensor_motion
-from drake_teleop.lab.excitation.optimizer import MARGIN, Problem, Task, design
+from drake_teleop.lab.excitation.excite import (
+    criterion_values,
+    excite,
+    find_best_within_limits,
+    sensor_motion,
+)
+from drake_teleop.lab.excitation.optimizer import MARGIN, Problem, Task, minimise_criterion
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
@@ -63,12 +68,14 @@ def speed(robot: Robot, row: tuple[str, float, float, float], seeds: int) -> dic
     task = task_of(robot, criterion, period)
     values: dict[str, list[float]] = {"soon": [], "later": []}
     for seed in range(seeds):
-        found = design(Problem(task), seed=seed, seconds=later)
+        found = minimise_criterion(Problem(task), seed=seed, seconds=later)
         for name, seconds in (("soon", soon), ("later", later)):
-            trajectory, _ = best_checked(robot, [it for it in found if it.seconds <= seconds])
-            values[name].append(criteria_of(robot, trajectory)[criterion])
+            trajectory, _ = find_best_within_limits(
+                robot, [it for it in found if it.seconds <= seconds]
+            )
+            values[name].append(criterion_values(robot, trajectory)[criterion])
     start = time.thread_time()
-    check(robot, trajectory)
+    check_trajectory(robot, trajectory)
     values["check_s"] = [time.thread_time() - start]
     return {"criterion": criterion, "period": period, "soon_s": soon, "later_s": later} | values
 

@@ -34,15 +34,15 @@ from drake_teleop.lab.analysis.analyze import (
     DIRECTIONS,
     close_all_loops,
     close_other_directions,
-    sampling_of,
+    sampling_of_scenario,
 )
 from drake_teleop.lab.analysis.cut_loop import cut_loop, dominant_multiplier
-from drake_teleop.lab.analysis.figures import OMEGA, bounded_figures, with_grip
+from drake_teleop.lab.analysis.figures import OMEGA, axis_with_grip, bounded_figures
 from drake_teleop.lab.analysis.linearization import Linearization, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
-from drake_teleop.lab.analysis.two_port import absorb
+from drake_teleop.lab.analysis.two_port import absorb_impedances
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
@@ -101,13 +101,13 @@ def station_of(arm: str, models: Path | None) -> Scenario:
 
 def figures(scenario: Scenario) -> dict[str, Any]:
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
-    along, sampling = task_direction(scenario, DIRECTIONS["z"]), sampling_of(scenario)
+    along, sampling = task_direction(scenario, DIRECTIONS["z"]), sampling_of_scenario(scenario)
     free = linearize(scenario, load_estimate=estimate)
     with_hand = hybrid_along(
         close_other_directions(free, scenario, along), OMEGA, along.hand, along.tool
     )
     axis = along.axis
-    H = absorb(with_hand, hand=-1j * OMEGA * axis.hand_mass)
+    H = absorb_impedances(with_hand, hand=-1j * OMEGA * axis.hand_mass)
     limits = bounded_figures(H, axis, sampling)["each"]
     return {
         "joints": slave_arm(scenario).num_joints,
@@ -116,7 +116,7 @@ def figures(scenario: Scenario) -> dict[str, Any]:
         "motion later over earlier, and as predicted": {
             f"{grip}, {share:g} of it": (
                 pressed(scenario, grip, limit, share),
-                predicted(with_grip(axis, grip), limit, share, sampling),
+                predicted(axis_with_grip(axis, grip), limit, share, sampling),
             )
             for grip, limit in limits.items()
             for share in (0.9, 1.1)

@@ -24,7 +24,7 @@ from drake_teleop.lab.analysis.frequency_response import (
     StationResponse,
     measure_frequency_response,
 )
-from drake_teleop.lab.analysis.linearization import delays, linearize_station
+from drake_teleop.lab.analysis.linearization import linearize_station, network_delay_periods
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
 from drake_teleop.lab.identification import slave_arm
@@ -84,7 +84,7 @@ def predict_frequency_response(
         row = system.outputs.index(f"{port}.x")
         return (pushed[:, row : row + 6] @ direction)[None]
 
-    _, backward = delays(scenario)
+    _, backward = network_delay_periods(scenario)
     delay_factor = np.exp(-1j * np.asarray(omega) * system.dt * backward)
     spectra = {
         # Unit force in place of the intent, plus the operator's reaction.

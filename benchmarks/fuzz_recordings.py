@@ -34,10 +34,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
-from drake_teleop.live.inputs import INPUTS, Inputs, read_inputs
+from drake_teleop.live.inputs import INPUTS_FILE, Inputs, read_inputs
 from drake_teleop.live.record import Record, versions_and_digest
 from drake_teleop.robots import lines
-from drake_teleop.robots.recording import Recorder
+from drake_teleop.robots.recording import ReadingRecorder
 from drake_teleop.robots.streams import Compensated, Reading
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
@@ -228,7 +228,7 @@ def recorded(path: Path) -> None:
     """The longest run of readings on one clock is kept, but for a second at its start."""
     parts, step = _fields(path, parts=_STAMPS[0], step=5e-3)
     step = min(max(abs(step), 1e-4), 0.9) if np.isfinite(step) else 5e-3
-    recorder, longest = Recorder(), 0.0
+    recorder, longest = ReadingRecorder(), 0.0
     for k, part in enumerate(parts):
         start, count = (part if isinstance(part, list) and len(part) == 2 else (0.0, 1))[:2]
         start = start if isinstance(start, (int, float)) else float("nan")
@@ -237,8 +237,8 @@ def recorded(path: Path) -> None:
             recorder.add(Reading(k, float(t), np.ones(15)))
         if count >= 50 and abs(start) < 1e9:
             longest = max(longest, (count - 1) * step)
-    if recorder.seconds < longest - 1.0 - 50 * step:
-        raise AssertionError(f"{recorder.seconds} s are kept of {longest} s")
+    if recorder.longest_part_s < longest - 1.0 - 50 * step:
+        raise AssertionError(f"{recorder.longest_part_s} s are kept of {longest} s")
 
 
 sizes = json_seeds(*({"room": 10**6, "rows": 90, "name": name} for name in ("x.csv", "x.parquet")))
@@ -303,16 +303,16 @@ def killed(path: Path) -> None:
             for ms in range(10**6):
                 record.write(ms, Inputs(x=ms % 1000))
         os._exit(0)
-    while not (folder / INPUTS).exists() and not os.waitpid(child, os.WNOHANG)[0]:
+    while not (folder / INPUTS_FILE).exists() and not os.waitpid(child, os.WNOHANG)[0]:
         time.sleep(1e-4)
     time.sleep(1e-6 * min(abs(microseconds), 30_000))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    text = (folder / INPUTS).read_text()
+    text = (folder / INPUTS_FILE).read_text()
     if text.count("\n") < 4:
         return
     changes = read_inputs(
-        folder / INPUTS, versions_and_digest(LoadScenario(folder / "scenario.yaml"))
+        folder / INPUTS_FILE, versions_and_digest(LoadScenario(folder / "scenario.yaml"))
     )
     expected = [(0, 0), *((ms, ms % 1000) for ms in range(1, len(changes)))]
     if [(ms, inputs.x) for ms, inputs in changes] != expected:

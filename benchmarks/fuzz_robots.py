@@ -17,8 +17,8 @@ from drake_teleop.robots.assembly import Assembly, Parts
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD, NetFtSource
 from drake_teleop.robots.ros2_messages import KINDS
-from drake_teleop.robots.ros2_zenoh import Messages, attachment, message_types
-from drake_teleop.robots.rtde import parts_of
+from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
+from drake_teleop.robots.rtde import parts_of_sample
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import IMU, JOINTS, NONZERO_FLAGS, POSE, WRENCH, Part, Reading
 
@@ -70,7 +70,7 @@ def _message(name: str, k: int) -> bytes:
         message = kinds["TFMessage"]([link])
     else:
         message = store.types[KINDS[name]](header, *data[name]())
-    return bytes(store.serialize_cdr(message, KINDS[name])) + attachment(k, ns, b"x" * 16)
+    return bytes(store.serialize_cdr(message, KINDS[name])) + make_attachment(k, ns, b"x" * 16)
 
 
 class _Told:
@@ -94,7 +94,7 @@ def netft_wrenches(path: Path) -> None:
     def parts() -> Iterator[Part]:
         for k, packet in enumerate(_pieces(path.read_bytes(), RECORD.size)):
             yield Part(IMU, k, DT * k, still)
-            yield source.part(packet, DT * k)
+            yield source.part_of_packet(packet, DT * k)
 
     _checked(Assembly(Parts(_Told(WRENCH), _Told(IMU))), parts())
     source._socket.close()
@@ -103,12 +103,12 @@ def netft_wrenches(path: Path) -> None:
 def rtde_wrenches(path: Path) -> None:
     """Samples of RTDE."""
     whole = [each for each in _pieces(path.read_bytes(), SAMPLE.size) if len(each) == SAMPLE.size]
-    parts = (part for each in whole for part in parts_of(SAMPLE.unpack(each), DT, -1.0))
+    parts = (part for each in whole for part in parts_of_sample(SAMPLE.unpack(each), DT, -1.0))
     _checked(Assembly(Parts(_Told(WRENCH, POSE))), parts)
 
 
 _SIZES = {name: len(_message(name, 0)) for name in KINDS}
-_MESSAGES = Messages(-1.0, _FRAMES, _JOINTS)
+_MESSAGES = CdrConverter(-1.0, _FRAMES, _JOINTS)
 
 
 def ros_wrenches(path: Path) -> None:
@@ -128,7 +128,7 @@ def _pieces(content: bytes, size: int) -> list[bytes]:
 def _checked(assembly: Assembly, parts: Iterator[Part]) -> None:
     compensator = Compensator(LOAD, DT, gamma=2.0, largest=np.full(6, RANGE))
     for k, part in enumerate(parts):
-        found: list[Reading] = assembly.take(part, DT * k / 3)
+        found: list[Reading] = assembly.complete_readings(part, DT * k / 3)
         for reading in found:
             out = compensator.step(reading, DT * k / 3)
             numbers = np.array([out.t, *out.contact, *out.scaled])

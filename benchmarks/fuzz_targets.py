@@ -513,12 +513,12 @@ def _message(path: Path) -> None:
     content = path.read_bytes()
     said = [parse_message(text) for text in (content, content.decode(errors="replace"))]
     for found in filter(None, said):
-        inputs = Inputs().changed(found.get("set", {}))
+        inputs = Inputs().with_changes(found.get("set", {}))
         for name in RANGES:
             value, (low, high) = getattr(inputs, name), range_of(name)
             if not (isinstance(value, int) and low <= value <= high):
                 raise AssertionError(f"{name} = {value!r}")
-        pose = inputs.changed({"held": 1}).pose(np.zeros(3))
+        pose = inputs.with_changes({"held": 1}).intended_pose(np.zeros(3))
         if not 1.0 <= found.get("slow", 1.0) <= MAX_SLOWDOWN or not np.isfinite(pose).all():
             raise AssertionError(f"{found!r}")
 
@@ -610,7 +610,7 @@ def _command_line(path: Path) -> None:
     said = io.StringIO()
     words = [word.replace("\0", "") for word in json.loads(path.read_bytes())]
     with contextlib.redirect_stderr(said):
-        status = cli._run(words)
+        status = cli._run_with_exit_status(words)
     line = said.getvalue().rstrip("\n")
     refused = line.startswith("error: ") and len(line) <= LONGEST_LINE and "\n" not in line
     if refused:

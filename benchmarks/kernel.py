@@ -88,7 +88,7 @@ def readings(count: int, seed: int = 0) -> Array:
 
 def compensated(rows: Array) -> Array:
     """Outputs (N, 13) of `compensate`: contact wrench, scaled wrench, flags."""
-    loop, out = TARGET.loop(**SCALES), np.empty((len(rows), 13))
+    loop, out = TARGET.make_compensator(**SCALES), np.empty((len(rows), 13))
     for k, row in enumerate(rows):
         one = loop.step(Reading(k, DT * k, row[:15], gravity=row[15:]), DT * k)
         out[k, :6], out[k, 6:12], out[k, 12] = one.contact, one.scaled, one.flags
@@ -142,7 +142,7 @@ def python_loop(rows, largest, limits, offsets, phi, nothing, scales, low_pass, 
 
 def python_ns(rows: Array) -> float:
     """ns per reading of the compiled Python kernel: best of three."""
-    s = TARGET.loop().settings
+    s = TARGET.make_compensator().settings
     scales = np.array([1.2, 1.2, 1.3, -0.9])
     best = np.inf
     for _ in range(4):

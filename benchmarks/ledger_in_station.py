@@ -34,7 +34,11 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from drake_teleop.lab.comparison.compare_passivity import station_base
-from drake_teleop.lab.comparison.delayed_contact import LEAVES, delayed_contact, station_figures
+from drake_teleop.lab.comparison.delayed_contact import (
+    LEAF_SPRINGS,
+    delayed_contact,
+    station_figures,
+)
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, MOTOR
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import true_load
@@ -180,7 +184,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--network", nargs="+", choices=NETWORKS, default=list(NETWORKS))
-    parser.add_argument("--leaf", nargs="+", choices=list(LEAVES), default=list(LEAVES))
+    parser.add_argument("--leaf", nargs="+", choices=list(LEAF_SPRINGS), default=list(LEAF_SPRINGS))
     parser.add_argument("--grip", nargs="+", choices=GRIPS, default=list(GRIPS))
     parser.add_argument("--sigma", nargs="+", type=float, default=list(SIGMAS))
     parser.add_argument("--seed", type=int, default=0, help="of sensor and networks")

@@ -37,13 +37,13 @@ from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.lab.reproduction.experiments import contact_motion, contact_values
+from drake_teleop.lab.reproduction.experiments import contact_values, simulate_contact
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
@@ -85,7 +85,7 @@ def detection() -> dict[str, Any]:
     """Delays from the touch [ms]."""
     scenario = replace(LoadScenario("contact_transition"), rates__log_hz=2000.0)
     estimate = identified_load(scenario, False).estimate
-    run = contact_motion(scenario, estimate, lambda name: lambda done, words="": None)
+    run = simulate_contact(scenario, estimate, lambda name: lambda done, words="": None)
     values, arm = contact_values(run), slave_arm(scenario)
     touched, free = (np.abs(residual(x, arm)) for x in (run.touched, run.free))
     start = run.touched.t[np.argmax(run.contact)]
@@ -125,9 +125,9 @@ def architectures() -> dict[str, Any]:
             PassivityConfig(method=method),
             NetworkConfig(delay=trip / 2, loss=loss),
             timeout=2.0,
-            intent=operators_intent(task),
+            intent=operator_intent(task),
         )
-        of = figures(run, model, task)
+        of = figures_of_run(run, model, task)
         swing = (run.t > task.swing) & (run.t < task.swung)
         apart = np.sqrt(np.mean((run.master - run.slave)[swing] ** 2))
         error = 100.0 * abs(of.force_error) if of.stable else np.inf

@@ -65,8 +65,8 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         if now >= next_message:
             next_message += FRAME_PERIOD_S
             live.handle_message(1, json.dumps({"set": wanted(now - start)}), now)
-        if not live.is_idle and live.pace.wait(now) <= 0:
-            late.append(-live.pace.wait(now))
+        if not live.is_idle and live.pace.time_to_next_slice(now) <= 0:
+            late.append(-live.pace.time_to_next_slice(now))
         frame = live.tick(clock)
         if frame is not None:
             bytes_sent += len(json.dumps({"frame": frame}))
@@ -112,11 +112,11 @@ def slices(seconds: float) -> dict[str, float]:
 
 def spent(session: Session, choice: dict[str, int], seconds: float) -> list[float]:
     """CPU time of each slice [ms] after the first second."""
-    session.apply(session.inputs.changed(choice))
+    session.apply_inputs(session.inputs.with_changes(choice))
     taken = []
     while session.ms < 1e3 * (1.0 + seconds):
         start = time.thread_time()
-        session.apply(session.inputs.changed(wanted(1e-3 * session.ms)))
+        session.apply_inputs(session.inputs.with_changes(wanted(1e-3 * session.ms)))
         session.advance()
         taken.append(1e3 * (time.thread_time() - start))
         session.new_rows()  # a page asks for them, too

@@ -40,10 +40,10 @@ class Driven:
 
     def go(self, seconds: float, **changes: int) -> None:
         """Goes on for so long, with changed inputs."""
-        self.inputs, self.rows = self.inputs.changed(changes), []
+        self.inputs, self.rows = self.inputs.with_changes(changes), []
         end = self.session.ms + round(1e3 * seconds)
         while self.session.ms < end:
-            self.session.apply(self.inputs)
+            self.session.apply_inputs(self.inputs)
             self.session.advance()
             self.rows.append(self.session.new_rows())
 
@@ -81,7 +81,7 @@ class Driven:
 
 def measured(driven: Driven, z: int, network: int, method: int) -> dict[str, float]:
     """Figures of one network and method."""
-    still = driven.inputs.changed({"network": network, "method": method})
+    still = driven.inputs.with_changes({"network": network, "method": method})
     fills = channel_fill_time(chosen_scenario(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
     driven.go(0.8 + fills, z=z)  # at rest, with nothing on its way

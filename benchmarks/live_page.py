@@ -99,7 +99,7 @@ def way(speed: float = 0.12) -> float:
     R_WS, start, place = np.empty((3, 3)), np.full(3, np.nan), np.empty(3)
     while True:
         ahead = LEAD_TIME_S + 1e-3 * (session.ms - 1000)
-        session.apply(session.inputs.changed({"z": 1e5 * speed * ahead}))
+        session.apply_inputs(session.inputs.with_changes({"z": 1e5 * speed * ahead}))
         session.advance(1)
         q = session.new_rows()["slave_state"][-1, : table.shape[0] - 1]
         forward_kinematics(table, q, R_WS, place)

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from drake_teleop.lab.identification import (
-    batch_identification,
+    identify_by_batch,
     identify_load,
     sensor_samples,
     slave_arm,
@@ -140,7 +140,7 @@ def least_squares(scenario: Scenario, *samples: Array) -> Identification:
 
 
 def total_least_squares(scenario: Scenario, *samples: Array) -> Identification:
-    return batch_identification(scenario, *samples, rate_hz=RATE / EVERY)
+    return identify_by_batch(scenario, *samples, rate_hz=RATE / EVERY)
 
 
 ESTIMATORS: dict[str, Callable[..., Identification]] = {

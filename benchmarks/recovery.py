@@ -28,7 +28,7 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     OneDofRun,
     Task,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -110,7 +110,7 @@ def rough_line(path: Path, rng: np.random.Generator) -> NetworkConfig:
 
 def _some_networks(job: tuple[int, int]) -> list[Row]:
     """Every method over the networks first..last-1."""
-    rows, intent = [Row(method) for method in METHODS], operators_intent(TASK)
+    rows, intent = [Row(method) for method in METHODS], operator_intent(TASK)
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{way}.csv" for way in range(2)]
         for seed in range(*job):

@@ -62,7 +62,7 @@ def wanted(now: Inputs, ms: int, end: int) -> Inputs:
     for begins, choices in CHOICES:
         if share >= begins:
             values |= choices
-    return now.changed(values)
+    return now.with_changes(values)
 
 
 def driven(seconds: float, folder: Path) -> None:
@@ -72,7 +72,7 @@ def driven(seconds: float, folder: Path) -> None:
     session = Session(scenario, load, log=folder / "log.parquet", record=folder)
     end = round(1e3 * seconds / SLICE_MS) * SLICE_MS
     while session.ms < end:
-        session.apply(wanted(session.inputs, session.ms, end))
+        session.apply_inputs(wanted(session.inputs, session.ms, end))
         session.advance()
         if session.ms % (3 * SLICE_MS) == 0:
             session.new_rows()

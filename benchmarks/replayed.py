@@ -32,9 +32,9 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.sample import sample_log_command
-from drake_teleop.robots.compensate import run
+from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import TARE_S, Compensator
-from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import Compensated
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
@@ -59,9 +59,9 @@ class Kept(list[Compensated]):
 
 def replayed(path: Path, load: Identification, chunk: int, mode: str) -> Kept:
     """What `compensate` makes of a log where it was measured."""
-    source, kept = LogSource(path, load, chunk=chunk), Kept()
+    source, kept = ReplayLogSource(path, load, chunk=chunk), Kept()
     late = {"wait": source.wait, "predicted": mode == "predicted"}
-    run(source, Compensator(load, source.dt, sigma=0.3, gamma=1.5, **late), kept)  # type: ignore[arg-type]
+    compensate_stream(source, Compensator(load, source.dt, sigma=0.3, gamma=1.5, **late), kept)  # type: ignore[arg-type]
     return Kept(row for row in kept if not row.flags)
 
 

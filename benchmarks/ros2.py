@@ -85,7 +85,7 @@ def peer(stack: ExitStack, *words: str, **options: Any) -> subprocess.Popen[str]
 
 def processing(folder: Path, seconds: float) -> dict[str, float]:
     """Times of one pass of the loop, and of the way to the receiver."""
-    from drake_teleop.robots.compensate import run
+    from drake_teleop.robots.compensate import compensate_stream
     from drake_teleop.robots.compensator import Compensator
     from drake_teleop.robots.connections import open_sink, open_source
     from drake_teleop.robots.ros2_messages import MessageConverter
@@ -97,14 +97,14 @@ def processing(folder: Path, seconds: float) -> dict[str, float]:
     began: list[float] = []
     writes: list[int] = []
     spent: list[list[float]] = []
-    parts_of = MessageConverter.parts_of
+    parts_of = MessageConverter.parts_of_message
 
     def noted(self: Any, name: str, data: Any, number: int) -> Any:
         if not began:
             began[:] = time.perf_counter(), time.thread_time()
         return parts_of(self, name, data, number)
 
-    MessageConverter.parts_of = noted  # type: ignore[method-assign]
+    MessageConverter.parts_of_message = noted  # type: ignore[method-assign]
     with ExitStack() as stack:
         sink = open_sink(f"ros2://contact?domain={DOMAIN}")
         source = open_source(SOURCE, load, rate_hz=ECHO_HZ)
@@ -130,7 +130,7 @@ def processing(folder: Path, seconds: float) -> dict[str, float]:
 
         sink.write, source.read = timed, until  # type: ignore[method-assign]
         compensator = Compensator(load, source.dt, wait=getattr(source, "wait", 0))
-        counts = run(source, compensator, sink)
+        counts = compensate_stream(source, compensator, sink)
         echo.kill()
         heard.seek(0)
         rows = [json.loads(line) for line in heard.read().splitlines()[:-1]]

@@ -19,9 +19,13 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from drake_teleop.lab.excitation.limits import empty_motions, motions_of, sensor_vectors
+from drake_teleop.lab.excitation.limits import (
+    empty_motions,
+    write_link_motions,
+    write_sensor_motion,
+)
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import shortest
+from drake_teleop.lab.excitation.shortest import design_shortest_motion
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
@@ -65,9 +69,9 @@ def reached(
     period = 1.0 / scenario.rates.sensor_hz
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, period))
     motions = empty_motions(*joints[0].shape)
-    motions_of(table, *joints, motions)
+    write_link_motions(table, *joints, motions)
     vectors = np.empty((3, len(motions), 3))
-    sensor_vectors(motions, vectors)
+    write_sensor_motion(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     noisy = without_parts(sensor, "calibration")
     constants, memory = sensor_chain_constants(noisy, joints[0].shape[1], period)
@@ -95,7 +99,7 @@ def main() -> None:
     scenario, tolerance = LoadScenario("identification"), read_tolerance(ASKED)
     robot, found = RobotFromScenario(scenario), []
     for seed in range(options.restarts):
-        found.append(shortest(robot, tolerance, seed=seed).excitation)
+        found.append(design_shortest_motion(robot, tolerance, seed=seed).excitation)
         print(f"seed {seed}: {found[-1].trajectory.period:.4f} s", flush=True)
     periods = np.array([each.trajectory.period for each in found])
     first = found[0].trajectory

@@ -5,12 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Sampling, cut_map, delay_steps
+from drake_teleop.lab.analysis.period_map import (
+    RECEIVED,
+    SAMPLE,
+    Sampling,
+    cut_period_map,
+    delay_steps,
+)
 
 
 def closed_map(axis: OneAxis, sampling: Sampling) -> np.ndarray:
     """Return the matrix of the closed loop over a hand period; registers delay the force."""
-    M, registers = cut_map(axis, sampling), 2 * delay_steps(axis, sampling)
+    M, registers = cut_period_map(axis, sampling), 2 * delay_steps(axis, sampling)
     n = len(M) - 3
     closed = np.zeros((n + registers, n + registers))
     closed[:n, :n] = M[:n, :n]

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.analysis.absolute_stability import (
-    range_of_grips,
+    impedance_range_of_grips,
     required_damping,
     stiffness_limit,
     worst_loads,
 )
-from drake_teleop.lab.analysis.cut_loop import cut_loop, unstable_multipliers
+from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
 from drake_teleop.lab.analysis.linearization import AXES, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
-from drake_teleop.lab.analysis.two_port import absorb, hybrid
+from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.scenario import replace as with_values
@@ -85,11 +85,13 @@ def diagrams():
         estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
         cut = linearize(scenario, load_estimate=estimate)
         others = [axis for axis in AXES if axis != "z"]
-        system = cut.close(
+        system = cut.close_loop(
             [f"operator_wrench.{axis}" for axis in others],
             [f"hand_wrench.{axis}" for axis in others],
         )
-        system = system.close("pose_command", "pose_received").close("wrench_B", "wrench_received")
+        system = system.close_loop("pose_command", "pose_received").close_loop(
+            "wrench_B", "wrench_received"
+        )
         H = hybrid_along(system, omega, along.hand, along.tool)
         low_pass = None if sensor == "ideal" else scenario.wrist_sensor.bandwidth_hz
         found[sensor] = omega, H, along.axis, Sampling(low_pass_hz=low_pass)
@@ -104,7 +106,7 @@ def test_deviations_of_the_models_from_the_diagram(diagrams):
         omega, H = omega[band], H[band]
         axis = replace(axis, device_mass=axis.device_mass + axis.hand_mass)
         other = (
-            hybrid(axis, 1j * omega)
+            hybrid_matrix(axis, 1j * omega)
             if model == "closed form"
             else sampled_two_port(axis, sampling, omega)
         )
@@ -115,11 +117,11 @@ def test_deviations_of_the_models_from_the_diagram(diagrams):
 @pytest.mark.slow
 def test_lacking_damping_and_stiffness_limit_of_the_grips(diagrams):
     omega, H, axis, _ = diagrams["real"]
-    H = absorb(H, hand=-1j * omega * axis.hand_mass)
+    H = absorb_impedances(H, hand=-1j * omega * axis.hand_mass)
     (damping,) = re.findall(r"lacks\s(\d+) N s/m", TEXT)
     assert required_damping(H).max() == pytest.approx(float(damping), rel=0.01)
     (limit,) = re.findall(r"at\swalls\sup\sto\s([\d.]+) kN/m", TEXT)
-    softest = stiffness_limit(H, omega, range_of_grips()).min()
+    softest = stiffness_limit(H, omega, impedance_range_of_grips()).min()
     ((mass, wall),) = re.findall(
         r"at\s10 Hz\sa\shand\sof\s([\d.]+) kg\sat\sa\swall\sof\s([\d.]+) MN", TEXT
     )
@@ -138,7 +140,7 @@ def test_bounds_on_mass_errors():
         m, b = axis.hand_mass + axis.device_mass, axis.hand_damping + axis.device_damping
         k = axis.hand_stiffness
         wrong = replace(axis, wall_stiffness=0.0, wall_damping=0.0, mass_error=error)
-        unstable = unstable_multipliers(cut_loop(wrong, sampling), 0.0) > 0
+        unstable = count_unstable_multipliers(cut_loop(wrong, sampling), 0.0) > 0
         found = [
             m / (axis.force_scale * axis.position_scale),
             error[np.argmax(unstable)],

@@ -23,7 +23,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.robots.connections import SINKS, SOURCES, open_sink, open_source
-from drake_teleop.robots.export import export
+from drake_teleop.robots.export import export_text
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import ENVIRONMENTS, LoadScenario, Scenario, ScenarioFromData
@@ -141,9 +141,9 @@ def test_parameters_of_a_registered_method_are_checked(folder):
 
 
 def test_a_live_session_records_the_registered_name(folder):
-    before = Inputs().changed({"method": 99}).method
+    before = Inputs().with_changes({"method": 99}).method
     register_from(folder / "parts.py")
-    inputs = Inputs().changed({"method": 99})
+    inputs = Inputs().with_changes({"method": 99})
     assert inputs.method == before + 1
     assert chosen_scenario(Scenario(), None, inputs).passivity.method == "share"
     path = folder / "inputs.csv"
@@ -160,7 +160,7 @@ def test_export_source_and_sink_by_their_registered_names(folder):
     s, omega, alpha = rng.normal(size=(3, 200, 3)) * [[[9.0]], [[2.0]], [[5.0]]]
     wrench = np.arange(6.0) + non_contact_wrench(s, omega, alpha, PHI)
     found = identify_batch(wrench, s, omega, alpha, method="data_sheet").identification
-    assert export(found, "kilograms")[0] == "3.000\n"
+    assert export_text(found, "kilograms")[0] == "3.000\n"
     sink, source = object(), object()
     SINKS.register("serial", lambda address: sink)
     SOURCES.register("serial", lambda address, dt: (source, dt))

@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.run import run_command
-from drake_teleop.lab.run_summary import _detection_figures, in_contact
+from drake_teleop.lab.run_summary import _detection_figures, is_in_contact
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
@@ -40,7 +40,7 @@ def typed(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         type_in("README.md", ".venv/bin/drake-teleop run contact_transition")
-        patch.setattr("drake_teleop.lab.run.overview", lambda result: Figure())
+        patch.setattr("drake_teleop.lab.run.draw_overview", lambda result: Figure())
         type_in("docs/start.md", ".venv/bin/drake-teleop run mine.yaml")
     return folder / "out"
 
@@ -63,7 +63,7 @@ def identification(tmp_path_factory):
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
     """Return a function that runs QUICK with further lines, without its picture."""
-    monkeypatch.setattr("drake_teleop.lab.run.overview", lambda result: Figure())
+    monkeypatch.setattr("drake_teleop.lab.run.draw_overview", lambda result: Figure())
 
     def run(name: str, more: str = "", seed: int | None = None, quiet: bool = True):
         path = tmp_path / "quick.yaml"
@@ -215,7 +215,7 @@ def test_bounces_belong_to_one_contact():
     force[10:15, 2] = force[18:22, 2] = 5.0  # a bounce of 3 ms
     force[60, 2] = 5.0
     spec = Signal("true_contact_wrench_W", tuple("abcdef"), "N")
-    contact = in_contact(SimulationResult(t, {spec.name: force}, [spec]))
+    contact = is_in_contact(SimulationResult(t, {spec.name: force}, [spec]))
     np.testing.assert_array_equal(np.flatnonzero(contact), [*range(10, 22), 60])
 
 

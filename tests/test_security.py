@@ -81,7 +81,6 @@ LISTENING = {
     ("robots/netft.py", "socket"),
     # Connected to the drive, which alone is heard; a class of its own.
     ("live/device_client.py", "socket"),
-    ("live/device_client.py", "Client("),
     ("robots/netft.py", "http."),
 }
 """All that can listen; tests look at the sockets of both."""

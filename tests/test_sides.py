@@ -12,7 +12,7 @@ from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, Leaf
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.comparison.delayed_contact import energy_between
+from drake_teleop.lab.comparison.delayed_contact import injected_energy
 from drake_teleop.lab.identification import true_load
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.channel.channel import Channel
@@ -314,4 +314,4 @@ def test_example_controllers_press_a_wall_without_creating_energy():
         assert result["true_contact_wrench_W"][:, 2].max() > 10.0
         assert result["true_contact_wrench_W"][-1, 2] > 5.0  # it presses to the end
         # With the initial energy E0. `tdpa` has none and dissipates one hand period late.
-        assert energy_between(result, scenario).min() >= (-1e-6 if method == "tdpa" else 0.0)
+        assert injected_energy(result, scenario).min() >= (-1e-6 if method == "tdpa" else 0.0)

@@ -14,13 +14,13 @@ from drake_teleop.lab.new_station.plan import plan_station
 from drake_teleop.lab.new_station.random_postures import (
     Postures,
     degrees_of_freedom,
-    elbow_up,
+    elbow_up_share,
     joint_margins,
     postures_at,
     random_postures,
-    suitable,
+    select_suitable_postures,
 )
-from drake_teleop.lab.new_station.text import scenario_text, wall_of
+from drake_teleop.lab.new_station.text import scenario_text, wall_of_plan
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
@@ -97,7 +97,7 @@ def plain(tmp_path_factory):
 
 
 def elbow_of(plan):
-    return elbow_up(postures_at(plan.shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
+    return elbow_up_share(postures_at(plan.shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
 
 
 def slave_of(plan, path):
@@ -114,8 +114,8 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     # The base link has a plate on the plane; everything that moves is above it.
     assert plan.plane == pytest.approx(0.0, abs=1e-9)
     assert plan.shapes.points_on_bodies(plan.shapes.moving_bodies())[:, 2].min() > 0.02
-    assert start_overlaps(slave_of(plan, path), wall_of(plan))[0] == ()
-    assert wall_of(plan).position[2] < plan.lowest[2] - 0.01
+    assert start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == ()
+    assert wall_of_plan(plan).position[2] < plan.lowest[2] - 0.01
 
 
 def test_arm_that_can_only_face_minus_y_starts_there(tmp_path):
@@ -137,7 +137,7 @@ def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
 def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
     path, plan = plain
     slave = slave_of(plan, path)
-    assert start_overlaps(slave, wall_of(plan))[0] == ()
+    assert start_overlaps(slave, wall_of_plan(plan))[0] == ()
     elbow = postures_at(plan.shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
     (said,) = [
         text for text in start_overlaps(slave, Wall(position=list(elbow)))[0] if "link3" in text
@@ -221,13 +221,13 @@ def test_start_is_free_although_shapes_overlap_in_most_postures(tmp_path):
         near = [{each.first.name(), each.second.name()} for each in shapes.overlaps()]
         counts.append({"link2", "link4"} in near)
     assert 0.6 < np.mean(counts) < 0.95
-    assert start_overlaps(slave_of(plan, path), wall_of(plan))[0] == () == plan.overlaps
+    assert start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == () == plan.overlaps
     assert not any("link2 and link4" in text for text in plan.assumptions)
 
 
 def test_postures_of_all_ranks_are_checked_if_the_best_ones_overlap(plain):
     shapes = plain[1].shapes
-    postures, region = suitable(random_postures(shapes.arm), 0.0, 0.1)
+    postures, region = select_suitable_postures(random_postures(shapes.arm), 0.0, 0.1)
     usable, clear, clear_of_all = _rows_to_solve(shapes.arm, postures, region, shapes)
     expected = _usable_rows(shapes.arm, postures.q)
     np.testing.assert_array_equal(np.sort(usable), np.sort(expected))
@@ -304,7 +304,9 @@ def test_joints_of_a_mobile_base_may_be_at_the_base_plane(low: float) -> None:
     origins[:, 0, :2] = 0.0
     R_WS = np.tile(np.diag([1.0, -1.0, -1.0]), (count, 1, 1))
     axes = np.tile([0.0, 0.0, 1.0], (count, 4, 1))
-    kept, region = suitable(Postures(np.zeros((count, 4)), origins, axes, R_WS, p_WS), 0.0, 0.1)
+    kept, region = select_suitable_postures(
+        Postures(np.zeros((count, 4)), origins, axes, R_WS, p_WS), 0.0, 0.1
+    )
     assert region.raised.tolist() == [False, False, True, True]
     assert region.removed[2] == ("a joint is below the base plane", 20)
     assert (kept.origins[:, 3, 2] > 0.0).all() and len(kept.q) > 0

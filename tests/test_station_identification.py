@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab import identification
-from drake_teleop.lab.identification import batch_identification, slave_arm
+from drake_teleop.lab.identification import identify_by_batch, slave_arm
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -30,7 +30,7 @@ def test_offset_drift_does_not_depend_on_the_rate(rate_hz):
     sines = sum(np.sin((k + 1) * turns + phases[:, k]) for k in range(4))
     motion = 6.0 * sines[:, :3], 2.0 * sines[:, 3:6], 10.0 * sines[:, 6:]
     wrench = non_contact_wrench(*motion, slave_arm(scenario).phi_load)
-    found = batch_identification(scenario, wrench, *motion, rate_hz)
+    found = identify_by_batch(scenario, wrench, *motion, rate_hz)
     expected = np.repeat([0.5, 0.03], 3) * np.sqrt(duration / 3)
     # The load absorbs a small part.
     np.testing.assert_allclose(found.standard_deviations[:6], expected, rtol=0.05)
@@ -47,7 +47,7 @@ def test_motion_is_designed_once_for_all_seeds_and_again_for_another_sensor(monk
     monkeypatch.setattr(identification, "_DESIGN_CACHE", {})
     monkeypatch.setattr(identification, "excite", excite)
     monkeypatch.setattr(identification, "RobotFromScenario", lambda scenario: None)
-    monkeypatch.setattr(identification, "criteria_of", lambda *_: {"kappa_w10": 4.0})
+    monkeypatch.setattr(identification, "criterion_values", lambda *_: {"kappa_w10": 4.0})
 
     def designed(**changes) -> float:
         scenario = replace(LoadScenario("identification"), **changes)

@@ -170,7 +170,7 @@ def little_work(monkeypatch):
     """Replace the work of the commands, which still write all files."""
     monkeypatch.setattr(runs, "run_scenario", a_run)
     monkeypatch.setattr(runs, "summarise", lambda run: {"x": float("nan")})
-    monkeypatch.setattr(runs, "overview", lambda result: Figure())
+    monkeypatch.setattr(runs, "draw_overview", lambda result: Figure())
     monkeypatch.setattr(replay, "write_replay", lambda path, *_: write_text(path, "film"))
     monkeypatch.setattr(
         studies.StationWork, "__call__", lambda self, values, seed: {"hand_work_J": 1.0}

@@ -9,13 +9,13 @@ fades what would throw it away.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from drake_teleop.lab.comparison.one_dof import OneDof, Task, operators_intent, run_one_dof
+from drake_teleop.lab.comparison.one_dof import OneDof, Task, operator_intent, run_one_dof
 from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
 
 model, gone = OneDof(), 3000  # the station's grip and servo; ms
 task = Task(0.1, 0.6, 0.7, 1.5, release=9.0, released=10.0, end=4.0, judged=0.1)
-intent = operators_intent(task)
+intent = operator_intent(task)
 grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(intent), 1))
 grip[gone:] = 0.0
 figure, axes = plt.subplots(figsize=(7, 3.5))

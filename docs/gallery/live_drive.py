@@ -25,7 +25,7 @@ while session.ms < 3500:
     t = 1e-3 * session.ms
     wanted = {"z": round(-7500 * min(t, 1.0))}  # in steps of 10 um
     wanted |= (internet if t >= 1.5 else {}) | ({"sigma": 50} if t >= 2.5 else {})
-    session.apply(session.inputs.changed(wanted))
+    session.apply_inputs(session.inputs.with_changes(wanted))
     session.advance()  # 5 ms
 log = session.log()
 figure, (above, below) = plt.subplots(2, sharex=True, figsize=(7, 5))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import polars as pl
 
-from drake_teleop.lab.studies.pictures import main_effects
+from drake_teleop.lab.studies.pictures import draw_main_effects
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 
 folder = Path(tempfile.mkdtemp())
@@ -28,4 +28,4 @@ repeats: 2
 study_command(folder / "study.yaml", folder / "out", jobs=1, quiet=True, progress=False)
 study = LoadStudy(folder / "study.yaml")
 rows = pl.read_parquet(folder / "out" / "runs.parquet")
-figure = main_effects(study, rows, list(study.measures)[:2])
+figure = draw_main_effects(study, rows, list(study.measures)[:2])

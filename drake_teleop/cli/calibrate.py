@@ -26,7 +26,7 @@ from drake_teleop.load.tolerance import (
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, Evaluation, calibrate
 from drake_teleop.robots.connections import open_recording
 
-_BAR, _DECADES = 24, 3.0  # cells of a bar; decades of half-width over tolerance in a bar
+_BAR_CELLS, _BAR_DECADES = 24, 3.0  # cells of a bar; decades of half-width over tolerance in a bar
 
 
 def calibrate_command(
@@ -55,11 +55,11 @@ def calibrate_command(
     try:
         with Live(console=console, auto_refresh=False) as live:
 
-            def show(at: Evaluation) -> None:
-                live.update(shown(at, tolerance), refresh=True)
+            def show_progress(at: Evaluation) -> None:
+                live.update(progress_table(at, tolerance), refresh=True)
 
             looks = calibrate(
-                stream, recorder, path, tolerance, seconds=seconds, show=show, **processing
+                stream, recorder, path, tolerance, seconds=seconds, show=show_progress, **processing
             )
     finally:
         stream.close()
@@ -85,12 +85,12 @@ def calibrate_command(
     return summary
 
 
-def shown(at: Evaluation, tolerance: Tolerance) -> Group:
+def progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
-    table.add_column("settled", width=_BAR)
+    table.add_column("settled", width=_BAR_CELLS)
     table.add_column("verdict")
     units = [
         QUANTITY_UNITS[name]
@@ -107,7 +107,7 @@ def shown(at: Evaluation, tolerance: Tolerance) -> Group:
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
-            *(_bar(half, bool(at.known[k])), _verdict(at, k)),
+            *(_progress_bar(half, bool(at.known[k])), _parameter_verdict(at, k)),
         )
     lines = [Text(line, style="red") for line in (*at.doubts, *([at.why] if at.why else []))]
     if at.advice:
@@ -115,13 +115,13 @@ def shown(at: Evaluation, tolerance: Tolerance) -> Group:
     return Group(table, *lines)
 
 
-def _bar(half: float, known: bool) -> Text:
-    share = 1.0 - np.log10(max(half, 1.0)) / _DECADES if np.isfinite(half) else 0.0
-    cells = int(np.clip(share, 0.0, 1.0) * _BAR)
-    return Text("█" * cells + "·" * (_BAR - cells), style="green" if known else "yellow")
+def _progress_bar(half: float, known: bool) -> Text:
+    share = 1.0 - np.log10(max(half, 1.0)) / _BAR_DECADES if np.isfinite(half) else 0.0
+    cells = int(np.clip(share, 0.0, 1.0) * _BAR_CELLS)
+    return Text("█" * cells + "·" * (_BAR_CELLS - cells), style="green" if known else "yellow")
 
 
-def _verdict(at: Evaluation, k: int) -> str:
+def _parameter_verdict(at: Evaluation, k: int) -> str:
     if at.known[k]:
         return "known"
     if not np.isfinite(at.half[k]):

@@ -23,7 +23,7 @@ from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.lab.excitation.motion_film import write_motion_film
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import RELIABLE, shortest
+from drake_teleop.lab.excitation.shortest import RELIABLE_PROBABILITY, design_shortest_motion
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance
 from drake_teleop.station.scenario import LoadScenario
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Meaning of each printed criterion.
-WORDS = {
+CRITERION_TEXTS = {
     "kappa_w10": "condition number, ten columns, rows whitened, columns scaled by L = {L:.3g} m",
     "kappa10": "condition number, ten columns, plain V in SI units",
     "kappa16": "condition number, sixteen columns with offsets, SI units",
@@ -76,7 +76,7 @@ def excite_command(
     with show_progress(progress and not quiet) as stage:
         read = stage("Read the robot")
         if model is None:
-            _refuse(sensor_frame, package_paths, acceleration, payload)
+            _refuse_model_options(sensor_frame, package_paths, acceleration, payload)
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
             raise DrakeTeleopError(
@@ -109,7 +109,7 @@ def excite_command(
             )
         else:
             report = stage("Shorten the motion")
-            result = shortest(
+            result = design_shortest_motion(
                 robot,
                 tolerance,
                 harmonics=3 if harmonics is None else harmonics,
@@ -119,13 +119,13 @@ def excite_command(
             report(1.0)
             found = result.excitation
             shares = dict(zip(tolerance.required_entries, result.reached.tolist(), strict=True))
-            reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE}
+            reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
     summary = summarise(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}
     with output_folder(out):
-        write_table(out / "trajectory.csv", table(found))
+        write_table(out / "trajectory.csv", trajectory_table(found))
         found.trajectory.save(out / "excitation.yaml", robot.arm.joint_names)
-        write_picture(out / "excitation.png", draw(found))
+        write_picture(out / "excitation.png", draw_trajectory(found))
         write_motion_film(out / "excitation.html", found)
         write_json(out / "session.json", session)
         write_json(out / "summary.json", summary)
@@ -134,7 +134,7 @@ def excite_command(
     return summary | session
 
 
-def _refuse(*options: object) -> None:
+def _refuse_model_options(*options: object) -> None:
     names = ("--sensor-frame", "--package-path", "--acceleration", "--payload")
     for name, value in zip(names, options, strict=True):
         if value not in (None, ()):
@@ -150,7 +150,7 @@ def summarise(found: Excitation) -> dict[str, Any]:
         "robot": robot.name,
         "criterion": found.criterion,
         **found.values,
-        "meaning": {name: _words(name, robot) for name in found.values},
+        "meaning": {name: _criterion_text(name, robot) for name in found.values},
         "period_s": trajectory.period,
         "harmonics": trajectory.rho.shape[1],
         "limit_use": {
@@ -166,11 +166,11 @@ def summarise(found: Excitation) -> dict[str, Any]:
     }
 
 
-def _words(name: str, robot: Robot) -> str:
-    return WORDS[name].format(L=robot.scales.length)
+def _criterion_text(name: str, robot: Robot) -> str:
+    return CRITERION_TEXTS[name].format(L=robot.scales.length)
 
 
-def table(found: Excitation) -> pl.DataFrame:
+def trajectory_table(found: Excitation) -> pl.DataFrame:
     """Return the content of trajectory.csv: one period at 1 kHz, both ends included."""
     period = found.trajectory.period
     t = np.linspace(0, period, round(period * RATE) + 1)
@@ -182,7 +182,7 @@ def table(found: Excitation) -> pl.DataFrame:
     return pl.DataFrame(columns)
 
 
-def draw(found: Excitation) -> Figure:
+def draw_trajectory(found: Excitation) -> Figure:
     with plot_style():
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
@@ -191,9 +191,7 @@ def draw(found: Excitation) -> Figure:
         progress.step(*found.history.T, where="post", color=BLUE)
         least = found.values.get(found.criterion, found.trajectory.period)  # --until: the period
         progress.set(
-            title=f"{found.criterion} down to {least:.4g}",
-            xlabel="evaluations",
-            yscale="log",
+            title=f"{found.criterion} down to {least:.4g}", xlabel="evaluations", yscale="log"
         )
     return figure
 
@@ -247,8 +245,8 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         console.print(part)
     if "until" in summary:
         console.print(
-            f"{summary['period_s']:.3g} s reach {summary['until']}"
-            f" in {summary['reliable']:.0%} of the records, by the sensor's noise alone",
+            f"{summary['period_s']:.3g} s reach {summary['until']} in {summary['reliable']:.0%}"
+            " of the records, by the sensor's noise alone",
             highlight=False,
             markup=False,
         )

@@ -32,7 +32,7 @@ def experiment_command(
     with open_results(out, experiment) as store:
         try:
             if simulated:
-                _simulate(experiment, scenarios, store, simulated)
+                _simulate_participants(experiment, scenarios, store, simulated)
             else:
                 from drake_teleop.live.experiment.server import serve_experiment
 
@@ -50,7 +50,7 @@ def next_participant(store: Store, trials: int, wanted: int | None = None) -> in
         return wanted
     known = store.participants()
     for number in known:
-        if len(store.rows(number)) < trials:
+        if len(store.read_rows(number)) < trials:
             return number
     number = max(known, default=0) + 1
     if number > MAX_PARTICIPANT:
@@ -62,14 +62,16 @@ def next_participant(store: Store, trials: int, wanted: int | None = None) -> in
     return number
 
 
-def _simulate(experiment: Experiment, scenarios: list[Scenario], store: Store, count: int) -> None:
-    from drake_teleop.live.experiment.simulated import all_apparatus, take_part
+def _simulate_participants(
+    experiment: Experiment, scenarios: list[Scenario], store: Store, count: int
+) -> None:
+    from drake_teleop.live.experiment.simulated import make_all_apparatus, simulate_participant
 
-    stations = all_apparatus(experiment, scenarios)
+    stations = make_all_apparatus(experiment, scenarios)
 
     def progress(done: int, trials: int) -> None:
         print(f"\rparticipant {number} of {count}: trial {done} of {trials}", end="", flush=True)
 
     for number in range(1, count + 1):
-        take_part(experiment, scenarios, stations, store, number, progress)
+        simulate_participant(experiment, scenarios, stations, store, number, progress)
     print()

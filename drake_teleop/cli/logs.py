@@ -156,7 +156,7 @@ def eliminate_command(
     from drake_teleop.logs.pictures import draw_elimination
 
     with output_folder(out):
-        write_table(out / "contact_wrench.parquet", _wrenches(found))
+        write_table(out / "contact_wrench.parquet", _wrench_table(found))
         write_picture(out / "contact_wrench.png", draw_elimination(found))
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -164,7 +164,7 @@ def eliminate_command(
     return summary
 
 
-def _wrenches(found: EliminatedLog) -> pl.DataFrame:
+def _wrench_table(found: EliminatedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}

@@ -504,11 +504,7 @@ _EXPORT_FORMATS = option.Registered(
 @option.sensor_range
 @option.out("export")
 def export(
-    identification: Path,
-    to: str,
-    sensor_pose: tuple[float, ...] | None,
-    sign: str,
-    **loop: Any,
+    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str, **loop: Any
 ) -> None:
     """Write a load for a robot, model or controller.
 
@@ -526,7 +522,7 @@ def export(
         notes = export_controller(found, to, sensor_pose=sensor_pose, sign=int(sign), **loop)
         text = ""
     else:
-        from drake_teleop.robots.export import export as export_load
+        from drake_teleop.robots.export import export_text as export_load
 
         text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
     for note in notes:
@@ -597,10 +593,7 @@ def compare_passivity(
     from drake_teleop.lab.comparison import compare_passivity as comparison
 
     comparison.compare_command(
-        out,
-        networks=networks or comparison.NETWORKS,
-        methods=methods,
-        **options,
+        out, networks=networks or comparison.NETWORKS, methods=methods, **options
     )
 
 
@@ -788,30 +781,30 @@ def main(arguments: list[str] | None = None) -> None:
             warnings.simplefilter("ignore")
             os.environ["PYTHONWARNINGS"] = "ignore"  # for the processes of a study
         try:
-            status = _run(arguments)
+            status = _run_with_exit_status(arguments)
         finally:
             INTERRUPTED_EVENT.clear()
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _run(arguments: list[str] | None) -> Any:
+def _run_with_exit_status(arguments: list[str] | None) -> Any:
     try:
         return cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return 2
     except click.ClickException as error:
-        return _fail(error.format_message())
+        return _print_error(error.format_message())
     except DrakeTeleopError as error:
-        return _fail(str(error))
+        return _print_error(str(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:
         # click raises Abort from a KeyboardInterrupt, which contains the message.
         click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
         return 130
     except OSError as error:
-        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return _print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
 
 
-def _fail(message: str) -> int:
+def _print_error(message: str) -> int:
     click.echo(to_one_line(f"error: {message}"), err=True)
     return 2

@@ -166,11 +166,11 @@ def out(command: str) -> Callable[[Any], Any]:
 def _remove_empty_at_failure(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
     new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     if new:
-        ctx.call_on_close(lambda: _remove_empty(new))
+        ctx.call_on_close(lambda: _remove_empty_folders(new))
     return folder
 
 
-def _remove_empty(new: list[Path]) -> None:
+def _remove_empty_folders(new: list[Path]) -> None:
     inner = sorted(new[0].rglob("*"), reverse=True)
     for folder in (*inner, *new):
         if folder.is_symlink() or not folder.is_dir():
@@ -245,7 +245,7 @@ free = click.option(
 )
 
 
-def ask(question: str) -> bool:
+def confirm_at_terminal(question: str) -> bool:
     """Return the answer of a user at a terminal, True for yes; False without a terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
@@ -253,7 +253,7 @@ def ask(question: str) -> bool:
 yes = click.option(
     "--yes",
     is_flag=True,
-    callback=lambda _ctx, _param, is_set: is_set or ask,
+    callback=lambda _ctx, _param, is_set: is_set or confirm_at_terminal,
     help="Start more than 100,000 runs without a question.",
 )
 
@@ -301,7 +301,7 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
         package_paths: tuple[Path, ...],
         **options: Any,
     ) -> Any:
-        arm = _arm(model, sensor_frame, package_paths)
+        arm = _arm_from_options(model, sensor_frame, package_paths)
         return command(*arguments, arm=arm, **options)
 
     decorated: Callable[..., Any] = with_arm
@@ -326,7 +326,9 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
     return decorated
 
 
-def _arm(model: Path | None, sensor_frame: str | None, package_paths: tuple[Path, ...]) -> Any:
+def _arm_from_options(
+    model: Path | None, sensor_frame: str | None, package_paths: tuple[Path, ...]
+) -> Any:
     if model is None:
         if sensor_frame is not None or package_paths:
             name = "--package-path" if sensor_frame is None else "--sensor-frame"

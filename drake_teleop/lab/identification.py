@@ -1,4 +1,4 @@
-"""Identification of the load in simulation from samples of the wrist sensor (paper, section IV)."""
+"""Load identification in simulation (paper, section IV)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, check_identified, one_blas_thread
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
-from drake_teleop.lab.excitation.check import check
-from drake_teleop.lab.excitation.excite import criteria_of, excite
+from drake_teleop.lab.excitation.check import check_trajectory
+from drake_teleop.lab.excitation.excite import criterion_values, excite
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
@@ -53,7 +53,7 @@ class LoadIdentification:
     Attributes:
         estimate: (16,) final recursive estimate of Eq. (7): sensor offsets [N, N m], then phi.
         batch: estimate by batch total least squares from the same record.
-        kappa_w10: condition number of the excitation, see `excitation.criteria`.
+        kappa_w10: condition number, see `excitation.criteria`.
         real_time_factor: simulated time over elapsed time.
     """
 
@@ -76,7 +76,7 @@ class LoadIdentification:
         )
 
     def noise_floor(self, arm: ArmModel) -> NoiseFloor:
-        """Return the noise floor of the contact wrench, fitted to this motion without contact."""
+        """Return the noise floor of the contact wrench in this motion."""
         usable = self.result["saturated"][:, 0] == 0
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
@@ -87,7 +87,7 @@ class LoadIdentification:
 
     @property
     def recursive_against_batch(self) -> float:
-        """Largest difference of recursive and batch estimate, in standard deviations."""
+        """Largest difference of both estimates in standard deviations."""
         batch = np.concatenate([self.batch.offsets, self.batch.phi])
         return float(np.max(np.abs(self.estimate - batch) / self.batch.standard_deviations))
 
@@ -143,8 +143,8 @@ def identify_load(
         raise DrakeTeleopError(
             "the load estimator is off, so it cannot identify the load",
             where="scenario:load_estimator.enabled",
-            remedy="call identified_load(scenario) of drake_teleop.lab.identified_load, or pass "
-            'LoadScenario("identification")',
+            remedy="call identified_load(scenario) of drake_teleop.lab.identified_load, or pass"
+            ' LoadScenario("identification")',
         )
     if trajectory is not None:
         expect(FourierTrajectory, trajectory, "trajectory")
@@ -155,20 +155,20 @@ def identify_load(
         else:
             robot = RobotFromScenario(scenario)
             _check_trajectory(robot, trajectory, simulation.duration)
-            kappa = criteria_of(robot, trajectory)["kappa_w10"]
+            kappa = criterion_values(robot, trajectory)["kappa_w10"]
         station = MakeIdentificationStation(scenario, trajectory)
         result, factor = simulate_with_timing(station, simulation, stage("Identify the load"), log)
     usable = result["saturated"][:, 0] == 0
     wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
     with one_blas_thread():
-        batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
+        batch = identify_by_batch(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
     estimate = result["load_estimate"][-1]
     check_identified("load_estimate", estimate[6:])
     method = METHODS[scenario.load_estimator.method].method
     return LoadIdentification(trajectory, result, estimate, batch, kappa, factor, method)
 
 
-def batch_identification(
+def identify_by_batch(
     scenario: Scenario, wrench: Array, s: Array, omega: Array, alpha: Array, rate_hz: float
 ) -> Identification:
     """Identify load and sensor offsets by total least squares from N samples in S."""
@@ -197,7 +197,7 @@ def _design_trajectory(scenario: Scenario, stage: StartStage) -> tuple[FourierTr
     if key not in _DESIGN_CACHE or scenario.environment:  # the environment's files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
-        _DESIGN_CACHE[key] = found, criteria_of(robot, found)["kappa_w10"]
+        _DESIGN_CACHE[key] = found, criterion_values(robot, found)["kappa_w10"]
     return copy.deepcopy(_DESIGN_CACHE[key])
 
 
@@ -214,7 +214,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
             where="trajectory",
             remedy="set simulation.duration to the period",
         )
-    worst = check(robot, trajectory)[0]
+    worst = check_trajectory(robot, trajectory)[0]
     if worst.share > 1:
         raise DrakeTeleopError(
             f"it uses {worst}", where="trajectory", remedy="compute a trajectory for these limits"

@@ -19,7 +19,7 @@ from drake_teleop.common.files import (
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identification import identify_load, simulate_with_timing
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.lab.run_summary import ScenarioRun, overview, summarise
+from drake_teleop.lab.run_summary import ScenarioRun, draw_overview, summarise
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
@@ -48,7 +48,7 @@ class RecordedDrive(Protocol):
 
     @property
     def load(self) -> IdentifiedLoad | None:
-        """Load identified before the session; None if the load was estimated during the session."""
+        """Load identified before the session; None if estimated during it."""
 
     def repeat(self, progress: UpdateProgress, log: Path | None = None) -> SimulationResult:
         """Simulate the recorded session again."""
@@ -90,7 +90,7 @@ def run_command(
         with show_progress(progress and not quiet) as stage:
             run = _run_with_log(setup, out, stage, fresh, drive)
             written = stage("Write pictures and 3D replay")
-            write_picture(out / "overview.png", overview(run.result))
+            write_picture(out / "overview.png", draw_overview(run.result))
             written(0.3)
             write_replay(out / "replay.html", run.result, run.scenario)
             written(1.0)
@@ -142,8 +142,7 @@ def run_scenario(
 ) -> ScenarioRun:
     """Run a scenario; estimate the load during the run, or use the cached or newly identified load.
 
-    If it is estimated and there is no intended motion or task, the slave runs an excitation
-    trajectory.
+    An estimation without intended motion or task uses an excitation trajectory.
 
     Args:
         progress: True shows progress bars; or a `StartStage` that receives the progress.

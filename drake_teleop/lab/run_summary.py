@@ -44,8 +44,8 @@ class ScenarioRun:
     real_time_factor: float
 
 
-def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True in true contact; gaps shorter than `FILTER_TAIL_S` are closed."""
+def is_in_contact(result: SimulationResult) -> NDArray[np.bool_]:
+    """Return true contact (N,); gaps shorter than `FILTER_TAIL_S` are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -53,7 +53,7 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return the contact wrench (N, 6) [N, N m] in S, calculated with the final load estimate."""
+    """Return the contact wrench (N, 6) [N, N m] in S with the final load estimate."""
     estimate = result["load_estimate"][-1]
     check_identified("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)
@@ -66,7 +66,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     estimate = result["load_estimate"][-1]
     measured = result["measured_wrench_S"] - estimate[:6]
     calculated = calculated_contact_wrench(result)
-    contact = in_contact(result)
+    contact = is_in_contact(result)
     # The first bounce of a contact may be between two samples.
     free = _time_since(contact, result.t) > FILTER_TAIL_S
     free &= _time_until(contact, result.t) > FILTER_TAIL_S
@@ -78,9 +78,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "seed": run.scenario.simulation.seed,
         "duration_s": round(float(result.t[-1]), 6),
         "samples": len(result.t),
-        **_peaks("peak_measured", "", measured),
-        **_peaks("peak_contact", "", calculated),
-        **_peaks("residual", "_max", calculated[free]),
+        **_peak_values("peak_measured", "", measured),
+        **_peak_values("peak_contact", "", calculated),
+        **_peak_values("residual", "_max", calculated[free]),
         "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
         "joint_speed_use": _largest_use(result["slave_state"][:, n:], arm.velocity_limit),
         "joint_torque_use": _largest_use(result["joint_torque"], arm.effort_limit),
@@ -88,7 +88,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
     }
     if "force_to_master" in result:
-        summary |= _peaks("peak", "_to_master", result["force_to_master"])
+        summary |= _peak_values("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_figures(result, contact_spans(result.t, contact))
     if beyond := _unmodelled_contact(run.scenario):
@@ -104,12 +104,12 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     return summary | {"warnings": run_warnings(result, run.scenario, arm)}
 
 
-def overview(result: SimulationResult) -> Figure:
+def draw_overview(result: SimulationResult) -> Figure:
     """Draw wrenches, motion and force to the master over time."""
     signals = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
     if "contact_wrench_S" not in result:
         signals = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
-    figure = result.plot(*signals, contact=in_contact(result))
+    figure = result.plot(*signals, contact=is_in_contact(result))
     figure.align_ylabels()
     return figure
 
@@ -154,7 +154,7 @@ def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]
     return {"moved_mm": displacements, "turned_deg": rotations} if displacements else {}
 
 
-def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
+def _peak_values(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
     names = (f"{prefix}_force{suffix}_N", f"{prefix}_torque{suffix}_Nm")
     if not len(wrench):
         return dict.fromkeys(names)

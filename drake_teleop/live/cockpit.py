@@ -1,4 +1,4 @@
-"""Forces, energy, contact and warnings of a running station, for the browser page."""
+"""Forces, energy, contact and warnings for the browser page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PACKET_TIMEOUT_S = 0.05  # s
 
 
 @njit(cache=True)
-def _norm_range_into(vectors, origins, out):
+def smallest_and_largest_norm_into(vectors, origins, out):
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -38,7 +38,7 @@ def _norm_range_into(vectors, origins, out):
 
 
 @njit(cache=True)
-def _columns_at_limit(values, limits):
+def _joints_at_limit_bits(values, limits):
     found = 0
     for row in range(len(values)):
         for k in range(len(limits)):
@@ -49,7 +49,6 @@ def _columns_at_limit(values, limits):
 
 @njit(cache=True)
 def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Add the work at hand and tool in new rows to `energy` (2,) [J]."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
         forward_kinematics(table, states[row, : table.shape[0] - 1], R_WS, p_WS)
@@ -66,7 +65,7 @@ def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Calculator of the values that the browser page shows, from the log's rows."""
+    """Calculator of the page's values from the log's rows."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
@@ -80,16 +79,16 @@ class Cockpit:
         self._last_row = np.full(4, np.nan)  # t, p_WS of the last row
         self._forces = np.zeros((3, 2))
 
-    def frame(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
+    def page_values(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
         """Return the page's values for at least one new row, finite and ready for JSON."""
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
-        _norm_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
-        _norm_range_into(contact_S, zeros, contact)
-        _norm_range_into(rows["force_to_master"], zeros, rendered)
+        smallest_and_largest_norm_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        smallest_and_largest_norm_into(contact_S, zeros, contact)
+        smallest_and_largest_norm_into(rows["force_to_master"], zeros, rendered)
         in_contact = rows["contact"].any() if "contact" in rows else contact[1] > CONTACT_FORCE_N
-        self._forces[:2] *= inputs.scales["force_scale"]
+        self._forces[:2] *= inputs.force_scales["force_scale"]
         _integrate_work(
             self._table,
             rows["t"],
@@ -101,13 +100,13 @@ class Cockpit:
             self._energy,
         )
         return {
-            "f": [_numbers(pair, 4) for pair in self._forces],
+            "f": [_round_finite(pair, 4) for pair in self._forces],
             "contact": bool(in_contact),
-            "energy": _numbers(self._energy, 5),
+            "energy": _round_finite(self._energy, 5),
             "words": list(dict.fromkeys(self._warnings(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
-            "tool": _numbers(self._last_row[1:], 5),
-            "stylus": _numbers(rows["pose_master"][-1, 4:], 5),
+            "tool": _round_finite(self._last_row[1:], 5),
+            "stylus": _round_finite(rows["pose_master"][-1, 4:], 5),
         }
 
     def _warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
@@ -122,11 +121,11 @@ class Cockpit:
         if self._forces[2, 1] >= _LIMIT_SHARE * self._peak:
             yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
-        _norm_range_into(rows["hand_wrench_E"], zeros, hand)
+        smallest_and_largest_norm_into(rows["hand_wrench_E"], zeros, hand)
         if hand[1] > _HAND_FORCE_LIMIT_N:
             yield "the simulated hand pulls with its largest force"
         for quantity, name, part, limits in self._limits:
-            at_limit = _columns_at_limit(rows[name][:, part], limits)
+            at_limit = _joints_at_limit_bits(rows[name][:, part], limits)
             if at_limit:
                 joints = [str(k + 1) for k in range(len(limits)) if at_limit >> k & 1]
                 yield f"joint {', '.join(joints)} at the limit of its {quantity}"
@@ -136,5 +135,5 @@ class Cockpit:
             yield "the hand is at the edge of its box, 0.3 m wide"
 
 
-def _numbers(values: Array, digits: int) -> list[float]:
+def _round_finite(values: Array, digits: int) -> list[float]:
     return [round(x, digits) if math.isfinite(x) else 0.0 for x in values.tolist()]

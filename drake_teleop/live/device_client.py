@@ -30,7 +30,7 @@ from drake_teleop.live.device_packets import (
 )
 from drake_teleop.live.haply import HaplyDevice
 from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
-from drake_teleop.robots.udp import endpoint
+from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
@@ -53,7 +53,7 @@ class Device(Protocol):
         """Disconnect the device with zero force."""
 
 
-class Client:
+class DeviceClient:
     """Connection of a haptic device and a station.
 
     `behind` is the delay [s] between each device position and the force that answers it.
@@ -64,12 +64,14 @@ class Client:
         self.behind: deque[float] = deque(maxlen=_MAX_AGES)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect(endpoint(address))
+        self._socket.connect(host_and_port(address))
         self._socket.setblocking(False)
         self._command: ForceCommand | None = None
         self._last_tick: float | None = None
 
-    def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
+    def exchange_once(
+        self, clock: Callable[[], float] = time.perf_counter
+    ) -> tuple[float, ...] | None:
         """Exchange pose and force once; return the displayed wrench, or None without a pose."""
         pose = self._device.read()
         now = clock()
@@ -83,7 +85,7 @@ class Client:
         period = min(max(elapsed, 1e-5), _MAX_LATENESS_S)
         self._last_tick = now
         commanded = (0.0,) * 6 if command is None else command.wrench
-        wrench = self.guard.tick(pose.position, commanded, age, period)
+        wrench = self.guard.limit_wrench(pose.position, commanded, age, period)
         self._device.set(wrench)
         self._send(pose, now, age)
         return wrench
@@ -120,7 +122,7 @@ class Client:
         self._socket.close()
 
 
-class RealTimeDevice:
+class RealTimeVirtualDevice:
     """Virtual device that runs in real time."""
 
     limits = Limits(force=10.0)
@@ -138,7 +140,7 @@ class RealTimeDevice:
         now = time.perf_counter()
         if now - self._due > _MAX_LATENESS_S:  # missed ticks are skipped
             self._due = self._simulated_until = now
-        self.virtual.move(self._wrench[:3], max(now - self._simulated_until, 1e-6))
+        self.virtual.simulate_motion(self._wrench[:3], max(now - self._simulated_until, 1e-6))
         self._simulated_until = now
         return DevicePose(self.virtual.position)
 
@@ -151,7 +153,7 @@ class RealTimeDevice:
 def open_device(address: str, grip: str, depth: float) -> Device:
     """Return the device at an address: `virtual` or haply://HOST:PORT."""
     if address == "virtual":
-        return RealTimeDevice(VirtualDevice(tapping_motion(depth), grip))
+        return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
     raise DrakeTeleopError(
@@ -172,11 +174,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="output file of the figures")
     options = parser.parse_args(arguments)
     device = open_device(options.device, options.grip, options.depth)
-    client = Client(device, options.station, observe=not options.no_observer)
+    client = DeviceClient(device, options.station, observe=not options.no_observer)
     end, largest = time.perf_counter() + options.seconds, 0.0
     try:
         while time.perf_counter() < end:
-            largest = max(largest, float(np.linalg.norm((client.tick() or (0.0,) * 3)[:3])))
+            largest = max(
+                largest, float(np.linalg.norm((client.exchange_once() or (0.0,) * 3)[:3]))
+            )
     except KeyboardInterrupt:
         pass
     finally:

@@ -48,7 +48,7 @@ class DeviceGuard:
         self._force, self._torque, self._velocity = np.zeros((3, 3))
         self._position: Array | None = None
 
-    def tick(
+    def limit_wrench(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
     ) -> tuple[float, ...]:
         """Return the wrench to display (6,) [N, N m]; `age` is the age of the command [s]."""
@@ -62,7 +62,7 @@ class DeviceGuard:
         next_motion = period * (2.0 * velocity - self._velocity)
         self._position, self._velocity = x, velocity
 
-        share = self._command_share(age, period)
+        share = self._fading_share(age, period)
         force, torque = _finite_or_zero(wrench[:3]), _finite_or_zero(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
@@ -76,7 +76,7 @@ class DeviceGuard:
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
 
-    def _command_share(self, age: float, period: float) -> float:
+    def _fading_share(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
             self._was_silent = True
         elif self._was_silent:

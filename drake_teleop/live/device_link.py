@@ -27,8 +27,8 @@ from drake_teleop.live.device_packets import (
     rejection_reason,
     unpack_state,
 )
-from drake_teleop.live.inputs import ANGLE, LENGTH
-from drake_teleop.robots.udp import THIS_MACHINE, endpoint, listening
+from drake_teleop.live.inputs import ANGLE_UNIT_RAD, LENGTH_UNIT_M
+from drake_teleop.robots.udp import LOCALHOST, host_and_port, open_udp_receiver
 
 _CLIENT_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS = 256  # packets per poll
@@ -47,14 +47,14 @@ class DeviceLink:
     """
 
     def __init__(self, address: str) -> None:
-        host, port = endpoint(address)
+        host, port = host_and_port(address)
         if not _is_loopback(host):
             raise DrakeTeleopError(
                 "is not an address of this machine (other senders could move the arm)",
                 where=address,
                 remedy="use udp://127.0.0.1:PORT, and run the device's client on this machine",
             )
-        self._socket = listening(host, port)
+        self._socket = open_udp_receiver(host, port)
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
         self.refused = self.lost = 0
@@ -67,7 +67,7 @@ class DeviceLink:
         self._latencies: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
         self._force_ages: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
 
-    def poll(self, now: float) -> DeviceState | None:
+    def receive_state(self, now: float) -> DeviceState | None:
         """Receive waiting packets; return the newest device state, None after 50 ms of silence."""
         self._polled_at = now
         for _ in range(_MAX_PACKETS):
@@ -76,10 +76,10 @@ class DeviceLink:
             except (BlockingIOError, ConnectionError):
                 break
             self._handle_packet(packet, peer, now)
-        return None if self.silent(now) else self._state
+        return None if self.is_silent(now) else self._state
 
     def _handle_packet(self, packet: bytes, peer: Any, now: float) -> None:
-        state, silent = unpack_state(packet), self.silent(now)
+        state, silent = unpack_state(packet), self.is_silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1
             self.refusal = rejection_reason(packet) if state is None else "is from a second device"
@@ -97,10 +97,10 @@ class DeviceLink:
         self._latencies.append(now - state.t)
         self._force_ages.append(state.behind)
 
-    def silent(self, now: float) -> bool:
+    def is_silent(self, now: float) -> bool:
         return now - self._last_arrival > COMMAND_TIMEOUT_S
 
-    def send(self, wrench: np.ndarray) -> None:
+    def send_wrench(self, wrench: np.ndarray) -> None:
         """Answer the newest device state with the wrench (6,) [N, N m]."""
         if self._state is None or self._peer is None:
             return
@@ -116,7 +116,7 @@ class DeviceLink:
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
         """Return the `Inputs` of the device's pose; a silent device releases the hand."""
-        state = self.poll(now)
+        state = self.receive_state(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
         first = self._origin
@@ -125,14 +125,14 @@ class DeviceLink:
         )
         values: dict[str, float] = {"held": 1}
         for k, name in enumerate("xyz"):
-            values[name] = (state.position[k] - first.position[k]) / LENGTH
-            values["r" + name] = turn[k] / ANGLE
+            values[name] = (state.position[k] - first.position[k]) / LENGTH_UNIT_M
+            values["r" + name] = turn[k] / ANGLE_UNIT_RAD
         if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_S:
             values["clutch"] = 0
         return values
 
-    def figures(self, now: float) -> dict[str, float]:
-        """Return packet rate [Hz], lost packets, and lateness of packets and forces [ms]."""
+    def link_statistics(self, now: float) -> dict[str, float]:
+        """Return packet rate [Hz], lost packets and lateness [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (
@@ -156,10 +156,10 @@ class DeviceLink:
 
     def _lateness_text(self) -> str:
         now = self._polled_at
-        if self.silent(now):
+        if self.is_silent(now):
             what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"
-        figures = self.figures(now)
+        figures = self.link_statistics(now)
         text = f"Device: packets arrive up to {figures['late_p99_ms']:.1f} ms late (99 of 100)"
         if figures["behind_p99_ms"] > 0.0:
             text += (
@@ -195,10 +195,10 @@ class DeviceConnection:
                 where=address,
                 remedy="use udp://127.0.0.1:PORT or haply://localhost:10001",
             )
-        self.link = DeviceLink(address if kind == "udp" else f"udp://{THIS_MACHINE}:0")
+        self.link = DeviceLink(address if kind == "udp" else f"udp://{LOCALHOST}:0")
         self._client: subprocess.Popen[bytes] | None = None
         if kind == "haply":
-            station = f"udp://{THIS_MACHINE}:{self.link.port}"
+            station = f"udp://{LOCALHOST}:{self.link.port}"
             client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
             self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 

@@ -65,10 +65,10 @@ def unpack_state(packet: bytes) -> DeviceState | None:
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
-    return plausible_state(number, t, flags, numbers)
+    return state_if_plausible(number, t, flags, numbers)
 
 
-def plausible_state(
+def state_if_plausible(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
     """Return the device state, or None if a value is implausible."""

@@ -1,4 +1,4 @@
-"""Master side of a real haptic device, in place of operator, simulated device and force display."""
+"""Master side of a real haptic device."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from drake_teleop.station.wiring import export_outputs
 Array = NDArray[np.float64]
 
 #: Period of the poses [s], and [ms].
-TICK, TICK_MS = 2e-3, 2
+POSE_PERIOD_S, POSE_PERIOD_MS = 2e-3, 2
 # Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
 # largest slew rate [1/s].
-_FADE_S, _RETURN, _SLEW = 0.05, 4.0, 150.0
+_FADE_S, _RETURN_RATE, _SLEW_RATE = 0.05, 4.0, 150.0
 # Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
 _HELD, _START_TIME, _START_POSE, _DISPLACEMENT, _ROTATION, _PATH = 0, 1, 2, 9, 12, 15
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
@@ -49,11 +49,11 @@ _WRENCH = float(Fault.WRENCH)
 
 @njit(cache=True)
 def _pose_on_path(path, time, out):
-    share = min(max((time - path[_START_TIME]) / TICK, 0.0), 1.0)
+    share = min(max((time - path[_START_TIME]) / POSE_PERIOD_S, 0.0), 1.0)
     r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
     start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
     rotation = quaternion_product(quaternion_exponential(r), start)
-    moves = 1.0 / TICK if share < 1.0 else 0.0
+    moves = 1.0 / POSE_PERIOD_S if share < 1.0 else 0.0
     for k in range(4):
         out[k] = rotation[k]
     for k in range(3):
@@ -63,12 +63,12 @@ def _pose_on_path(path, time, out):
 
 
 @njit(cache=True)
-def _display_step(wrench, held, period, limits, last, now):
+def _update_displayed_wrench(wrench, held, period, limits, last, now):
     fault = 0.0
     if not all_in_range(wrench):
         fault = _WRENCH
     enabled = held and fault == 0.0
-    change = _RETURN if enabled else -1.0 / _FADE_S
+    change = _RETURN_RATE if enabled else -1.0 / _FADE_S
     allowed = min(max(last[_ALLOWED] + period * change, 0.0), 1.0)
     target, step = np.zeros(6), np.empty(6)
     if enabled:
@@ -78,7 +78,7 @@ def _display_step(wrench, held, period, limits, last, now):
     for i in range(6):
         step[i] = target[i] - last[i]
     for g in range(2):
-        limit_group(step, g, _SLEW * period * limits[g])
+        limit_group(step, g, _SLEW_RATE * period * limits[g])
     for i in range(6):
         now[i] = last[i] + step[i]
     now[_FAULT], now[_ALLOWED] = fault, allowed
@@ -110,7 +110,7 @@ class ExternalMaster(LeafSystem):
     def __init__(self, start: Array, period: float, limits: Array) -> None:
         super().__init__()
         path = np.zeros(_PATH)
-        path[_HELD], path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = 1.0, -TICK, start
+        path[_HELD], path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = 1.0, -POSE_PERIOD_S, start
         self._path = self.DeclareNumericParameter(BasicVector(path))
         self._period, self._limits, self._pose_and_twist = period, limits, np.zeros(13)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
@@ -122,7 +122,7 @@ class ExternalMaster(LeafSystem):
             ("master_state", 12, self._calc_state, moves),
             ("force_to_master", 6, self._calc_force, {self.xd_ticket()}),
             ("fault_at_hand", 1, self._calc_fault, {self.xd_ticket()}),
-            ("displayed_and_fault", 7, self._calc_both, {self.xd_ticket()}),
+            ("displayed_and_fault", 7, self._calc_wrench_and_fault, {self.xd_ticket()}),
             ("hand_wrench_E", 6, self._calc_hand, {self.xd_ticket()}),
         ):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), needed)
@@ -130,7 +130,7 @@ class ExternalMaster(LeafSystem):
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
         """Interpolate the device's X_BE to `target` (7,) over 2 ms; None releases the device."""
-        now, path = self._present(context), np.zeros(_PATH)
+        now, path = self._current_pose_and_twist(context), np.zeros(_PATH)
         path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:
             path[_HELD], path[_DISPLACEMENT:_ROTATION] = 1.0, target[4:] - now[4:7]
@@ -142,7 +142,7 @@ class ExternalMaster(LeafSystem):
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
         """Do nothing: a real hand has no setting."""
 
-    def _present(self, context: Context) -> Array:
+    def _current_pose_and_twist(self, context: Context) -> Array:
         _pose_on_path(
             context.get_numeric_parameter(self._path).value(),
             context.get_time(),
@@ -151,13 +151,13 @@ class ExternalMaster(LeafSystem):
         return self._pose_and_twist
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._present(context)[:7])
+        output.SetFromVector(self._current_pose_and_twist(context)[:7])
 
     def _calc_twist(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._present(context)[7:])
+        output.SetFromVector(self._current_pose_and_twist(context)[7:])
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        pose = self._present(context)
+        pose = self._current_pose_and_twist(context)
         rotation = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
         angles = (rotation.yaw_angle(), rotation.pitch_angle(), rotation.roll_angle())
         output.SetFromVector([*pose[4:7], *angles, *([0.0] * 6)])
@@ -168,14 +168,14 @@ class ExternalMaster(LeafSystem):
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output[0] = context.get_discrete_state_vector().value()[_FAULT]
 
-    def _calc_both(self, context: Context, output: BasicVector) -> None:
+    def _calc_wrench_and_fault(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[:_ALLOWED])
 
     def _calc_hand(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(-context.get_discrete_state_vector().value()[:_FAULT])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        _display_step(
+        _update_displayed_wrench(
             self._command.Eval(context),
             context.get_numeric_parameter(self._path).value()[_HELD] > 0.5,
             self._period,

@@ -110,7 +110,7 @@ def _rotation_vector_rate(r, omega):
 
 
 @njit(cache=True)
-def _path_into(path, time, now, target, poles):
+def _start_path_into(path, time, now, target, poles):
     path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
     copy_into(path, _TARGET, target, 0, 7)
     rotation = quaternion_logarithm(quaternion_product(now, conjugate_quaternion(target)))
@@ -159,10 +159,10 @@ class LiveHand(Operator):
         """Start a smooth path to the pose X_BE `target` (7,); None releases the stylus."""
         path = np.zeros(_PATH)
         if target is not None:
-            _path_into(
+            _start_path_into(
                 path,
                 context.get_time(),
-                self._present_intention(context),
+                self._current_intention(context),
                 target,
                 _TRANSLATION_POLE,
             )
@@ -174,7 +174,7 @@ class LiveHand(Operator):
         if path[_HELD] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
-        intention = self._present_intention(context)
+        intention = self._current_intention(context)
         rotation = np.array(
             quaternion_logarithm(
                 quaternion_product(tuple(intention[:4]), conjugate_quaternion(tuple(pose[:4])))
@@ -190,10 +190,12 @@ class LiveHand(Operator):
         intention[4:7] = pose[4:] + displacement
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
-        _path_into(path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _SLOW_POLE)
+        _start_path_into(
+            path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _SLOW_POLE
+        )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def _present_intention(self, context: Context) -> Array:
+    def _current_intention(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
         _intention_into(path, context.get_time(), self._pose.Eval(context), self._scratch)
         return self._scratch
@@ -211,7 +213,7 @@ class LiveHand(Operator):
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._present_intention(context)[:7])
+        output.SetFromVector(self._current_intention(context)[:7])
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:

@@ -13,7 +13,12 @@ from urllib.parse import urlsplit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import Limits
-from drake_teleop.live.device_packets import CLUTCH_OPEN, DevicePose, DeviceState, plausible_state
+from drake_teleop.live.device_packets import (
+    CLUTCH_OPEN,
+    DevicePose,
+    DeviceState,
+    state_if_plausible,
+)
 
 _MAX_MESSAGE_BYTES, _TIMEOUT_S = 65536, 0.5  # bytes of a message, s
 _GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
@@ -44,7 +49,7 @@ def read_message(text: Any) -> Message | None:
     if not isinstance(name, str):
         return None
     flags = CLUTCH_OPEN if pressed else 0
-    state = plausible_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
+    state = state_if_plausible(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
     return None if state is None else Message(name, state)
 
 

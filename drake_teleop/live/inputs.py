@@ -1,4 +1,4 @@
-"""Inputs of a live session as integers, so that the record is exactly the simulated input."""
+"""Inputs of a live session as integers, exactly as recorded."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
 Array = NDArray[np.float64]
 
-OWN = "as in the scenario"
-NETWORKS = (OWN, *NETWORK_PRESETS, "custom")
-SENSORS = (OWN, *SENSOR_PRESETS)
+AS_IN_SCENARIO = "as in the scenario"
+NETWORKS = (AS_IN_SCENARIO, *NETWORK_PRESETS, "custom")
+SENSORS = (AS_IN_SCENARIO, *SENSOR_PRESETS)
 
 #: Name of the file with the inputs of a recorded drive.
-INPUTS = "inputs.csv"
+INPUTS_FILE = "inputs.csv"
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
-LENGTH, ANGLE = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
+LENGTH_UNIT_M, ANGLE_UNIT_RAD = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
 _SHARE_UNIT, _SCALE_UNIT = 1e-2, 1e-5
 MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
@@ -99,7 +99,7 @@ class Inputs:
     sensor: int = 0
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Inputs:
+    def from_scenario(cls, scenario: Scenario) -> Inputs:
         sigma, sigma_object, gamma = (
             round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()[:3]
         )
@@ -113,9 +113,9 @@ class Inputs:
             gamma=gamma,
             force_scale=round(config.force_scale / _SCALE_UNIT),
         )
-        return started.changed(initial_choices(scenario))
+        return started.with_changes(initial_choices(scenario))
 
-    def changed(self, values: Mapping[str, Any]) -> Inputs:
+    def with_changes(self, values: Mapping[str, Any]) -> Inputs:
         """Return the inputs with new values, clipped to their range; invalid ones are ignored."""
         changes = {}
         for name in values.keys() & RANGES.keys():
@@ -125,38 +125,40 @@ class Inputs:
         return dataclasses.replace(self, **changes) if changes else self
 
     @property
-    def target(self) -> tuple[int, ...]:
+    def hand_inputs(self) -> tuple[int, ...]:
         """Inputs that move the hand."""
         return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
 
     @property
-    def station(self) -> tuple[int, ...]:
+    def station_choices(self) -> tuple[int, ...]:
         """Inputs whose change requires a new station."""
         line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
         choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
         return (*choices, *line)
 
     @property
-    def channel(self) -> tuple[int, ...]:
+    def channel_choices(self) -> tuple[int, ...]:
         """Inputs that determine channel and passivity method."""
-        return self.station[:2] + self.station[6:]
+        return self.station_choices[:2] + self.station_choices[6:]
 
-    def pose(self, start: Array) -> Array | None:
+    def intended_pose(self, start: Array) -> Array | None:
         """Return the intended pose X_BE (7,) of the stylus; None if released."""
         if not self.held:
             return None
-        turn = quaternion_exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
-        return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
+        turn = quaternion_exponential(
+            tuple(ANGLE_UNIT_RAD * r for r in (self.rx, self.ry, self.rz))
+        )
+        return np.concatenate([turn, start + LENGTH_UNIT_M * np.array([self.x, self.y, self.z])])
 
-    def holding(self, pose: Array, start: Array) -> Inputs:
+    def with_held_pose(self, pose: Array, start: Array) -> Inputs:
         """Return the inputs that hold the stylus at the pose X_BE (7,)."""
         turn = quaternion_logarithm(tuple(pose[:4]))
-        places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
-        turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
-        return self.changed({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
+        places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH_UNIT_M, strict=True)
+        turns = zip(("rx", "ry", "rz"), (r / ANGLE_UNIT_RAD for r in turn), strict=True)
+        return self.with_changes({name: float(x) for name, x in (*places, *turns)} | {"held": 1})
 
     @property
-    def scales(self) -> dict[str, Any]:
+    def force_scales(self) -> dict[str, Any]:
         return {
             "sigma_weight": None if self.sigma_weight < 0 else _SHARE_UNIT * self.sigma_weight,
             "sigma_gripper": _SHARE_UNIT * self.sigma,
@@ -215,7 +217,7 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _COLUMNS:
-        raise _cannot_repeat("has choices as numbers and no version of this package", path)
+        raise _repeat_error("has choices as numbers and no version of this package", path)
     if tuple(lines[1:2]) != (list(_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
             "is not a record of a drive",
@@ -228,7 +230,7 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             found = recorded_with.get(name, "unknown")
             what = f"was recorded with {name} {found}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
-            raise _cannot_repeat(changed if name == "files" else what, path)
+            raise _repeat_error(changed if name == "files" else what, path)
     changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         raise DrakeTeleopError(
@@ -237,7 +239,7 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
     return changes
 
 
-def _cannot_repeat(what: str, path: Path) -> DrakeTeleopError:
+def _repeat_error(what: str, path: Path) -> DrakeTeleopError:
     remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {path.parent}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
@@ -256,7 +258,7 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _cannot_repeat(f"has an unknown {name}, {line[column]!r}", path)
+                raise _repeat_error(f"has an unknown {name}, {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:

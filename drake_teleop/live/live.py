@@ -17,7 +17,7 @@ from drake_teleop.common.files import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
-from drake_teleop.live.external_master import TICK_MS
+from drake_teleop.live.external_master import POSE_PERIOD_MS
 from drake_teleop.live.inputs import (
     CHOICES,
     MAX_DURATION_MS,
@@ -33,7 +33,7 @@ from drake_teleop.live.scenarios import SCENES
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
 
-Show = Callable[[dict[str, np.ndarray]], dict[str, Any]]
+ShowScene = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 """Function from rows of a log to the 3D scene's part of a frame."""
 
 #: Period of the frames for the page [s].
@@ -45,7 +45,7 @@ TOUCH_FORCE_N = 0.12
 # of messages.
 _SLEEP_AFTER_S, _SLICES_PER_TICK = 0.25, 4
 _MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
-_RELEASED = {"held": 0, "clutch": 0}
+_RELEASE_STYLUS = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
 
@@ -75,7 +75,7 @@ class Live:
         scenario: Scenario,
         load: IdentifiedLoad | None,
         record: Path | None,
-        show: Show,
+        show: ShowScene,
         now: float,
         link: DeviceLink | None = None,
         *,
@@ -83,7 +83,7 @@ class Live:
         begin: Mapping[str, int] | None = None,
     ) -> None:
         self._log, self._initial = log, begin or {}
-        self._link, self._slice_ms = link, SLICE_MS if link is None else TICK_MS
+        self._link, self._slice_ms = link, SLICE_MS if link is None else POSE_PERIOD_MS
         self.refused, self.requested_scene, self.scene = 0, "", SCENES[0]
         self._scenario, self._load, self._record, self._scene_part = scenario, load, record, show
         self._driver: int | None = None
@@ -104,7 +104,7 @@ class Live:
             self._scenario, self._load, log=log, record=folder, device=by_device
         )
         self._folder = "" if folder is None else str(folder)
-        self._session.apply(self._session.inputs.changed(self._initial))
+        self._session.apply_inputs(self._session.inputs.with_changes(self._initial))
         if self._link is not None:
             self._link.reset_origin(now)
         scaling = self._scenario.kinematic_scaling
@@ -114,12 +114,12 @@ class Live:
         self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
         self._requested, self._rates = self._session.inputs, RateInputs()
-        self._last_target = self._requested.target
+        self._last_target = self._requested.hand_inputs
         self._last_frame: dict[str, Any] = {}
-        self.pace.start(now)
+        self.pace.restart(now)
 
     def change_scene(
-        self, scenario: Scenario, load: IdentifiedLoad | None, show: Show, now: float
+        self, scenario: Scenario, load: IdentifiedLoad | None, show: ShowScene, now: float
     ) -> None:
         """Complete the record and start a new session with the requested scene."""
         self._scenario, self._load, self._scene_part = scenario, load, show
@@ -136,7 +136,7 @@ class Live:
     def reject_scene(self, why: str, now: float) -> None:
         """Continue the present scene; the page shows the reason `why`."""
         self.requested_scene, self._refusal = "", why
-        self.pace.start(now)
+        self.pace.restart(now)
 
     def hello(self) -> dict[str, Any]:
         """Return the scenario's constants, which a new page receives first."""
@@ -163,7 +163,10 @@ class Live:
         """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
-            self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
+            self._requested, self._rates = (
+                self._requested.with_changes(_RELEASE_STYLUS),
+                RateInputs(),
+            )
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
         message = parse_message(text)
@@ -177,16 +180,16 @@ class Live:
         if "set" in message:
             if not CHOICES.isdisjoint(message["set"]):
                 self._refusal = ""
-            self._requested = self._requested.changed(message["set"])
+            self._requested = self._requested.with_changes(message["set"])
             self._rates = RateInputs()
         if "rates" in message:
-            self._requested = self._rates.begin(message["rates"], self._requested, now)
+            self._requested = self._rates.set_rates(message["rates"], self._requested, now)
         if "slow" in message:
             self.pace.slow = message["slow"]
-            self.pace.start(now)
+            self.pace.restart(now)
         if "pause" in message and message["pause"] != self._paused:
             self._paused = message["pause"]
-            self.pace.start(now)
+            self.pace.restart(now)
         if "scene" in message and not self.requested_scene:
             self.requested_scene = message["scene"]
         if "reset" in message:
@@ -194,10 +197,10 @@ class Live:
 
     def _set_driver(self, client: int, now: float) -> None:
         self._driver = client
-        self._requested = self._session.inputs_at_stylus().changed({"clutch": 1})
+        self._requested = self._session.inputs_at_stylus().with_changes({"clutch": 1})
         self._rates = RateInputs()
         if self._asleep:
-            self.pace.start(now)
+            self.pace.restart(now)
         self._asleep = False
 
     @property
@@ -210,21 +213,21 @@ class Live:
 
     def wait(self, now: float) -> float:
         frame = self._frame_due - now
-        return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
+        return max(0.0, frame if self.is_idle else min(frame, self.pace.time_to_next_slice(now)))
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
         """Simulate at most four due slices of time; return a frame for the pages if one is due."""
         for _ in range(_SLICES_PER_TICK):
             now = clock()
-            if self.is_idle or self.pace.wait(now) > 0:
+            if self.is_idle or self.pace.time_to_next_slice(now) > 0:
                 break
-            self.pace.begin(now)
+            self.pace.begin_slice(now)
             self._simulate_slice(now)
         now = clock()
         self._poll_device(now)
         if self._driver is None and not self._asleep and now - self._alone_since >= _SLEEP_AFTER_S:
             self._asleep = True
-            self._stop_on_failure(self._session.flush)
+            self._stop_on_failure(self._session.write_log)
         # A new input or contact is shown at once; the schedule of frames then restarts.
         show_now = self._show_now and now >= self._last_frame_at + _MIN_FRAME_PERIOD_S
         if now < self._frame_due and not show_now:
@@ -235,12 +238,12 @@ class Live:
         return self.frame()
 
     def _poll_device(self, now: float) -> None:
-        if self._link is None or self._link.poll(now) is None:
+        if self._link is None or self._link.receive_state(now) is None:
             return
         self._alone_since = now
         if self._asleep:
             self._asleep = False
-            self.pace.start(now)
+            self.pace.restart(now)
 
     def _stop_on_failure(self, action: Callable[[], None]) -> None:
         try:
@@ -250,43 +253,43 @@ class Live:
 
     def _simulate_slice(self, now: float) -> None:
         by_device = {} if self._link is None else self._link.hand_inputs(now)
-        self._requested = self._rates.step(self._requested, 1e-3 * self._slice_ms, now)
-        self._show_now |= self._requested.target != self._last_target
-        self._last_target = self._requested.target
+        self._requested = self._rates.advance_inputs(self._requested, 1e-3 * self._slice_ms, now)
+        self._show_now |= self._requested.hand_inputs != self._last_target
+        self._last_target = self._requested.hand_inputs
         try:
-            self._session.apply(self._limit_motion(self._requested.changed(by_device)))
+            self._session.apply_inputs(self._limit_motion(self._requested.with_changes(by_device)))
         except _FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
-            if self._requested.station == present.station:
+            if self._requested.station_choices == present.station_choices:
                 self.stopped = to_one_line(str(error))
             else:  # there is no such station: keep the present one
                 self._refusal = to_one_line(str(error))
                 removed = {name: getattr(present, name) for name in CHOICES}
-                self._requested = self._requested.changed(removed)
+                self._requested = self._requested.with_changes(removed)
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
             pressed = self._session.contact_force() > TOUCH_FORCE_N
             self._show_now |= pressed and not self._pressed
             self._pressed = pressed
         if self._link is not None and not self.stopped:
-            self._link.send(self._session.force())
+            self._link.send_wrench(self._session.device_wrench())
         if self._session.ms >= MAX_DURATION_MS:
             self.stopped = "the limit of ten hours is reached"
 
     def _limit_motion(self, wanted: Inputs) -> Inputs:
         by_device = self._link is not None
         free = not self._session.inputs.held or (by_device and not wanted.clutch)
-        return self._limiter.step(wanted, free=free)
+        return self._limiter.limit_inputs(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
         rows = self._session.new_rows()
         if len(rows["t"]):
-            self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(
-                rows
-            )
+            self._last_frame = self._cockpit.page_values(
+                rows, self._session.inputs
+            ) | self._scene_part(rows)
         inputs = self._requested
         words = self._last_frame.get("words", [])
-        if self._session.filling:
+        if self._session.is_channel_filling:
             words = ["a new channel starts: the clutch is open until its packets arrive", *words]
         removed = self._session.removed_force()
         if removed > _MIN_REMOVED_FORCE_N:
@@ -296,9 +299,9 @@ class Live:
         return self._last_frame | {
             "words": words,
             "device": "" if self._link is None else self._link.status_text(),
-            "speed": round(self.pace.factor, 4),
+            "speed": round(self.pace.real_time_factor, 4),
             "slow": self.pace.slow,
-            "factor": round(self.pace.factor * self.pace.slow, 3),
+            "factor": round(self.pace.real_time_factor * self.pace.slow, 3),
             "late": round(1e3 * self.pace.lateness(), 1),
             "lost": round(self.pace.given_up, 2),
             "state": self._state(),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from drake_teleop.live.hand import LEAD_TIME_S
-from drake_teleop.live.inputs import ANGLE, LENGTH, RANGES, Inputs
+from drake_teleop.live.inputs import ANGLE_UNIT_RAD, LENGTH_UNIT_M, RANGES, Inputs
 
 _RATE_TIMEOUT_S = 1.0  # s
 # Lead time of the target, which compensates the lag of the hand at constant speed [s].
@@ -24,25 +24,25 @@ class RateInputs:
         self._at: dict[str, float] = {}
         self._end_time = 0.0
 
-    def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
+    def set_rates(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
         """Set new rates by input name [input units/s] for 1 s; return the inputs at this time."""
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
         self._end_time = now + _RATE_TIMEOUT_S
-        return inputs.changed(self._at)
+        return inputs.with_changes(self._at)
 
-    def step(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
+    def advance_inputs(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
         if not self._rates:
             return inputs
         if now > self._end_time:
-            return self.begin({}, inputs, now)
+            return self.set_rates({}, inputs, now)
         values = dict(self._at)
         for name, rate in self._rates.items():
             low, high = RANGES[name]
             self._at[name] = min(max(self._at[name] + slice_s * rate, low), high)
             values[name] = self._at[name] + _LEAD_TIMES[name] * rate
-        return inputs.changed(values)
+        return inputs.with_changes(values)
 
 
 class MotionLimiter:
@@ -51,20 +51,21 @@ class MotionLimiter:
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _Axis] = {}
         limits = (
-            (("x", "y", "z"), LENGTH, _TRANSLATION_LIMITS),
-            (("rx", "ry", "rz"), ANGLE, _ROTATION_LIMITS),
+            (("x", "y", "z"), LENGTH_UNIT_M, _TRANSLATION_LIMITS),
+            (("rx", "ry", "rz"), ANGLE_UNIT_RAD, _ROTATION_LIMITS),
         )
         for (names, unit, (speed, acceleration)), scale in zip(limits, scales, strict=True):
             units = slice_s / (unit * max(scale, 1e-3))
             change = slice_s * units * acceleration if device else math.inf
             self._axes |= {name: _Axis(units * speed, change, RANGES[name]) for name in names}
 
-    def step(self, inputs: Inputs, *, free: bool) -> Inputs:
+    def limit_inputs(self, inputs: Inputs, *, free: bool) -> Inputs:
         """Return the limited inputs of the next period; `free` permits jumps of the target."""
         followed = {
-            name: axis.step(getattr(inputs, name), free) for name, axis in self._axes.items()
+            name: axis.limit_target(getattr(inputs, name), free)
+            for name, axis in self._axes.items()
         }
-        return inputs.changed(followed)
+        return inputs.with_changes(followed)
 
 
 class _Axis:
@@ -72,22 +73,21 @@ class _Axis:
         self._speed, self._change, self._ends = speed, change, ends
         self._at = self._target = self._moved = 0.0
 
-    def step(self, target: float, free: bool) -> float:
+    def limit_target(self, target: float, free: bool) -> float:
         last, self._target = self._target, target
         if free:
             self._at, self._moved = target, 0.0
             return target
         behind = last - self._at
-        speed = target - last + math.copysign(self._braking(abs(behind)), behind)
-        least, most = (self._braking(abs(end - self._at)) for end in self._ends)
+        speed = target - last + math.copysign(self._max_braking_speed(abs(behind)), behind)
+        least, most = (self._max_braking_speed(abs(end - self._at)) for end in self._ends)
         speed = min(max(speed, -min(least, self._speed)), min(most, self._speed))
         change = min(max(speed - self._moved, -self._change), self._change)
         self._moved += change
         self._at += self._moved
         return self._at
 
-    def _braking(self, distance: float) -> float:
-        """Return the speed from which the axis can just stop within `distance`."""
+    def _max_braking_speed(self, distance: float) -> float:
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

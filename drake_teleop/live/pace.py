@@ -1,4 +1,4 @@
-"""Timing of simulation slices: simulated time follows a clock, or visibly falls behind."""
+"""Timing of simulation slices by a clock."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class Pace:
         self._slice = slice_s
         self._lateness: deque[float] = deque(maxlen=_STATISTICS_SLICES)
         self._starts: deque[float] = deque(maxlen=_STATISTICS_SLICES)
-        self.start(now)
+        self.restart(now)
 
-    def start(self, now: float) -> None:
+    def restart(self, now: float) -> None:
         self._due = now
         self._starts.clear()
 
-    def wait(self, now: float) -> float:
+    def time_to_next_slice(self, now: float) -> float:
         """Return the time until the next slice is due [s]."""
         return self._due - now
 
-    def begin(self, now: float) -> None:
+    def begin_slice(self, now: float) -> None:
         late = now - self._due
         if late > _MAX_LATENESS_S:
             self.given_up += late
@@ -45,7 +45,7 @@ class Pace:
         self._due += self._slice * self.slow
 
     @property
-    def factor(self) -> float:
+    def real_time_factor(self) -> float:
         """Simulated over elapsed time of the last 400 slices; 0 at first."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
@@ -60,7 +60,7 @@ class Pace:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable Python's garbage collector, whose pauses would delay slices, in this context."""
+    """Disable Python's garbage collector, which would delay slices."""
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -1,4 +1,4 @@
-"""3D scene of a live session for its page: the objects once, then their poses."""
+"""3D scene of a live session for its page."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ class PageScene:
                 meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
             self._scene = ReplayScene(meshcat, scenario, recorded)
             self.objects = _extract_objects(meshcat.StaticHtml())
-            self._scene.canvas = _Moves()  # only this thread may destroy Meshcat
+            self._scene.canvas = _SceneRecorder()  # only this thread may destroy Meshcat
         except _FAILURE_EXCEPTIONS as error:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
         """Return poses (4x4 matrices by columns) and sizes of the objects by path."""
-        moves = {} if self.failure else self._moves(rows)
+        moves = {} if self.failure else self._scene_changes(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 
-    def _moves(self, rows: Rows) -> dict[str, Any]:
-        moves = _Moves()
+    def _scene_changes(self, rows: Rows) -> dict[str, Any]:
+        moves = _SceneRecorder()
         try:
             self._scene.canvas = moves
             self._scene.show_sample(0.0, rows, -1)
@@ -61,14 +61,14 @@ class PageScene:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._fail(error)
             return {}
-        return moves.rounded()
+        return moves.rounded_changes()
 
     def _fail(self, error: BaseException) -> None:
         self.failure = to_one_line(f"no 3D scene: {error}")
         print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
 
 
-class _Moves:
+class _SceneRecorder:
     def __init__(self) -> None:
         self._poses: dict[str, NDArray[np.float64]] = {}
         self._sizes: dict[str, list[float]] = {}
@@ -79,7 +79,7 @@ class _Moves:
     def SetProperty(self, path: str, property: str, value: list[float], time: float) -> None:
         self._sizes[path] = [round(x, 4) for x in value]
 
-    def rounded(self) -> dict[str, Any]:
+    def rounded_changes(self) -> dict[str, Any]:
         matrices = np.array([*self._poses.values()]).round(5)
         if not np.isfinite(matrices).all():
             return {}

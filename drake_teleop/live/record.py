@@ -17,15 +17,15 @@ from pydrake.systems.analysis import Simulator
 from drake_teleop.common.files import make_folder, wrap_write_errors, write_text
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
-from drake_teleop.live.inputs import INPUTS, Inputs, csv_header, csv_row
+from drake_teleop.live.inputs import INPUTS_FILE, Inputs, csv_header, csv_row
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.simulation import LogOnDisk
 
-LOAD, SCENARIO = "load.npz", "scenario.yaml"
+LOAD_FILE, SCENARIO_FILE = "load.npz", "scenario.yaml"
 #: Marker file: the positions in the inputs are those of a haptic device.
-DEVICE = "device.txt"
+DEVICE_MARKER_FILE = "device.txt"
 
 
 def versions_and_digest(scenario: Scenario) -> dict[str, str]:
@@ -54,15 +54,18 @@ class Record:
         device: bool,
     ) -> None:
         make_folder(folder)
-        self._folder, path, self._last = folder, folder / INPUTS, ""
+        self._folder, path, self._last = folder, folder / INPUTS_FILE, ""
         with wrap_write_errors(path):  # mode x never overwrites another recorded drive
             self._file: TextIOWrapper = path.open("x", encoding="utf-8", newline="\n")
         try:
-            write_scenario(folder / SCENARIO, scenario)
+            write_scenario(folder / SCENARIO_FILE, scenario)
             if device:
-                write_text(folder / DEVICE, "x to rz of inputs.csv are the places of a device.\n")
+                write_text(
+                    folder / DEVICE_MARKER_FILE,
+                    "x to rz of inputs.csv are the places of a device.\n",
+                )
             if load is not None:
-                write_load(folder / LOAD, load)
+                write_load(folder / LOAD_FILE, load)
             self._append(csv_header(versions_and_digest(scenario)))
             self.write(0, inputs)
         except BaseException:
@@ -93,12 +96,12 @@ class Record:
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):  # the folder contains other files
-            for name in (INPUTS, SCENARIO, LOAD, DEVICE):
+            for name in (INPUTS_FILE, SCENARIO_FILE, LOAD_FILE, DEVICE_MARKER_FILE):
                 (self._folder / name).unlink(missing_ok=True)
             self._folder.rmdir()
 
 
-class LogBeside(LogOnDisk):
+class BackgroundLog(LogOnDisk):
     """Log written by a thread; only `finish` and the next write wait for the disk."""
 
     def __init__(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.inputs import NETWORKS, OWN, SENSORS, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS, SENSORS, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
@@ -56,7 +56,7 @@ def live_scenario(scenario: Scenario) -> Scenario:
     )
 
 
-def with_device(scenario: Scenario) -> Scenario:
+def with_task_space_device(scenario: Scenario) -> Scenario:
     """Return the scenario with a task-space device if its master is a serial arm."""
     if scenario.master.model not in (PHANTOM_NAME, LEADER_NAME):
         return scenario
@@ -96,7 +96,7 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
             distribution="gamma",
             loss=_LOSS_UNIT * inputs.loss,
         )
-    elif name != OWN:
+    elif name != AS_IN_SCENARIO:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSORS[inputs.sensor]]
@@ -125,7 +125,7 @@ def _object_phi(scenario: Scenario) -> Array:
     return payload - NominalSlave(empty.slave).arm.phi_load
 
 
-def adapted_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
+def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
     """Return the load estimate (16,) of `before`, adapted to load and sensor offsets of `now`."""
     if load is None:
         return None

@@ -42,7 +42,7 @@ from drake_teleop.live.device_link import DeviceConnection
 from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
 from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.scenarios import SCENES, live_scenario, load_scene, with_device
+from drake_teleop.live.scenarios import SCENES, live_scenario, load_scene, with_task_space_device
 from drake_teleop.live.session import Session
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
@@ -73,7 +73,7 @@ class LiveDrive:
     def __init__(
         self, scenario: Scenario, record: Path | None, port: int, device: str | None = None
     ) -> None:
-        setup = live_scenario(scenario if device is None else with_device(scenario))
+        setup = live_scenario(scenario if device is None else with_task_space_device(scenario))
         setup.check()
         if record is not None:
             make_folder(record)
@@ -88,15 +88,15 @@ class LiveDrive:
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
         self._page_numbers = itertools.count(1)  # of pages
         self._threads: list[threading.Thread] = []
-        self._start(self._run, setup, record)
+        self._start_thread(self._run, setup, record)
         try:
             self._ready.wait()
         except KeyboardInterrupt:
-            self._end()
+            self._stop_threads()
             raise
-        self._check()
+        self._raise_failure()
 
-    def _start(self, work: Callable[..., None], *arguments: Any) -> None:
+    def _start_thread(self, work: Callable[..., None], *arguments: Any) -> None:
         self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
         self._threads[-1].start()
 
@@ -109,7 +109,7 @@ class LiveDrive:
         self._scene_scenarios: dict[str, Scenario] = {}
         for name in SCENES:
             setup = load_scene(name, scenario)
-            self._scene_scenarios[name] = with_device(setup) if device else setup
+            self._scene_scenarios[name] = with_task_space_device(setup) if device else setup
             self._views[name] = PageScene(name, self._scene_scenarios[name])
             progress(len(self._views) / (1 + len(SCENES)))
         warm_up(scenario, self._load, device)
@@ -125,19 +125,19 @@ class LiveDrive:
             while not self._over.wait(0.2):
                 pass
         finally:
-            self._end()
-        self._check()
+            self._stop_threads()
+        self._raise_failure()
 
-    def until_signal(self) -> str:
+    def wait_for_signal(self) -> str:
         """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`."""
         try:
             self.wait()
             return "stop"
         except KeyboardInterrupt as signal:
-            self._check()
+            self._raise_failure()
             return str(signal) or "Ctrl-C"
 
-    def _check(self) -> None:
+    def _raise_failure(self) -> None:
         if self._failed is not None:
             raise self._failed
 
@@ -147,8 +147,8 @@ class LiveDrive:
         for thread in self._threads:
             thread.join()
 
-    def _end(self) -> None:
-        """Stop all threads within 4 s; Python may crash at exit while compiled code runs."""
+    def _stop_threads(self) -> None:
+        """Stop all threads; Python may crash at exit while compiled code runs."""
         self._stop.set()
         end = time.monotonic() + _END_TIMEOUT_S
         for thread in self._threads:
@@ -253,11 +253,11 @@ class LiveDrive:
 
         def identify() -> None:
             try:
-                found.set_result(_identify_load(scenario, self._until_stopped))
+                found.set_result(_identify_load(scenario, self._raise_when_stopped))
             except Exception as error:
                 found.set_exception(error)
 
-        self._start(identify)
+        self._start_thread(identify)
         while not found.done():
             if self._stop.is_set():
                 return
@@ -271,7 +271,7 @@ class LiveDrive:
             with contextlib.suppress(ConnectionClosed):
                 await page.send(self._hello(page))
 
-    def _until_stopped(self, name: str) -> UpdateProgress:
+    def _raise_when_stopped(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
                 raise DrakeTeleopError("the drive has ended")
@@ -349,8 +349,8 @@ def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> No
     """Compile the functions of the first simulation slices, which takes a minute once."""
     session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
-        cockpit.frame(session.new_rows(), session.inputs)
-        session.apply(session.inputs.changed({"z": z}))
+        cockpit.page_values(session.new_rows(), session.inputs)
+        session.apply_inputs(session.inputs.with_changes({"z": z}))
         session.advance()
     session.inputs_at_stylus()
 
@@ -409,7 +409,7 @@ def drive_command(
 ) -> None:
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
-    reason = live.until_signal()
+    reason = live.wait_for_signal()
     print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")

@@ -1,4 +1,4 @@
-"""Station that is simulated in slices of time and takes its inputs between them."""
+"""Station that is simulated in slices and takes inputs between them."""
 
 from __future__ import annotations
 
@@ -20,11 +20,18 @@ from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
-from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, read_inputs
-from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, LogBeside, Record, versions_and_digest
+from drake_teleop.live.inputs import INPUTS_FILE, SLICE_MS, Inputs, read_inputs
+from drake_teleop.live.record import (
+    DEVICE_MARKER_FILE,
+    LOAD_FILE,
+    SCENARIO_FILE,
+    BackgroundLog,
+    Record,
+    versions_and_digest,
+)
 from drake_teleop.live.scenarios import (
     CROSS_FADE_S,
-    adapted_estimate,
+    adapt_estimate,
     channel_fill_time,
     chosen_scenario,
 )
@@ -85,7 +92,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log, with missing signals of channel and contact detection added."""
+    """Return the log with missing signals added."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -128,14 +135,14 @@ class _Station:
         block = inner_side.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
         return block, block.GetMyMutableContextFromRoot(self.context)
 
-    def value(self, signal: str) -> NDArray[np.float64]:
+    def signal_value(self, signal: str) -> NDArray[np.float64]:
         values: NDArray[np.float64] = self.station.GetOutputPort(signal).Eval(self.context).copy()
         return values
 
-    def open(self, closed: bool) -> None:
+    def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def follow(self, other: _Station, channel_anew: bool) -> float:
+    def continue_from(self, other: _Station, channel_anew: bool) -> float:
         """Continue another station's state; return how long the clutch stays open [s]."""
         excluded = {"channel"} if channel_anew else set()
         if not self.scenario.load_estimator.enabled:
@@ -146,7 +153,7 @@ class _Station:
             sensor.reset_queue(context)
         wait_s = channel_fill_time(self.scenario) if channel_anew else 0.0
         cross_fade, context = self.block("cross_fade")
-        rendered = other.value("force_to_master")
+        rendered = other.signal_value("force_to_master")
         cross_fade.Begin(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
         if channel_anew:
             cross_fade.Limit(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
@@ -157,7 +164,7 @@ class _Station:
         if not channel_anew:
             return 0.0
         name = "pose_command" if other.scenario.is_direct else "pose_received"
-        command = other.value(name)
+        command = other.signal_value(name)
         scaling, context = self.block("kinematic_scaling")
         scaling.Open(context, command)
         if not self.scenario.is_direct:
@@ -188,7 +195,7 @@ class Session:
         device: bool = False,
     ) -> None:
         self.scenario, self._load, self._device = scenario, load, device
-        self.inputs, self.ms = Inputs.of(scenario), 0
+        self.inputs, self.ms = Inputs.from_scenario(scenario), 0
         self._start = np.array(scenario.master.position)
         self._station_count, self._rows_read, self._filled_at_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
@@ -196,37 +203,39 @@ class Session:
         self._record: Record | None = None
         if record is not None:
             self._record = Record(record, scenario, load, self.inputs, device=device)
-        self._on_disk: LogBeside | None = None
+        self._on_disk: BackgroundLog | None = None
         if log is not None:
-            self._on_disk = LogBeside(log, self._station.simulator, 0.0, add_missing_signals)
+            self._on_disk = BackgroundLog(log, self._station.simulator, 0.0, add_missing_signals)
         self._earlier_rows: list[SimulationResult] = []
         self._station.simulator.Initialize()
 
-    def apply(self, inputs: Inputs) -> None:
+    def apply_inputs(self, inputs: Inputs) -> None:
         """Set and record the inputs from now on; a changed choice replaces the station."""
         before = self.inputs
         if inputs == before:
             return
-        if inputs.station != before.station:
+        if inputs.station_choices != before.station_choices:
             self._swap_station(inputs)
         self.inputs = inputs
-        if inputs.target != before.target:
+        if inputs.hand_inputs != before.hand_inputs:
             hand, context = self._station.block("live_hand")
-            hand.SetTarget(context, inputs.pose(self._start))
-        if inputs.clutch != before.clutch or inputs.station != before.station:
-            self._station.open(bool(inputs.clutch) and self.ms >= self._filled_at_ms)
-        if inputs.scales != before.scales:
+            hand.SetTarget(context, inputs.intended_pose(self._start))
+        if inputs.clutch != before.clutch or inputs.station_choices != before.station_choices:
+            self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._filled_at_ms)
+        if inputs.force_scales != before.force_scales:
             scaling, context = self._station.block("force_scaling")
-            scaling.SetScales(context, **inputs.scales, duration=_SCALE_RAMP_S)
+            scaling.SetScales(context, **inputs.force_scales, duration=_SCALE_RAMP_S)
         if self._record is not None:
             self._record.write(self.ms, inputs)
 
     def _swap_station(self, inputs: Inputs) -> None:
         scenario = chosen_scenario(self.scenario, self._load, inputs)
         scenario.check()
-        estimate = adapted_estimate(self.scenario, self._load, scenario)
+        estimate = adapt_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        wait_s = station.follow(self._station, inputs.channel != self.inputs.channel)
+        wait_s = station.continue_from(
+            self._station, inputs.channel_choices != self.inputs.channel_choices
+        )
         if wait_s:
             self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:
@@ -239,7 +248,7 @@ class Session:
         self._station, self._rows_read, self._station_count = station, 0, self._station_count + 1
 
     @property
-    def filling(self) -> bool:
+    def is_channel_filling(self) -> bool:
         """Whether the clutch is open until a new channel delivers packets."""
         return self.ms < self._filled_at_ms
 
@@ -247,7 +256,7 @@ class Session:
         end = self.ms + ms
         if self.ms < self._filled_at_ms <= end:
             self._advance_to(self._filled_at_ms)
-            self._station.open(bool(self.inputs.clutch))
+            self._station.set_clutch(bool(self.inputs.clutch))
         self._advance_to(end)
         if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _PART_ROWS:
             self._on_disk.write_and_clear()
@@ -277,15 +286,15 @@ class Session:
         if part is None or not sink.num_samples():
             return 0.0
         force = sink.data()[part.start : part.start + 3, -1]
-        return self.inputs.scales["force_scale"] * math.sqrt(float(force @ force))
+        return self.inputs.force_scales["force_scale"] * math.sqrt(float(force @ force))
 
     def inputs_at_stylus(self) -> Inputs:
         """Return the inputs of a hand that takes the stylus at its present pose."""
-        return self.inputs.holding(self._station.value("pose_master"), self._start)
+        return self.inputs.with_held_pose(self._station.signal_value("pose_master"), self._start)
 
-    def force(self) -> NDArray[np.float64]:
+    def device_wrench(self) -> NDArray[np.float64]:
         """Return the wrench (6,) for the haptic device [N, N m]."""
-        return self._station.value("force_to_master")
+        return self._station.signal_value("force_to_master")
 
     def removed_force(self) -> float:
         """Return the force [N] that the limit after a channel change removes."""
@@ -294,7 +303,7 @@ class Session:
         cross_fade, context = self._station.block("cross_fade")
         return float(cross_fade.removed_force(context))
 
-    def flush(self) -> None:
+    def write_log(self) -> None:
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
@@ -317,7 +326,7 @@ class Session:
                 record.close(self.ms, self.inputs)
         finally:
             if record is None or self.ms:
-                self.flush()
+                self.write_log()
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,22 +354,22 @@ class Drive:
             while session.ms < ms:
                 session.advance(min(slice_ms, ms - session.ms))
                 progress(session.ms / end)
-            session.apply(inputs)
+            session.apply_inputs(inputs)
         session.close()
         return session.log() if log is None else SimulationResult.scan_parquet(log)
 
 
 def read_drive(folder: str | Path) -> Drive:
     folder = Path(folder)
-    scenario = LoadScenario(folder / SCENARIO)
-    changes = read_inputs(folder / INPUTS, versions_and_digest(scenario))
-    load = read_load(folder / LOAD)
+    scenario = LoadScenario(folder / SCENARIO_FILE)
+    changes = read_inputs(folder / INPUTS_FILE, versions_and_digest(scenario))
+    load = read_load(folder / LOAD_FILE)
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
-    if not known or (load is None and (folder / LOAD).exists()):
+    if not known or (load is None and (folder / LOAD_FILE).exists()):
         raise DrakeTeleopError(
             "is damaged, or not a load of a drive",
-            where=str(folder / LOAD),
+            where=str(folder / LOAD_FILE),
             remedy="record the drive again",
         )
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
-    return Drive(driven, load, changes, (folder / DEVICE).exists(), folder)
+    return Drive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)

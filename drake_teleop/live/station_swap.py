@@ -32,8 +32,8 @@ def copy_state(
 ) -> None:
     """Copy time, states and changeable parameters of the station `before` to `station`."""
     context.SetTime(then.get_time())
-    sources = dict(_blocks(before))
-    for path, block in _blocks(station):
+    sources = dict(_blocks_by_path(before))
+    for path, block in _blocks_by_path(station):
         source_block = sources.get(path)
         if (
             source_block is None
@@ -48,11 +48,11 @@ def copy_state(
         )
 
 
-def _blocks(diagram: Diagram, path: str = "") -> Iterator[tuple[str, System]]:
+def _blocks_by_path(diagram: Diagram, path: str = "") -> Iterator[tuple[str, System]]:
     for system in diagram.GetSystems():
         name = f"{path}/{system.get_name()}"
         if isinstance(system, Diagram):
-            yield from _blocks(system, name)
+            yield from _blocks_by_path(system, name)
         else:
             yield name, system
 

@@ -1,4 +1,4 @@
-"""Simulated haptic device in a simulated hand, for tests and for trying a link."""
+"""Simulated haptic device in a simulated hand."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class VirtualDevice:
         self.position, self.velocity = list(map(float, hand(0.0)[0])), [0.0, 0.0, 0.0]
         self.energy, self._t = 0.0, 0.0
 
-    def move(self, force: Sequence[float], seconds: float) -> None:
+    def simulate_motion(self, force: Sequence[float], seconds: float) -> None:
         """Simulate `seconds` under a constant force (3,) on the hand [N]."""
         steps = max(math.ceil(seconds * 1e3 * _STEPS_PER_MS - 1e-9), 1)
         h = seconds / steps

@@ -33,10 +33,10 @@ class Address:
                     remedy=f"use {', '.join(allowed)}",
                 )
 
-    def parameter(self, name: str) -> str | None:
+    def required_parameter(self, name: str) -> str | None:
         return self._parameters.get(name)
 
-    def numbers(self, name: str, count: int) -> list[float] | None:
+    def positive_numbers(self, name: str, count: int) -> list[float] | None:
         """Return a parameter of `count` positive numbers; None if it is absent."""
         text = self._parameters.get(name)
         if text is None:
@@ -53,7 +53,7 @@ class Address:
             )
         return values
 
-    def choice(self, name: str, among: tuple[str, ...]) -> str:
+    def choose_word(self, name: str, among: tuple[str, ...]) -> str:
         """Return a parameter among words, by default the first."""
         text = self._parameters.get(name, among[0])
         if text not in among:
@@ -64,7 +64,7 @@ class Address:
             )
         return text
 
-    def sign(self) -> float:
+    def wrench_sign(self) -> float:
         """Factor, 1 or -1, from the source's wrench to that of sensor on load, Eq. (1)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space

@@ -35,7 +35,7 @@ from drake_teleop.robots.streams import (
     Reading,
     ReadingFlag,
 )
-from drake_teleop.robots.watch import MODEL_ERROR, raw_noise
+from drake_teleop.robots.watch import MODEL_ERROR, unfiltered_noise
 
 FADE_TIME_S = 10.0
 """Time constant of the weights [s]."""
@@ -51,7 +51,7 @@ TRACKING_ERROR_S = 0.004
 """Delay error in a residual once the delay is known, besides the remaining correction [s]."""
 SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
-_SIGMAS, _MIN_SAMPLES = 5.0, 50  # samples before offsets are estimated
+_OUTLIER_SIGMAS, _MIN_SAMPLES = 5.0, 50  # samples before offsets are estimated
 
 Motion = tuple[float, Array]
 """Time [s], and s, omega, alpha (9,)."""
@@ -64,11 +64,11 @@ class DelayTracker:
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
     ) -> None:
         self.delay_s = delay_s
-        self._phi, self._noise = tuple(usable_phi(load)[0]), raw_noise(load, dt, cutoff_hz)
+        self._phi, self._noise = tuple(usable_phi(load)[0]), unfiltered_noise(load, dt, cutoff_hz)
         self._weights, self._offsets = self._noise**-2, load.offsets.copy()
         self._wrenches = np.zeros((3, 6))
         self._reset(-math.inf)
-        self.take((0.0, np.zeros(9)), self._offsets, (0.0, np.zeros(9)), (1.0, np.zeros(9)))
+        self.update_delay((0.0, np.zeros(9)), self._offsets, (0.0, np.zeros(9)), (1.0, np.zeros(9)))
         self._reset(-math.inf)  # the call above loads compiled code before the first sample
 
     def _reset(self, t: float) -> None:
@@ -76,7 +76,7 @@ class DelayTracker:
         self._samples, self._count, self._sums = 0, 0.0, np.zeros((5, 6))
         self._delay_error = INITIAL_ERROR_S
 
-    def take(self, at: Motion, wrench: Array, before: Motion, after: Motion) -> None:
+    def update_delay(self, at: Motion, wrench: Array, before: Motion, after: Motion) -> None:
         """Update the delay with a wrench (6,), its motion `at`, and the neighbouring motions."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
@@ -103,7 +103,7 @@ class DelayTracker:
 
     def _is_explained(self, residual: Array, slope: Array) -> bool:
         starting = self._samples < _MIN_SAMPLES
-        limit = _SIGMAS * self._noise + self._delay_error * np.abs(slope)
+        limit = _OUTLIER_SIGMAS * self._noise + self._delay_error * np.abs(slope)
         limit += MODEL_ERROR * np.abs(self._wrenches[0]) + starting * MAX_OFFSET_DRIFT
         offsets = self._offsets
         if not starting:
@@ -195,9 +195,9 @@ class PosedByJoints:
         parts = self._source.read(timeout_s)
         if parts is None:
             return None
-        return [self._converted(part) for part in parts if part.stream != POSE]
+        return [self._convert_to_pose(part) for part in parts if part.stream != POSE]
 
-    def _converted(self, part: Part) -> Part:
+    def _convert_to_pose(self, part: Part) -> Part:
         if part.stream != JOINTS:
             return part
         values = np.full(7, np.nan)  # an invalid pose, rejected later
@@ -238,9 +238,9 @@ class MotionWindow:
             self._size = self._weights.shape[1]
             self.reset()
 
-    def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
+    def add_part(self, part: Part, now: float) -> list[tuple[float, Array]]:
         """Return times [s] and motions [s, omega, alpha, known gravity] that a part completes."""
-        row = self._row(part)
+        row = self._motion_sample(part)
         if row is None:
             return []
         last = self._last
@@ -260,11 +260,11 @@ class MotionWindow:
             share = (self._next_t - last[0]) / max(part.t - last[0], 1e-9)
             self._rows.append(last[1] + share * (row - last[1]))
             if len(self._rows) == self._size:
-                found.append((self._next_t - self._size // 2 * self._dt, self._motion()))
+                found.append((self._next_t - self._size // 2 * self._dt, self._smoothed_motion()))
             self._next_t += self._dt
         return found
 
-    def _row(self, part: Part) -> Array | None:
+    def _motion_sample(self, part: Part) -> Array | None:
         values = part.values
         if part.flags or not (abs(part.t) < _MAX_TIME_S and (np.abs(values) < _MAX_VALUE).all()):
             return None
@@ -276,7 +276,7 @@ class MotionWindow:
         R_WF = rotation_matrices(values[None, :4] / size, "quaternion_wxyz")[0]
         return np.concatenate([(R_WF @ self._R_FS).ravel(), values[4:] + R_WF @ self._p_FS])
 
-    def _motion(self) -> Array:
+    def _smoothed_motion(self) -> Array:
         rows = np.array(self._rows)
         smooth, first, second = self._weights @ rows
         if rows.shape[1] == 6:
@@ -351,9 +351,9 @@ class Assembly:
         arrived = self._parts.read(timeout_s)
         if arrived is None:
             return None
-        return [reading for part, now in arrived for reading in self.take(part, now)]
+        return [reading for part, now in arrived for reading in self.complete_readings(part, now)]
 
-    def take(self, part: Part, now: float) -> list[Reading]:
+    def complete_readings(self, part: Part, now: float) -> list[Reading]:
         """Return the readings that a part, received at time `now` [s], completes."""
         if part.stream == WRENCH:
             self._clocks[0].update(part.t, now)
@@ -363,10 +363,10 @@ class Assembly:
             shift = -self.delay_s
             if self._parts.two_clocks:
                 shift += self._clocks[1].offset - self._clocks[0].offset
-            for t, motion in self._window.take(part, now):
+            for t, motion in self._window.add_part(part, now):
                 self._add_motion(t + shift, motion)
         found = []
-        while self._pending and (reading := self._complete(self._pending[0])) is not None:
+        while self._pending and (reading := self._make_reading(self._pending[0])) is not None:
             self._pending.popleft()
             found.append(reading)
         return found
@@ -382,7 +382,7 @@ class Assembly:
             while t - motions[0][0] > _BUFFER_S:
                 motions.popleft()
 
-    def _complete(self, part: Part) -> Reading | None:
+    def _make_reading(self, part: Part) -> Reading | None:
         values, flags, motions = np.zeros(VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):
@@ -397,7 +397,7 @@ class Assembly:
         motion = before[1] + share * (after[1] - before[1])
         values[6:] = motion[:9]
         if self._tracker is not None and not flags and np.isfinite(part.values).all():
-            self._tracker.take((part.t, values[6:]), part.values, before, after)
+            self._tracker.update_delay((part.t, values[6:]), part.values, before, after)
         return Reading(part.number, part.t, values, flags, motion[9:] if len(motion) > 9 else None)
 
     def close(self) -> None:

@@ -28,7 +28,7 @@ from drake_teleop.logs.causes.cause import CHANGE_CAUSES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_pass_log
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.robots.recording import Records
+from drake_teleop.robots.recording import SampleRecorder
 from drake_teleop.robots.streams import Source
 
 CONFIDENCE = 0.9998
@@ -86,7 +86,7 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> Evaluation:
-    """Identify the load of a record and compare its uncertainty with the tolerance."""
+    """Identify a record's load; compare its uncertainty with the tolerance."""
     count, found, why = len(tolerance.required_entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -197,7 +197,7 @@ _T = TypeVar("_T")
 
 def calibrate(
     source: Source[_T],
-    recorder: Records[_T],
+    recorder: SampleRecorder[_T],
     path: Path,
     tolerance: Tolerance,
     *,
@@ -222,7 +222,7 @@ def calibrate(
         return bool(result.known.all())
 
     def write_record() -> None:
-        if recorder.seconds:
+        if recorder.longest_part_s:
             move_earlier_recordings(*earlier)
             earlier.clear()
         recorder.write(path)
@@ -235,17 +235,17 @@ def calibrate(
                     break
                 for sample in samples:
                     recorder.add(sample)
-                    if pending is None and recorder.seconds >= next_length_s:
-                        next_length_s = max(FIRST_RECORD_S, RECORD_GROWTH * recorder.seconds)
+                    if pending is None and recorder.longest_part_s >= next_length_s:
+                        next_length_s = max(FIRST_RECORD_S, RECORD_GROWTH * recorder.longest_part_s)
                         write_record()
                         pending = executor.submit(evaluate)
                     if pending is not None and (not source.live or pending.done()):
                         done, pending = finish(pending.result()), None
                         if done:
                             break
-                done = done or recorder.seconds >= seconds
+                done = done or recorder.longest_part_s >= seconds
     except Exception:  # raised again: the record is kept whatever ended the loop
-        if recorder.seconds:
+        if recorder.longest_part_s:
             write_record()
         raise
     if pending is not None:

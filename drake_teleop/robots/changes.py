@@ -40,7 +40,7 @@ Report = tuple[float, str]
 """Time of a change [s], and the change in words."""
 
 
-class Changes:
+class ChangeMonitor:
     """Monitor that reports each change of sensor zero or load once, by `report`."""
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
@@ -52,7 +52,7 @@ class Changes:
         self._pending: Future[list[Report]] | None = None
         self._reported: list[float] = []
 
-    def take(self, reading: Reading, flags: int) -> None:
+    def add_reading(self, reading: Reading, flags: int) -> None:
         if flags & _INVALID_FLAGS:
             return
         if not 0.0 < reading.t - self._last < JUMP_S:
@@ -72,7 +72,7 @@ class Changes:
                 max(SETTLED_S, 0.5 * (t - self._flagged_since)), _MAX_RETRY_S
             )
             find = _find_changes_in_process if self._live else find_changes
-            self._pending = self._executor.submit(find, self._record(), self._dt)
+            self._pending = self._executor.submit(find, self._recorded_rows(), self._dt)
         if self._pending is not None and (self._pending.done() or not self._live):
             self._report_changes(self._pending)
             self._pending = None
@@ -83,7 +83,7 @@ class Changes:
             self._report_changes(self._pending)
         self._executor.shutdown()
 
-    def _record(self) -> Array:
+    def _recorded_rows(self) -> Array:
         first = self._count % len(self._rows)
         if self._count <= len(self._rows):
             return self._rows[: self._count].copy()
@@ -127,11 +127,11 @@ def find_changes(rows: Array, dt: float) -> list[Report]:
         for cause in causes_of_fit(state)
         if cause.name in CHANGE_CAUSES
         and cause.start_s is not None
-        and _decisive(state, cause.start_s)
+        and _is_decisive(state, cause.start_s)
     ]
 
 
-def _decisive(state: State, time: float) -> bool:
+def _is_decisive(state: State, time: float) -> bool:
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, S]
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_FORCE_STD:
@@ -152,8 +152,8 @@ def _change_text(cause: Cause) -> str:
             " tare, or a push that turns with the tool); tare the compensation too"
         )
     return (
-        f"t = {cause.start_s:.2f} s: another load, {cause.values['mass_change']:+.4g} kg; run"
-        " `calibrate` with it"
+        f"t = {cause.start_s:.2f} s: another load, {cause.values['mass_change']:+.4g} kg;"
+        " run `calibrate` with it"
     )
 
 

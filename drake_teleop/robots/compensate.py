@@ -16,26 +16,26 @@ from drake_teleop.common.files import move_earlier_recordings
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, handled_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
-from drake_teleop.robots.changes import Changes
+from drake_teleop.robots.changes import ChangeMonitor
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
-from drake_teleop.robots.connections import is_file, open_sink, open_source
+from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import Compensated, Reading, Sink, Source
-from drake_teleop.robots.udp import THIS_MACHINE, listening
-from drake_teleop.robots.watch import Detector, Watch
+from drake_teleop.robots.udp import LOCALHOST, open_udp_receiver
+from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
 _IDLE_S = 0.01  # period of zero wrenches while nothing comes
 
 
-class Control:
+class TareRequestPort:
     """UDP port of this machine that accepts the request `tare`."""
 
     def __init__(self, port: int) -> None:
-        self._socket = listening(THIS_MACHINE, port)
+        self._socket = open_udp_receiver(LOCALHOST, port)
         self._socket.setblocking(False)
         self.port = self._socket.getsockname()[1]
 
-    def answer(self, tare: Callable[[], str]) -> None:
+    def answer_request(self, tare: Callable[[], str]) -> None:
         """Answer a waiting request, if any."""
         try:
             request, sender = self._socket.recvfrom(64)
@@ -50,14 +50,14 @@ class Control:
         self._socket.close()
 
 
-def run(
+def compensate_stream(
     source: Source[Reading],
     compensator: Compensator,
     sink: Sink,
     *,
-    control: Control | None = None,
+    control: TareRequestPort | None = None,
     tare: bool = False,
-    changes: Changes | None = None,
+    changes: ChangeMonitor | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
     """Compensate readings until the source ends, or Ctrl-C; count wrenches and flags."""
@@ -91,12 +91,12 @@ def run(
                 out = compensator.step(reading, time.monotonic() if source.live else reading.t)
                 write(out)
                 if changes is not None:
-                    changes.take(reading, out.flags)
+                    changes.add_reading(reading, out.flags)
                 if compensator.good_count >= tare_count:
                     tare_count = np.inf
                     report(f"tare {compensator.tare()}")
             if control is not None:
-                control.answer(compensator.tare)
+                control.answer_request(compensator.tare)
     return counts
 
 
@@ -130,7 +130,7 @@ def compensate_command(
     found = Identification.load(load)
     readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)
 
-    def make(load: Identification) -> Compensator:
+    def make_compensator(load: Identification) -> Compensator:
         return Compensator(
             load,
             readings.dt,
@@ -142,28 +142,30 @@ def compensate_command(
             wait=getattr(readings, "wait", 0),
             predicted=predicted,
             largest=None if largest is None else np.repeat(largest, 3),
-            watch=Watch(load, readings.dt, cutoff_hz) if watch else None,
-            detector=None if free is None else Detector(load, free, readings.dt, cutoff_hz),
+            watch=ContactAndLoadMonitor(load, readings.dt, cutoff_hz) if watch else None,
+            detector=None
+            if free is None
+            else StreamContactDetector(load, free, readings.dt, cutoff_hz),
         )
 
-    compensator = make(found) if attach is None else attach(make)
+    compensator = make_compensator(found) if attach is None else attach(make_compensator)
 
     def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    file = [Path(sink)] if readings.live and is_file(sink) else []
+    file = [Path(sink)] if readings.live and is_file_address(sink) else []
     if earlier := move_earlier_recordings(*file):
         report(f"{sink} exists; it is moved to {earlier}")
     wrenches = open_sink(sink)
-    control_port = None if control is None else Control(control)
-    changes = Changes(readings.dt, live=readings.live, report=report) if watch else None
+    control_port = None if control is None else TareRequestPort(control)
+    changes = ChangeMonitor(readings.dt, live=readings.live, report=report) if watch else None
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
     report(f"late by {1e3 * late:.1f} ms")
     report(f"readings are stale after {1e3 * STALE_S:.0f} ms; invalid wrenches are zero")
     if largest is None:
         report("no --range: saturation of the sensor is not detected")
     try:
-        counts = run(
+        counts = compensate_stream(
             readings,
             compensator,
             wrenches,

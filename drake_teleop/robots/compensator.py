@@ -33,7 +33,7 @@ from drake_teleop.robots.compensation_step import (
     value_problem,
 )
 from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Reading, ReadingFlag
-from drake_teleop.robots.watch import Detector, Watch
+from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
 STALE_S = 0.05
 """Age of a reading above which the output wrench is zero [s]."""
@@ -82,7 +82,7 @@ class _RateCheck:
     def reset(self) -> None:
         self._count, self._flag = 0, 0
 
-    def flag(self, reading: Reading) -> int:
+    def wrong_rate_flag(self, reading: Reading) -> int:
         if self._count == 0:
             self._start_t, self._start_number = reading.t, reading.number
         self._count += 1
@@ -117,8 +117,8 @@ class Compensator:
         wait: int = 0,
         predicted: bool = False,
         largest: Array | None = None,
-        watch: Watch | None = None,
-        detector: Detector | None = None,
+        watch: ContactAndLoadMonitor | None = None,
+        detector: StreamContactDetector | None = None,
     ) -> None:
         self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
         self._weight_removed, self._dt = load.weight_removed, dt
@@ -146,7 +146,7 @@ class Compensator:
         # Load compiled code now; otherwise the first readings would be stale.
         value_problem(np.zeros(VALUES), self._largest, self._range)
         clip(self._eliminate(np.zeros(VALUES), np.zeros(3)), self._range)
-        self._tare_result()
+        self._compute_tare()
         self._reset_filters()
         self.good_count = 0
 
@@ -181,18 +181,18 @@ class Compensator:
         flags = self._reading_flags(reading, now)
         invalid = flags & ~_NONZERO_FLAGS
         if invalid & ~_GAP:
-            return self._zero(flags)
+            return self._zero_output(flags)
         if now - self._now > STALE_S:
             self._reset_filters()
         self._now, self._number, self._t = now, reading.number, reading.t
         self._delay_line.append(self._eliminate(reading.values, reading.gravity))
         if invalid:
-            return self._zero(flags)
+            return self._zero_output(flags)
         if self._watch is not None:
-            flags |= self._watch.flags(reading.values)
+            flags |= self._watch.reading_flags(reading.values)
         if self._detector is not None:
             flags &= ~_IN_CONTACT
-            flags |= self._detector.flags(reading.values, self._delay_line[-1][:6])
+            flags |= self._detector.contact_flag(reading.values, self._delay_line[-1][:6])
         wrench = self._delay_line[0].copy()
         if clip(wrench, self._range):
             flags |= _CLIPPED
@@ -202,7 +202,7 @@ class Compensator:
         """Return a zero wrench, flagged as stale, after `STALE_S` of silence; else None."""
         if now - self._now <= STALE_S:
             return None
-        return self._zero(_STALE)
+        return self._zero_output(_STALE)
 
     def time_to_stale(self, now: float) -> float:
         return max(0.0, self._now + STALE_S - now)
@@ -211,7 +211,7 @@ class Compensator:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_count < len(self._tare_rows):
             return f"refused: fewer than {TARE_S:g} s of good readings so far"
-        problem, step, offsets = self._tare_result()
+        problem, step, offsets = self._compute_tare()
         if problem == MOVES:
             return "refused: the sensor moves"
         if problem == VARIES:
@@ -230,7 +230,7 @@ class Compensator:
         self.good_count = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
-    def _tare_result(self) -> tuple[int, Array, Array]:
+    def _compute_tare(self) -> tuple[int, Array, Array]:
         mean, squares, offsets = np.zeros(VALUES + 6), np.zeros(VALUES + 6), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             add_to_statistics(row, float(number), mean, squares)
@@ -271,7 +271,7 @@ class Compensator:
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         else:
             flags |= _STALE
-        return flags | self._rate.flag(reading)
+        return flags | self._rate.wrong_rate_flag(reading)
 
     def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:
         self._min_offset, self._number, self._t = ahead, reading.number, reading.t
@@ -303,6 +303,6 @@ class Compensator:
         self.good_count += 1
         return out
 
-    def _zero(self, flags: int) -> Compensated:
+    def _zero_output(self, flags: int) -> Compensated:
         self.good_count = 0
         return Compensated(max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags))

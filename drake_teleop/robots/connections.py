@@ -21,8 +21,8 @@ from drake_teleop.robots.assembly import (
     pose_from_rpy,
 )
 from drake_teleop.robots.lines import LineSink, LineSource, TableSink
-from drake_teleop.robots.recording import PartRecorder, Recorder, Records
-from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.recording import PartRecorder, ReadingRecorder, SampleRecorder
+from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
@@ -52,7 +52,7 @@ def open_source(
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
     """
-    kind = _kind(address)
+    kind = _address_kind(address)
     if kind in PART_SOURCES:
         track = load if isinstance(delay, str) else None
         if isinstance(delay, str):
@@ -63,7 +63,7 @@ def open_source(
             cutoff_hz=cutoff_hz,
             delay_s=delay,
             track=track,
-            X_FS=_pose(sensor_pose),
+            X_FS=_pose_from_option(sensor_pose),
             weight_removed=load is not None and load.weight_removed,
         )
     if motion is not None or sensor_pose is not None or arm is not None:
@@ -75,9 +75,9 @@ def open_source(
     if kind == "replay":
         path = address.removeprefix(_REPLAY)
         options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
-        return LogSource(path, load, **options)  # type: ignore[arg-type]
+        return ReplayLogSource(path, load, **options)  # type: ignore[arg-type]
     if kind not in SOURCES:
-        remedy = f"give {_forms(SOURCES, PART_SOURCES)}, or replay:LOG"
+        remedy = f"give {_address_forms(SOURCES, PART_SOURCES)}, or replay:LOG"
         raise DrakeTeleopError("is not a source", where=address, remedy=remedy)
     if load is not None and load.weight_removed:
         raise missing_orientation_error(address)
@@ -92,36 +92,36 @@ def open_recording(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
-) -> tuple[Source[Any], Records[Any]]:
+) -> tuple[Source[Any], SampleRecorder[Any]]:
     """Return the stream that `calibrate` reads, and its recorder."""
-    kind = _kind(address)
+    kind = _address_kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
     if kind in PART_SOURCES:
         parts = _open_parts(address, rate_hz, motion, arm)
-        return parts, PartRecorder(parts, largest, _pose(sensor_pose))
+        return parts, PartRecorder(parts, largest, _pose_from_option(sensor_pose))
     readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose, "arm": arm}
-    return open_source(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
+    return open_source(address, None, rate_hz=rate_hz, **readings), ReadingRecorder(largest)  # type: ignore[arg-type]
 
 
-def is_file(address: str) -> bool:
-    return not _kind(address) and Path(address).suffix in SINKS
+def is_file_address(address: str) -> bool:
+    return not _address_kind(address) and Path(address).suffix in SINKS
 
 
 def open_sink(address: str) -> Sink:
-    kind = _kind(address) or Path(address).suffix
+    kind = _address_kind(address) or Path(address).suffix
     if kind not in SINKS:
-        remedy = f"give {_forms(SINKS)}"
+        remedy = f"give {_address_forms(SINKS)}"
         raise DrakeTeleopError("is not a sink", where=address, remedy=remedy)
     return SINKS[kind](address)
 
 
-def _forms(*tables: Registry[Any]) -> str:
+def _address_forms(*tables: Registry[Any]) -> str:
     names = (name for table in tables for name in table)
     return ", ".join(f"{name}://" if name[0].isalnum() else name for name in names)
 
 
-def _kind(address: str) -> str:
+def _address_kind(address: str) -> str:
     if address.startswith(_REPLAY):
         return "replay"
     return address.partition("://")[0] if "://" in address or address == "-" else ""
@@ -138,9 +138,9 @@ def _period(rate_hz: float | None, address: str) -> float:
 def _open_part_source(
     address: str, rate_hz: float | None, joints: tuple[str, ...] = ()
 ) -> PartSource:
-    kind = _kind(address)
+    kind = _address_kind(address)
     if kind not in PART_SOURCES:
-        remedy = f"give {_forms(PART_SOURCES)}"
+        remedy = f"give {_address_forms(PART_SOURCES)}"
         raise DrakeTeleopError("delivers no motion", where=address, remedy=remedy)
     return PART_SOURCES[kind](address, rate_hz, joints)
 
@@ -171,7 +171,7 @@ def _open_parts(
         raise
 
 
-def _pose(sensor_pose: tuple[float, ...] | None) -> Array:
+def _pose_from_option(sensor_pose: tuple[float, ...] | None) -> Array:
     return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)
 
 

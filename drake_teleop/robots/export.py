@@ -22,7 +22,7 @@ STANDARD_GRAVITY = 9.80665  #: m/s^2
 
 
 @dataclass(frozen=True)
-class Load:
+class ExportedLoad:
     """Load parameters to export, in SI units.
 
     Args:
@@ -37,7 +37,7 @@ class Load:
     offsets: Array
 
     @property
-    def six(self) -> tuple[float, ...]:
+    def inertia_entries(self) -> tuple[float, ...]:
         """Inertia xx, yy, zz, xy, xz, yz [kg m^2]."""
         i = self.inertia
         return i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]
@@ -54,7 +54,7 @@ class Format:
         comment: prefix of a comment line; "" for none.
     """
 
-    write: Callable[[Load], str]
+    write: Callable[[ExportedLoad], str]
     of_sensor: bool = False
     inertia: bool = True
     offsets: bool = False
@@ -63,14 +63,10 @@ class Format:
     note: str = ""
 
 
-def export(
-    found: Identification,
-    to: str,
-    *,
-    sensor_pose: Sequence[float] | None = None,
-    sign: int = -1,
+def export_text(
+    found: Identification, to: str, *, sensor_pose: Sequence[float] | None = None, sign: int = -1
 ) -> tuple[str, list[str]]:
-    """Return the text in the format `to`, and warnings of dropped or unidentified values.
+    """Return the text in the format `to`, and warnings.
 
     `sensor_pose` is x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame of the export;
     `sign` is -1 if the sensor reports the wrench of load on sensor (usual), else 1.
@@ -79,7 +75,7 @@ def export(
     if format.of_sensor:
         refuse_removed_weight(found, to)
     if sensor_pose is not None and format.of_sensor:
-        raise in_sensor_frame(to)
+        raise sensor_frame_error(to)
     x, y, z, *angles = [0.0] * 6 if sensor_pose is None else sensor_pose
     R_FS = rotation_matrices(np.radians([angles]), "euler", "xyz")[0]
     phi = transform_phi(found.phi, R_FS, [x, y, z])
@@ -87,16 +83,18 @@ def export(
         raise DrakeTeleopError(
             f"the load is not physically consistent (mass {found.mass:.4g} kg), as {to} requires",
             where="export",
-            remedy="use `identify --method consistent`; a negative mass means"
-            " that the sign of the wrench is wrong",
+            remedy=(
+                "use `identify --method consistent`; a negative mass means that the sign of the"
+                " wrench is wrong"
+            ),
         )
-    load = Load(*mass_com_inertia(phi), sign * found.offsets)
+    load = ExportedLoad(*mass_com_inertia(phi), sign * found.offsets)
     warnings = _warnings(found, to, format)
     notes = "".join(f"{format.comment} {text}\n" for text in warnings if format.comment)
     return notes + format.write(load), warnings
 
 
-def in_sensor_frame(to: str) -> DrakeTeleopError:
+def sensor_frame_error(to: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         f"{to} takes its values in the sensor's frame",
         where="export",
@@ -134,20 +132,21 @@ def _warnings(found: Identification, to: str, format: Format) -> list[str]:
     return [*warnings, format.note] if format.note else warnings
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return repr(float(value) + 0.0)
 
 
-def _row(values: Any) -> str:
-    return ", ".join(map(_number, values))
+def _format_row(values: Any) -> str:
+    return ", ".join(map(_format_number, values))
 
 
-def _ur(load: Load) -> str:
-    return f"set_target_payload({_number(load.mass)}, [{_row(load.com)}], [{_row(load.six)}])\n"
+def _ur(load: ExportedLoad) -> str:
+    com, inertia = _format_row(load.com), _format_row(load.inertia_entries)
+    return f"set_target_payload({_format_number(load.mass)}, [{com}], [{inertia}])\n"
 
 
-def _franka(load: Load) -> str:
-    return _json(
+def _franka(load: ExportedLoad) -> str:
+    return _json_text(
         {
             "mass": load.mass,
             "centerOfMass": load.com.tolist(),
@@ -157,41 +156,41 @@ def _franka(load: Load) -> str:
     )
 
 
-def _xarm(load: Load) -> str:
-    return f"arm.set_tcp_load({_number(load.mass)}, [{_row(1e3 * load.com)}])\n"
+def _xarm(load: ExportedLoad) -> str:
+    return f"arm.set_tcp_load({_format_number(load.mass)}, [{_format_row(1e3 * load.com)}])\n"
 
 
-def _kth(load: Load) -> str:
+def _kth(load: ExportedLoad) -> str:
     return to_yaml_text(
         {
-            "bias": _list(load.offsets),
+            "bias": _float_list(load.offsets),
             "gripper_com_frame_id": "ft_sensor",
-            "gripper_com_pose": [*_list(load.com), 0.0, 0.0, 0.0],
+            "gripper_com_pose": [*_float_list(load.com), 0.0, 0.0, 0.0],
             "gripper_mass": float(load.mass),
         }
     )
 
 
-def _ft_tools(load: Load) -> str:
+def _ft_tools(load: ExportedLoad) -> str:
     return to_yaml_text(
         {
             "mass": float(load.mass),
-            "sensor_frame_to_com": _list(load.com),
-            "force_offset": _list(load.offsets[:3]),
-            "torque_offset": _list(load.offsets[3:]),
+            "sensor_frame_to_com": _float_list(load.com),
+            "force_offset": _float_list(load.offsets[:3]),
+            "torque_offset": _float_list(load.offsets[3:]),
         }
     )
 
 
-def _admittance(load: Load) -> str:
-    centre = {"pos": _list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
+def _admittance(load: ExportedLoad) -> str:
+    centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
     compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
     parameters = {"gravity_compensation": compensation}
     return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
 
 
-def _bota(load: Load) -> str:
-    six = dict(zip(("Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"), load.six, strict=True))
+def _bota(load: ExportedLoad) -> str:
+    six = dict(zip(("Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"), load.inertia_entries, strict=True))
     bias = dict(zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), load.offsets.tolist(), strict=True))
     properties = {
         "mass": load.mass,
@@ -200,56 +199,63 @@ def _bota(load: Load) -> str:
         "bias": bias,
     }
     config = {"enable_dynamic_compensation": True, "payload_properties": properties}
-    return _json({"payload_compensator_config": config})
+    return _json_text({"payload_compensator_config": config})
 
 
 _INERTIA_NAMES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
-def _urdf(load: Load) -> str:
+def _urdf(load: ExportedLoad) -> str:
     root = Element("robot", name="load")
     inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
-    SubElement(inertial, "origin", xyz=_words(load.com), rpy="0 0 0")
-    SubElement(inertial, "mass", value=_number(load.mass))
-    SubElement(inertial, "inertia", dict(zip(_INERTIA_NAMES, map(_number, load.six), strict=True)))
-    return _xml(root)
+    SubElement(inertial, "origin", xyz=_space_separated(load.com), rpy="0 0 0")
+    SubElement(inertial, "mass", value=_format_number(load.mass))
+    SubElement(
+        inertial,
+        "inertia",
+        dict(zip(_INERTIA_NAMES, map(_format_number, load.inertia_entries), strict=True)),
+    )
+    return _xml_text(root)
 
 
-def _sdf(load: Load) -> str:
+def _sdf(load: ExportedLoad) -> str:
     root = Element("sdf", version="1.9")
     link = SubElement(SubElement(root, "model", name="load"), "link", name="load")
     inertial = SubElement(link, "inertial")
-    SubElement(inertial, "pose").text = f"{_words(load.com)} 0 0 0"
-    SubElement(inertial, "mass").text = _number(load.mass)
+    SubElement(inertial, "pose").text = f"{_space_separated(load.com)} 0 0 0"
+    SubElement(inertial, "mass").text = _format_number(load.mass)
     inertia = SubElement(inertial, "inertia")
-    for name, value in zip(_INERTIA_NAMES, load.six, strict=True):
-        SubElement(inertia, name).text = _number(value)
-    return _xml(root)
+    for name, value in zip(_INERTIA_NAMES, load.inertia_entries, strict=True):
+        SubElement(inertia, name).text = _format_number(value)
+    return _xml_text(root)
 
 
-def _mjcf(load: Load) -> str:
+def _mjcf(load: ExportedLoad) -> str:
     root = Element("mujoco", model="load")
     body = SubElement(SubElement(root, "worldbody"), "body", name="load")
     SubElement(body, "freejoint")
-    inertia = {"mass": _number(load.mass), "fullinertia": _words(load.six)}
-    SubElement(body, "inertial", {"pos": _words(load.com)} | inertia)
-    return _xml(root)
+    inertia = {
+        "mass": _format_number(load.mass),
+        "fullinertia": _space_separated(load.inertia_entries),
+    }
+    SubElement(body, "inertial", {"pos": _space_separated(load.com)} | inertia)
+    return _xml_text(root)
 
 
-def _xml(root: Element) -> str:
+def _xml_text(root: Element) -> str:
     indent(root)
     return tostring(root, encoding="unicode") + "\n"
 
 
-def _list(values: Array) -> list[float]:
+def _float_list(values: Array) -> list[float]:
     return [float(value) + 0.0 for value in values]
 
 
-def _words(values: Any) -> str:
-    return " ".join(map(_number, values))
+def _space_separated(values: Any) -> str:
+    return " ".join(map(_format_number, values))
 
 
-def _json(document: dict[str, Any]) -> str:
+def _json_text(document: dict[str, Any]) -> str:
     return json.dumps(document, indent=2) + "\n"
 
 
@@ -269,8 +275,10 @@ FORMATS = Registry(
             inertia=False,
             offsets=True,
             comment="#",
-            note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
-            " compensated force is twice the weight, change the sign of the mass",
+            note=(
+                f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+                " compensated force is twice the weight, change the sign of the mass"
+            ),
         ),
         "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
         "ros2-admittance": Format(

@@ -11,7 +11,7 @@ from drake_teleop.common.files import make_folder, wrap_write_errors
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import Compensated
-from drake_teleop.robots.udp import endpoint
+from drake_teleop.robots.udp import host_and_port
 
 PORT = 8765
 TOPIC = "/wrench"
@@ -37,7 +37,7 @@ class _Channel:
         self.context = foxglove.Context()
         self._channel = foxglove.Channel(TOPIC, schema=_SCHEMA, context=self.context)
 
-    def log(self, out: Compensated, ns: int | None) -> None:
+    def log_wrench(self, out: Compensated, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH_COLUMNS, wrench.tolist(), strict=True))
@@ -51,7 +51,7 @@ class FoxgloveSink:
     """Sink with a server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
-        host, port = endpoint(address, PORT)
+        host, port = host_and_port(address, PORT)
         self._channel = _Channel(address)
         import foxglove
 
@@ -64,7 +64,7 @@ class FoxgloveSink:
         self.port = self._server.port
 
     def write(self, out: Compensated) -> None:
-        self._channel.log(out, None)
+        self._channel.log_wrench(out, None)
 
     def close(self) -> None:
         self._channel.close()
@@ -85,7 +85,7 @@ class McapSink:
             )
 
     def write(self, out: Compensated) -> None:
-        self._channel.log(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
+        self._channel.log_wrench(out, round(1e9 * min(max(out.t, 0.0), 1e9 * 18)))
 
     def close(self) -> None:
         self._file.close()

@@ -127,13 +127,13 @@ class TableSink:
     def write(self, out: Compensated) -> None:
         self._rows.append(out)
         if time.monotonic() >= self._due:
-            self._flush()
+            self._write_rows()
 
     def close(self) -> None:
         if self._rows or not self._written:
-            self._flush()
+            self._write_rows()
 
-    def _flush(self) -> None:
+    def _write_rows(self) -> None:
         import polars as pl
 
         rows, table = len(self._rows), pl.DataFrame(self._columns())

@@ -31,7 +31,7 @@ _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
 _UNITS = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
-class Record(NamedTuple):
+class RdtRecord(NamedTuple):
     """Record of RDT, with the wrench in counts."""
 
     rdt_sequence: int
@@ -40,11 +40,11 @@ class Record(NamedTuple):
     counts: tuple[int, ...]
 
 
-def unpack_record(packet: bytes) -> Record | None:
+def unpack_record(packet: bytes) -> RdtRecord | None:
     if len(packet) != RECORD.size:
         return None
     rdt, ft, status, *counts = RECORD.unpack(packet)
-    return Record(rdt, ft, status, tuple(counts))
+    return RdtRecord(rdt, ft, status, tuple(counts))
 
 
 class NetFtSource:
@@ -54,8 +54,8 @@ class NetFtSource:
 
     def __init__(self, address: str, dt: float | None = None) -> None:
         parsed = Address(address, PORT, allowed=("counts", "rate", "sign"))
-        counts, rate = parsed.numbers("counts", 2), parsed.numbers("rate", 1)
-        sign = parsed.sign()
+        counts, rate = parsed.positive_numbers("counts", 2), parsed.positive_numbers("rate", 1)
+        sign = parsed.wrench_sign()
         if rate is None and dt is not None:
             rate = [1.0 / dt]
         if counts is None or rate is None:
@@ -81,13 +81,13 @@ class NetFtSource:
         try:
             while len(found) < _MAX_RECORDS:
                 packet = self._socket.recv(RECORD.size + 1)
-                found.append(self.part(packet, time.monotonic()))
+                found.append(self.part_of_packet(packet, time.monotonic()))
                 self._socket.settimeout(0.0)
         except OSError:  # no further record, or no box
             pass
         return found
 
-    def part(self, packet: bytes, now: float) -> Part:
+    def part_of_packet(self, packet: bytes, now: float) -> Part:
         """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
         record = unpack_record(packet)
         if record is None:
@@ -104,7 +104,7 @@ class NetFtSource:
             self._measured, self._measured_at = record.ft_sequence, now
         elif now - self._measured_at > _MAX_UNCHANGED_S:
             flags |= int(ReadingFlag.STALE)
-        t = self._pace.time_of(self._number, now)
+        t = self._pace.time_of_sample(self._number, now)
         return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
 
     def _request_stream(self) -> None:
@@ -171,7 +171,7 @@ class SampleClock:
         self._number, self._t = 0, 0.0
         self._first: tuple[int, float] | None = None
 
-    def time_of(self, number: int, now: float) -> float:
+    def time_of_sample(self, number: int, now: float) -> float:
         """Return the time [s] of a sample that is received at `now` [s] of our monotonic clock."""
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _JUMP_S:

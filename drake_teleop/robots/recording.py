@@ -1,4 +1,4 @@
-"""Recorders that collect the samples of a stream and write them as a log."""
+"""Recorders that write the samples of a stream as a log."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _CLOCK_SAMPLES = 50  # successive samples that confirm another clock
 _T = TypeVar("_T")
 
 
-class Records(ABC, Generic[_T]):
+class SampleRecorder(ABC, Generic[_T]):
     """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
     If a clock is set, a new record starts; the longest one is written.
@@ -63,15 +63,17 @@ class Records(ABC, Generic[_T]):
     def _empty_part(self) -> dict[str, _Samples]:
         return {stream: _Samples() for stream in self._largest}
 
-    def _add(self, stream: str, t: float, values: Array, flags: int, now: float = 0.0) -> None:
+    def _add_sample(
+        self, stream: str, t: float, values: Array, flags: int, now: float = 0.0
+    ) -> None:
         finite = math.isfinite(t) and bool(np.isfinite(values).all())
         saturated = (np.abs(values[:6]) >= self._largest[stream]).any()
         if not finite or flags & _INVALID_FLAGS or saturated:
             self.left_out += 1
             return
         samples, other = self._part[stream], self._other_clock[stream]
-        same_clock = not samples.jumps(t)
-        if same_clock or other.jumps(t):
+        same_clock = not samples.is_clock_jump(t)
+        if same_clock or other.is_clock_jump(t):
             self.left_out += len(other.t)
             other = self._other_clock[stream] = _Samples()
         self.left_out += not (samples if same_clock else other).add(t, values, now)
@@ -81,11 +83,11 @@ class Records(ABC, Generic[_T]):
             self._part, self._other_clock = self._other_clock, self._empty_part()
 
     def _longest_part(self) -> dict[str, _Samples]:
-        return max(self._part, self._longest, key=_seconds)
+        return max(self._part, self._longest, key=_duration_s)
 
     @property
-    def seconds(self) -> float:
-        return _seconds(self._longest_part())
+    def longest_part_s(self) -> float:
+        return _duration_s(self._longest_part())
 
     @abstractmethod
     def add(self, sample: _T) -> None:
@@ -95,7 +97,7 @@ class Records(ABC, Generic[_T]):
     def write(self, path: Path) -> None: ...
 
 
-class Recorder(Records[Reading]):
+class ReadingRecorder(SampleRecorder[Reading]):
     """Recorder of readings; `largest` (6,) is the range of the sensor [N, N m]."""
 
     file = "log.parquet"
@@ -105,15 +107,15 @@ class Recorder(Records[Reading]):
         super().__init__({WRENCH: largest})
 
     def add(self, sample: Reading) -> None:
-        self._add(WRENCH, sample.t, sample.values, sample.flags)
+        self._add_sample(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
-        t, values = self._longest_part()[WRENCH].table(VALUES, self.left_out)
+        t, values = self._longest_part()[WRENCH].times_and_values(VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
 
 
-class PartRecorder(Records[tuple[Part, float]]):
+class PartRecorder(SampleRecorder[tuple[Part, float]]):
     """Recorder of parts: wrenches, and poses or IMU samples.
 
     `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame.
@@ -136,25 +138,25 @@ class PartRecorder(Records[tuple[Part, float]]):
         flags = (
             part.flags if abs(size - 1.0) < _NORM_TOLERANCE else part.flags | ReadingFlag.DAMAGED
         )
-        self._add(part.stream, part.t, part.values, flags, now)
+        self._add_sample(part.stream, part.t, part.values, flags, now)
 
     def write(self, path: Path) -> None:
         import polars as pl
 
         wrench, motion = (self._longest_part()[stream] for stream in (WRENCH, self._motion_stream))
-        start = wrench.table(6, self.left_out)[0][0]
+        start = wrench.times_and_values(6, self.left_out)[0][0]
         behind = motion.min_offset - wrench.min_offset if self._two_clocks else 0.0
         for stream, samples, shift in (
             (WRENCH, wrench, -start),
             (self._motion_stream, motion, behind - start),
         ):
             names = [name for columns in _FIELDS[stream].values() for name in columns]
-            t, values = samples.table(len(names), self.left_out)
+            t, values = samples.times_and_values(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
-        write_text(path, to_yaml_text(self._description()))
+        write_text(path, to_yaml_text(self._log_description()))
 
-    def _description(self) -> dict[str, Any]:
+    def _log_description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY}
         for stream in (WRENCH, self._motion_stream):
             fields = {name: {"columns": list(names)} for name, names in _FIELDS[stream].items()}
@@ -173,7 +175,7 @@ class _Samples:
         self._values: list[Array] = []
         self.min_offset = math.inf
 
-    def jumps(self, t: float) -> bool:
+    def is_clock_jump(self, t: float) -> bool:
         return bool(self.t) and abs(t - self.t[-1]) > JUMP_S
 
     def add(self, t: float, values: Array, now: float) -> bool:
@@ -184,7 +186,7 @@ class _Samples:
         self.min_offset = min(self.min_offset, now - t)
         return True
 
-    def table(self, width: int, left_out: int) -> tuple[Array, Array]:
+    def times_and_values(self, width: int, left_out: int) -> tuple[Array, Array]:
         if len(self.t) < 2:
             raise DrakeTeleopError(
                 f"{len(self.t)} valid and {left_out} invalid readings received (minimum: 2 valid)",
@@ -194,5 +196,5 @@ class _Samples:
         return np.array(self.t), np.array(self._values).reshape(-1, width)
 
 
-def _seconds(part: dict[str, _Samples]) -> float:
+def _duration_s(part: dict[str, _Samples]) -> float:
     return min(samples.t[-1] - samples.t[0] if samples.t else 0.0 for samples in part.values())

@@ -19,10 +19,10 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
-    damaged,
-    domain_of,
+    damaged_part,
+    domain_of_address,
     source_topics,
-    topic_of,
+    topic_of_address,
 )
 from drake_teleop.robots.streams import NONZERO_FLAGS, Compensated, Part, ReadingFlag
 
@@ -95,7 +95,7 @@ class Ros2Source:
     @delayed_signals()
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
         parsed = parse_address(address, SOURCE_PARAMETERS)
-        self.dt, sign, domain = dt, parsed.sign(), domain_of(parsed)
+        self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = source_topics(parsed, joints)
         classes = {name: message_class(KINDS[name], address) for name in topics}
         self._converter = MessageConverter(sign, frames, joints)
@@ -131,7 +131,7 @@ class Ros2Source:
                         break
                     receive(*taken)
 
-    def _receiver(self, name: str, kind: Any) -> Callable[[bytes, Any], None]:
+    def _make_receiver(self, name: str, kind: Any) -> Callable[[bytes, Any], None]:
         from rclpy.serialization import deserialize_message
 
         def receive(message: bytes, info: Any) -> None:
@@ -140,16 +140,16 @@ class Ros2Source:
             try:
                 data = deserialize_message(message, kind)
             except Exception:  # of rmw, without a common type
-                self._found.append(damaged(name))
+                self._found.append(damaged_part(name))
                 return
-            self._found += self._converter.parts_of(name, data, number)
+            self._found += self._converter.parts_of_message(name, data, number)
 
         return receive
 
     def _subscribe(self, name: str, kind: Any, topic: str) -> tuple[Any, Callable[..., None]]:
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-        node, receive = self._node.node, self._receiver(name, kind)
+        node, receive = self._node.node, self._make_receiver(name, kind)
         if name == "tf":
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             node.create_subscription(kind, "/tf_static", self._converter.add_transforms, kept)
@@ -166,15 +166,15 @@ class Ros2Sink:
         parsed = parse_address(address, ("frame", "wrench", "domain"))
         from rclpy.qos import qos_profile_sensor_data
 
-        topic, domain = topic_of(parsed, parsed.path), domain_of(parsed)
-        self._which = parsed.choice("wrench", ("contact", "scaled"))
+        topic, domain = topic_of_address(parsed, parsed.path), domain_of_address(parsed)
+        self._which = parsed.choose_word("wrench", ("contact", "scaled"))
         kinds = [WRENCH_STAMPED]
         kinds += [f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")]
         kinds += ["diagnostic_msgs/msg/KeyValue"]
         classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in kinds}
         self._kinds = SimpleNamespace(**classes)
         self._message = self._kinds.WrenchStamped()
-        self._message.header.frame_id = parsed.parameter("frame") or ""
+        self._message.header.frame_id = parsed.required_parameter("frame") or ""
         self._node = shared_node(domain)
         self._topic, self._flags, self._next = f"/{topic}", -1, 0.0
         self._counts: Counter[str] = Counter()
@@ -187,7 +187,7 @@ class Ros2Sink:
     @delayed_signals()
     def write(self, out: Compensated) -> None:
         message, ns = self._message, time.time_ns()
-        _stamp(message.header, ns)
+        _set_stamp(message.header, ns)
         wrench = getattr(out, self._which).tolist()
         for vector, values in (
             (message.wrench.force, wrench[:3]),
@@ -199,12 +199,12 @@ class Ros2Sink:
         now = time.monotonic()
         if out.flags != self._flags or now >= self._next:
             self._flags, self._next = out.flags, now + _DIAGNOSTICS_S
-            self._diagnostics.publish(self._diagnosis(out, ns))
+            self._diagnostics.publish(self._diagnostics_message(out, ns))
 
     def close(self) -> None:
         self._node.close()
 
-    def _diagnosis(self, out: Compensated, ns: int) -> Any:
+    def _diagnostics_message(self, out: Compensated, ns: int) -> Any:
         kind = self._kinds.DiagnosticStatus
         level = kind.OK if not out.flags else kind.WARN
         if out.flags & ~NONZERO_FLAGS:
@@ -218,9 +218,9 @@ class Ros2Sink:
             values=values,
         )
         message = self._kinds.DiagnosticArray(status=[status])
-        _stamp(message.header, ns)
+        _set_stamp(message.header, ns)
         return message
 
 
-def _stamp(header: Any, ns: int) -> None:
+def _set_stamp(header: Any, ns: int) -> None:
     header.stamp.sec, header.stamp.nanosec = divmod(ns, 10**9)

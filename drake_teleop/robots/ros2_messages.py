@@ -26,8 +26,8 @@ SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 """Parameters of a source's address."""
 
 
-def domain_of(address: Address) -> int:
-    text = address.parameter("domain") or "0"
+def domain_of_address(address: Address) -> int:
+    text = address.required_parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         raise DrakeTeleopError(
             f"domain={text!r} is not a ROS domain",
@@ -37,7 +37,7 @@ def domain_of(address: Address) -> int:
     return int(text)
 
 
-def topic_of(address: Address, text: str) -> str:
+def topic_of_address(address: Address, text: str) -> str:
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
@@ -52,12 +52,12 @@ def source_topics(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
     """Return the topics in an address by name, the frames of `tf`, and the streams."""
-    topics = {WRENCH: topic_of(address, address.path)}
+    topics = {WRENCH: topic_of_address(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
-        if (text := address.parameter(stream)) is not None:
-            topics[stream] = topic_of(address, text)
+        if (text := address.required_parameter(stream)) is not None:
+            topics[stream] = topic_of_address(address, text)
     frames: tuple[str, ...] = ()
-    if (text := address.parameter("tf")) is not None:
+    if (text := address.required_parameter("tf")) is not None:
         frames, topics["tf"] = tuple(text.split(",")), "tf"
         if len(frames) != 2 or not all(frames):
             raise DrakeTeleopError(
@@ -74,7 +74,7 @@ def source_topics(
     return topics, frames, tuple(_STREAMS.get(name, name) for name in topics)
 
 
-def damaged(name: str) -> Part:
+def damaged_part(name: str) -> Part:
     return DAMAGED_WRENCH._replace(stream=_STREAMS.get(name, name))
 
 
@@ -87,7 +87,7 @@ class MessageConverter:
         self._sign, self._frames, self._joints = sign, frames, joints
         self._links: dict[str, tuple[str, Array]] = {}
 
-    def parts_of(self, name: str, data: Any, number: int) -> list[Part]:
+    def parts_of_message(self, name: str, data: Any, number: int) -> list[Part]:
         """Return the parts of a message with ROS's fields; `name` is a key of `KINDS`."""
         if name == "tf":
             samples = self._transform_pose(data)
@@ -105,21 +105,25 @@ class MessageConverter:
             X = each.transform
             self._links[each.child_frame_id] = (
                 each.header.frame_id,
-                _pose(X.translation, X.rotation),
+                _pose_array(X.translation, X.rotation),
             )
 
     def _values(self, name: str, data: Any) -> Array | None:
         if name == WRENCH:
             wrench = data.wrench
-            return self._sign * np.array([*_xyz(wrench.force), *_xyz(wrench.torque)])
+            return self._sign * np.array(
+                [*_vector_array(wrench.force), *_vector_array(wrench.torque)]
+            )
         if name == POSE:
-            return _pose(data.pose.position, data.pose.orientation)
+            return _pose_array(data.pose.position, data.pose.orientation)
         if name == JOINTS:
             positions = dict(zip(data.name, data.position, strict=False))
             if not self._joints or not all(joint in positions for joint in self._joints):
                 return None
             return np.array([positions[joint] for joint in self._joints], float)
-        return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
+        return np.array(
+            [*_vector_array(data.linear_acceleration), *_vector_array(data.angular_velocity)]
+        )
 
     def _transform_pose(self, data: Any) -> list[tuple[Any, Array]]:
         newest = {each.child_frame_id: each for each in data.transforms}
@@ -136,19 +140,19 @@ class MessageConverter:
             if frame in newest:
                 stamp = newest[frame].header.stamp
             frame, link = self._links[frame]
-            pose = _compose(link, pose)
+            pose = _compose_poses(link, pose)
         return []
 
 
-def _xyz(v: Any) -> tuple[float, float, float]:
+def _vector_array(v: Any) -> tuple[float, float, float]:
     return v.x, v.y, v.z
 
 
-def _pose(p: Any, q: Any) -> Array:
+def _pose_array(p: Any, q: Any) -> Array:
     return np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
 
 
-def _compose(a: Array, b: Array) -> Array:
+def _compose_poses(a: Array, b: Array) -> Array:
     q = tuple(a[:4].tolist())
     p = rotate_vector(q, tuple(b[4:].tolist()))
     return np.array([*quaternion_product(q, tuple(b[:4].tolist())), *(a[4:] + p)])

@@ -18,7 +18,7 @@ from drake_teleop.robots.calibration import DEFAULT_TOLERANCE
 from drake_teleop.robots.compensate import compensate_command
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.ros2 import parse_address, shared_node
-from drake_teleop.robots.ros2_messages import SOURCE_PARAMETERS, domain_of
+from drake_teleop.robots.ros2_messages import SOURCE_PARAMETERS, domain_of_address
 
 _SCALES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
 _CALIBRATION_END_S = 3.0  # longest time for the last evaluation of a calibration [s]
@@ -53,10 +53,14 @@ class ServedCompensator:
         node.declare_parameter("load", str(load))
         node.declare_parameter("until", DEFAULT_TOLERANCE)
         node.declare_parameter("seconds", 120.0)
-        node.add_on_set_parameters_callback(self._check)
+        node.add_on_set_parameters_callback(self._check_scales)
         node.add_post_set_parameters_callback(lambda _: self._set_scales())
-        node.create_service(Trigger, "~/tare", self._answer(lambda: self._current.tare()))
-        node.create_service(Trigger, "~/load", self._answer(self._load))
+        node.create_service(
+            Trigger, "~/tare", self._make_service_callback(lambda: self._current.tare())
+        )
+        node.create_service(
+            Trigger, "~/load", self._make_service_callback(self._reload_compensator)
+        )
         node.create_service(Trigger, "~/calibrate", self._answer_calibration)
 
     def __getattr__(self, name: str) -> Any:
@@ -71,15 +75,15 @@ class ServedCompensator:
                 process.kill()
         self._pool.shutdown()
 
-    def _value(self, name: str) -> Any:
+    def _parameter_value(self, name: str) -> Any:
         return self._node.get_parameter(name).value
 
     def _set_scales(self) -> None:
-        sigma, gamma, *others = (self._value(name) for name in _SCALES)
+        sigma, gamma, *others = (self._parameter_value(name) for name in _SCALES)
         weight, inertia = (None if value < 0.0 else value for value in others)
         self._current.set_scales(sigma, gamma, weight, inertia)
 
-    def _check(self, parameters: list[Any]) -> Any:
+    def _check_scales(self, parameters: list[Any]) -> Any:
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
@@ -91,7 +95,7 @@ class ServedCompensator:
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
-    def _answer(self, act: Callable[[], str]) -> Callable[[Any, Any], Any]:
+    def _make_service_callback(self, act: Callable[[], str]) -> Callable[[Any, Any], Any]:
         def answer(_request: Any, response: Any) -> Any:
             try:
                 response.message = act()
@@ -102,8 +106,8 @@ class ServedCompensator:
 
         return answer
 
-    def _load(self) -> str:
-        compensator = self._make(load := Identification.load(self._value("load")))
+    def _reload_compensator(self) -> str:
+        compensator = self._make(load := Identification.load(self._parameter_value("load")))
         self._current = compensator
         self._set_scales()
         return f"done: {load.mass:.4g} kg"
@@ -116,7 +120,7 @@ class ServedCompensator:
             response.message = "refused: a calibration runs already"
             return response
         words = [sys.executable, "-c", _CALIBRATE]
-        words += self._calibrate(self._value("until"), self._value("seconds"))
+        words += self._calibrate(self._parameter_value("until"), self._parameter_value("seconds"))
         process = self._process = subprocess.Popen(
             words,
             stdout=subprocess.DEVNULL,
@@ -131,7 +135,7 @@ class ServedCompensator:
         if status == 0:
             path = str(self._out / "identification.json")
             self._node.set_parameters([Parameter("load", value=path)])
-            return self._answer(self._load)(None, response)
+            return self._make_service_callback(self._reload_compensator)(None, response)
         advice = "interrupted"
         if status == 1:
             summary = json.loads((self._out / "summary.json").read_text(encoding="utf-8"))
@@ -157,16 +161,16 @@ def ros2_command(
             raise DrakeTeleopError(
                 "is not an address of a ROS topic", where=address, remedy="give ros2://TOPIC"
             )
-    node = shared_node(domain_of(parse_address(source, SOURCE_PARAMETERS)))
+    node = shared_node(domain_of_address(parse_address(source, SOURCE_PARAMETERS)))
     scales = {name: -1.0 if options.get(name) is None else options[name] for name in _SCALES}
     served: list[ServedCompensator] = []
 
-    def attach(make: Callable[[Identification], Compensator]) -> Any:
+    def serve_compensator(make: Callable[[Identification], Compensator]) -> Any:
         served.append(ServedCompensator(node.node, make, load, calibrate, out, scales))
         return served[0]
 
     try:
-        compensate_command(source, load, sink, attach=attach, **options)
+        compensate_command(source, load, sink, attach=serve_compensator, **options)
     finally:
         for each in served:
             each.close()

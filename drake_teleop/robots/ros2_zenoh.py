@@ -19,10 +19,10 @@ from drake_teleop.robots.ros2_messages import (
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
-    damaged,
-    domain_of,
+    damaged_part,
+    domain_of_address,
     source_topics,
-    topic_of,
+    topic_of_address,
 )
 from drake_teleop.robots.streams import Compensated, Part
 
@@ -65,7 +65,7 @@ def open_session(address: Address) -> Any:
 
 def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
     """Return the zenoh key of a topic, by default with any type hash."""
-    return f"{domain}/{topic}/{_dds(kind)}/{hashed}"
+    return f"{domain}/{topic}/{_dds_type_name(kind)}/{hashed}"
 
 
 def liveliness_tokens(
@@ -76,11 +76,11 @@ def liveliness_tokens(
     name = "%" + topic.replace("/", "%")
     return [
         f"{here}/0/NN/%/%/{node}",
-        f"{here}/1/MP/%/%/{node}/{name}/{_dds(kind)}/{hashed}/::,10:,:,:,,",
+        f"{here}/1/MP/%/%/{node}/{name}/{_dds_type_name(kind)}/{hashed}/::,10:,:,:,,",
     ]
 
 
-def attachment(number: int, ns: int, sender: bytes) -> bytes:
+def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
     """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
     return _ATTACHMENT.pack(number, ns, len(sender), sender)
 
@@ -93,12 +93,12 @@ def message_number(attached: bytes) -> int | None:
     return None
 
 
-def _dds(kind: str) -> str:
+def _dds_type_name(kind: str) -> str:
     package, _, name = kind.split("/")
     return f"{package}::msg::dds_::{name}_"
 
 
-class Messages(MessageConverter):
+class CdrConverter(MessageConverter):
     """Converter of ROS 2 messages in CDR."""
 
     def __init__(
@@ -121,8 +121,8 @@ class Messages(MessageConverter):
         try:
             data = self._types.deserialize_cdr(message, KINDS[name])
         except self._damaged:
-            return [damaged(name)]
-        return self.parts_of(name, data, number)
+            return [damaged_part(name)]
+        return self.parts_of_message(name, data, number)
 
 
 class ZenohSource:
@@ -133,10 +133,10 @@ class ZenohSource:
 
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
         parsed = Address(address, PORT, allowed=SOURCE_PARAMETERS)
-        self.dt, sign, domain = dt, parsed.sign(), domain_of(parsed)
+        self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = source_topics(parsed, joints)
         require_libraries(address)
-        self.messages = Messages(sign, frames, joints)
+        self.messages = CdrConverter(sign, frames, joints)
         self._queue: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
         self._session = open_session(parsed)
         for stream, topic in topics.items():
@@ -175,11 +175,11 @@ class ZenohSink:
 
     def __init__(self, address: str) -> None:
         parsed = Address(address, PORT, allowed=("frame", "wrench", "domain"))
-        domain, topic = domain_of(parsed), topic_of(parsed, parsed.path)
-        which = parsed.choice("wrench", ("contact", "scaled"))
+        domain, topic = domain_of_address(parsed), topic_of_address(parsed, parsed.path)
+        which = parsed.choose_word("wrench", ("contact", "scaled"))
         require_libraries(address)
         self._types, self._which = message_types(), which
-        self._frame = parsed.parameter("frame") or ""
+        self._frame = parsed.required_parameter("frame") or ""
         hashed = self._types.hash_rihs01(WRENCH_STAMPED)
         self._session = open_session(parsed)
         session = str(self._session.info.zid())
@@ -195,10 +195,10 @@ class ZenohSink:
     def write(self, out: Compensated) -> None:
         ns = time.time_ns()
         self._number += 1
-        message = self.message(getattr(out, self._which), ns)
-        self._publisher.put(message, attachment=attachment(self._number, ns, self._sender))
+        message = self.wrench_message(getattr(out, self._which), ns)
+        self._publisher.put(message, attachment=make_attachment(self._number, ns, self._sender))
 
-    def message(self, wrench: Array, ns: int) -> bytes:
+    def wrench_message(self, wrench: Array, ns: int) -> bytes:
         """Return a WrenchStamped in CDR; `wrench` (6,) [N, N m], `ns`: its time stamp [ns]."""
         kinds = self._types.types
         vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]

@@ -36,13 +36,18 @@ class RtdeSource:
                 "RTDE always uses port 30004", where=address, remedy="remove the port"
             )
         require_library("rtde_receive", "ur_rtde", "robots", address)
-        self._host, self._sign, self._partial, self._started = parsed.host, parsed.sign(), b"", 0.0
-        self._start()
+        self._host, self._sign, self._partial, self._started = (
+            parsed.host,
+            parsed.wrench_sign(),
+            b"",
+            0.0,
+        )
+        self._start_process()
         quaternion_exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
         deadline = time.monotonic() + _START_TIMEOUT_S
         while len(self._first) < _RATE_SAMPLES and (left := deadline - time.monotonic()) > 0.0:
-            self._first += self._samples(left)
+            self._first += self._read_samples(left)
         if len(self._first) < _RATE_SAMPLES:
             self.close()
             raise DrakeTeleopError(
@@ -54,17 +59,17 @@ class RtdeSource:
         self.dt = 0.002 if spacing < 0.005 else 0.008
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        samples, self._first = [*self._first, *self._samples(timeout_s)], []
-        return [part for sample in samples for part in parts_of(sample, self.dt, self._sign)]
+        samples, self._first = [*self._first, *self._read_samples(timeout_s)], []
+        return [part for sample in samples for part in parts_of_sample(sample, self.dt, self._sign)]
 
-    def _samples(self, timeout_s: float) -> list[tuple[float, ...]]:
+    def _read_samples(self, timeout_s: float) -> list[tuple[float, ...]]:
         if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
             return []
         block = os.read(self._pipe, _BLOCK_BYTES)
         if not block:
             if time.monotonic() - self._started > _RESTART_PERIOD_S:
-                self._stop()
-                self._start()
+                self._stop_process()
+                self._start_process()
             else:
                 time.sleep(min(timeout_s, _RESTART_PERIOD_S))
             return []
@@ -73,7 +78,7 @@ class RtdeSource:
         self._partial = block[complete:]
         return list(SAMPLE.iter_unpack(block[:complete]))
 
-    def _start(self) -> None:
+    def _start_process(self) -> None:
         code = "from drake_teleop.robots.rtde_reader import main; main()"
         self._pipe, into = os.pipe()
         self._child = subprocess.Popen(
@@ -85,16 +90,16 @@ class RtdeSource:
         os.close(into)
         self._partial, self._started = b"", time.monotonic()
 
-    def _stop(self) -> None:
+    def _stop_process(self) -> None:
         self._child.kill()
         self._child.wait()
         os.close(self._pipe)
 
     def close(self) -> None:
-        self._stop()
+        self._stop_process()
 
 
-def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
+def parts_of_sample(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
     values_of_stream = {

@@ -16,7 +16,7 @@ VARIABLES = ("timestamp", "ft_raw_wrench", "actual_TCP_pose", "actual_tool_accel
 _POLL_S, _MAX_SILENCE_S = 0.0002, 1.0
 
 
-def read(host: str, pipe: int) -> None:
+def write_samples_to_pipe(host: str, pipe: int) -> None:
     import rtde_receive
 
     robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(VARIABLES))
@@ -34,6 +34,6 @@ def read(host: str, pipe: int) -> None:
 
 def main() -> None:
     try:
-        read(sys.argv[1], int(sys.argv[2]))
+        write_samples_to_pipe(sys.argv[1], int(sys.argv[2]))
     finally:
         os._exit(0)  # ur_rtde takes a second to end

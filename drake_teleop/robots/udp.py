@@ -22,7 +22,7 @@ from drake_teleop.robots.streams import (
     ReadingFlag,
 )
 
-THIS_MACHINE = "127.0.0.1"
+LOCALHOST = "127.0.0.1"
 READING = struct.Struct("<4sIQd15d")
 POSED = struct.Struct("<4sIQd13d")
 WRENCH = struct.Struct("<4sIQd12d")
@@ -76,10 +76,10 @@ def unpack_wrench(packet: bytes) -> Compensated:
     return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
 
-def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
+def host_and_port(address: str, port: int | None = None) -> tuple[str, int]:
     try:
         parts = urlsplit(address)
-        host, port = parts.hostname or THIS_MACHINE, port if parts.port is None else parts.port
+        host, port = parts.hostname or LOCALHOST, port if parts.port is None else parts.port
     except ValueError:
         host, port = "", None
     if port is None:
@@ -91,7 +91,7 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
     return host, port
 
 
-def listening(host: str, port: int) -> socket.socket:
+def open_udp_receiver(host: str, port: int) -> socket.socket:
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.bind((host, port))
@@ -101,17 +101,17 @@ def listening(host: str, port: int) -> socket.socket:
     return receiver
 
 
-class _Receiver:
+class _PacketReceiver:
     def __init__(self, address: str, dt: float) -> None:
         self.dt = dt
-        self._socket = listening(*endpoint(address))
+        self._socket = open_udp_receiver(*host_and_port(address))
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self.port = self._socket.getsockname()[1]
 
-    def packets(self, timeout_s: float) -> list[bytes]:
+    def receive_packets(self, timeout_s: float) -> list[bytes]:
         found: list[bytes] = []
         if self._poll.poll(1e3 * timeout_s):
             with suppress(BlockingIOError):
@@ -123,26 +123,28 @@ class _Receiver:
         self._socket.close()
 
 
-class UdpSource(_Receiver):
+class UdpSource(_PacketReceiver):
     """Source of readings at udp://[HOST]:PORT."""
 
     live = True
 
     def read(self, timeout_s: float) -> list[Reading] | None:
-        return [unpack_reading(packet) for packet in self.packets(timeout_s)]
+        return [unpack_reading(packet) for packet in self.receive_packets(timeout_s)]
 
 
-class PosedSource(_Receiver):
+class PosedSource(_PacketReceiver):
     """Source of wrenches and poses at posed://[HOST]:PORT[?sign=-1]."""
 
     streams: tuple[str, ...] = (streams.WRENCH, streams.POSE)
 
     def __init__(self, address: str, dt: float) -> None:
-        self._sign = Address(address, None, allowed=("sign",), host=THIS_MACHINE).sign()
+        self._sign = Address(address, None, allowed=("sign",), host=LOCALHOST).wrench_sign()
         super().__init__(address, dt)
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        parts = [part for packet in self.packets(timeout_s) for part in unpack_parts(packet)]
+        parts = [
+            part for packet in self.receive_packets(timeout_s) for part in unpack_parts(packet)
+        ]
         signs = {streams.WRENCH: self._sign}
         return [part._replace(values=signs.get(part.stream, 1.0) * part.values) for part in parts]
 
@@ -151,7 +153,7 @@ class UdpSink:
     """Sink that sends wrenches to HOST:PORT, with or without a receiver."""
 
     def __init__(self, address: str) -> None:
-        self._to = endpoint(address)
+        self._to = host_and_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, out: Compensated) -> None:

@@ -30,7 +30,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.compensation_step import low_pass_into
-from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import ReadingFlag
 
 MODEL_ERROR = 0.02
@@ -42,17 +42,17 @@ _NEVER_REPLACED = 1e-12  # accuracy at which another load would replace the pres
 _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
-def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
+def unfiltered_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
     """Return a reading's white noise (6,) [N, N m] that explains the residual of `load`."""
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
 
-class Watch:
+class ContactAndLoadMonitor:
     """Detector of contact and of another load than the identified one."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
-        noise = raw_noise(load, dt, cutoff_hz)
+        noise = unfiltered_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
         self._parameters = change_detector_parameters(
             noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER_REPLACED
@@ -61,7 +61,7 @@ class Watch:
         self._covariance = limit_covariance(self._phi, load.covariance)
         self._fallback, self._dt = np.zeros(10), dt
         self.restart(load.offsets)
-        self.flags(np.concatenate([load.offsets, np.zeros(9)]))  # loads compiled code
+        self.reading_flags(np.concatenate([load.offsets, np.zeros(9)]))  # loads compiled code
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
@@ -69,7 +69,7 @@ class Watch:
         self._out = np.concatenate([offsets, self._phi])
         self._memory = initial_monitor_memory(self._out, self._covariance)
 
-    def flags(self, values: Array) -> int:
+    def reading_flags(self, values: Array) -> int:
         """Return the `ReadingFlag` bits of a valid reading (15,): contact, another load, or 0."""
         monitor_load(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
         state = monitor_state(self._memory)
@@ -85,8 +85,8 @@ _STATISTIC = "level"
 _RATE_TOLERANCE = 0.05
 
 
-class Detector:
-    """Contact detector with the noise floor of a log of free motion, after the causal low-pass."""
+class StreamContactDetector:
+    """Contact detector with the noise floor of a free-motion log."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class Detector:
     ) -> None:
         if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
             raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
-        source = LogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
+        source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
         if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
             raise DrakeTeleopError(
                 f"has {1.0 / source.dt:.4g} Hz, and the stream {1.0 / dt:.4g} Hz",
@@ -113,7 +113,7 @@ class Detector:
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
         contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
-        rows = self._low_passed(np.hstack([contact, values[:, 6:]]))
+        rows = self._low_pass_rows(np.hstack([contact, values[:, 6:]]))
         # Skip the transient of the low-passes.
         settled = rows[round(0.5 / (_GRAVITY_CUTOFF_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
@@ -126,14 +126,14 @@ class Detector:
             floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
         ).settings
         self.restart()
-        self.flags(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
+        self.contact_flag(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
         self.restart()
 
     def restart(self) -> None:
         self._memory = ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
-    def _low_passed(self, rows: Array) -> Array:
+    def _low_pass_rows(self, rows: Array) -> Array:
         filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
         out = np.empty((len(rows), 18))
         for row, to in zip(rows, out, strict=True):
@@ -142,7 +142,7 @@ class Detector:
             _filter_motion_into(row, self._fast, self._slow, filters, to[6:])
         return out
 
-    def flags(self, values: Array, contact: Array) -> int:
+    def contact_flag(self, values: Array, contact: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
         touched = _detect(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings

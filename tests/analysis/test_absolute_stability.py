@@ -33,7 +33,7 @@ def scanned_resistance(H: np.ndarray) -> np.ndarray:
 
     Each of 8 rounds tries 17 susceptances around the best of the previous round.
     """
-    h11, h12, h21, h22 = (entry[..., None] for entry in tp.entries(H))
+    h11, h12, h21, h22 = (entry[..., None] for entry in tp.matrix_entries(H))
     scale = np.where(h22.real != 0, np.abs(h22.real), 1.0)
     step = np.pi / 8
     angles = np.linspace(-np.pi, np.pi, 17)
@@ -51,7 +51,7 @@ def scanned_resistance(H: np.ndarray) -> np.ndarray:
 def test_llewellyn_agrees_with_search_over_lossless_loads():
     H = random_two_ports(5000, 1)
     stable = (scanned_resistance(H) >= 0) & (H[:, 1, 1].real >= 0)
-    assert np.array_equal(ab.absolutely_stable(H), stable)
+    assert np.array_equal(ab.is_absolutely_stable(H), stable)
     assert 1000 < np.sum(stable) < 4000
     # Random loads are independent of the search.
     rng = np.random.default_rng(2)
@@ -83,8 +83,8 @@ def test_worst_loads_are_unstable_where_llewellyn_fails():
     proven = 0
     while proven < 300:
         axis = random_station(rng)
-        H = tp.hybrid(axis, S)
-        failing = np.flatnonzero(~ab.absolutely_stable(H))
+        H = tp.hybrid_matrix(axis, S)
+        failing = np.flatnonzero(~ab.is_absolutely_stable(H))
         if not failing.size:
             continue
         i = rng.choice(failing)
@@ -95,7 +95,7 @@ def test_worst_loads_are_unstable_where_llewellyn_fails():
             return s * x / w if x > 0 else -w * x / s
 
         def felt(s, axis=axis, environment=environment):
-            return tp.transmitted_impedance(tp.hybrid(axis, s), environment(s))
+            return tp.transmitted_impedance(tp.hybrid_matrix(axis, s), environment(s))
 
         # The hand's reactance is made of a spring and a mass that dominates the loop's.
         slope = abs(felt(1j * w * 1.0001) - felt(1j * w)) / (1e-4 * w)
@@ -117,7 +117,7 @@ def test_worst_loads_are_unstable_where_llewellyn_fails():
 
 def test_passive_implies_absolutely_stable_but_not_the_reverse():
     H = random_two_ports(20000, 4)
-    passive, stable = ab.passive(H), ab.absolutely_stable(H)
+    passive, stable = ab.is_passive(H), ab.is_absolutely_stable(H)
     assert not np.any(passive & ~stable)
     assert np.sum(passive) > 500
     assert np.sum(stable & ~passive) > 500
@@ -125,32 +125,36 @@ def test_passive_implies_absolutely_stable_but_not_the_reverse():
     least = np.linalg.eigvalsh(H + np.conj(np.swapaxes(H, 1, 2)))[:, 0]
     assert np.array_equal(passive, least >= 0)
     # With a suitable power ratio both criteria are equal.
-    even = tp.power_scaled(H, np.abs(H[:, 0, 1] / H[:, 1, 0]))
-    np.testing.assert_allclose(ab.raisbeck(even), 2 * ab.llewellyn(H), rtol=1e-9, atol=1e-9)
+    even = tp.scale_slave_power(H, np.abs(H[:, 0, 1] / H[:, 1, 0]))
+    np.testing.assert_allclose(
+        ab.raisbeck_criterion(even), 2 * ab.llewellyn_criterion(H), rtol=1e-9, atol=1e-9
+    )
 
 
 def test_scales_alone_are_passive_on_scaled_ports():
     axis = OneAxis(ideal_servo=True, force_scale=1 / 17.5, position_scale=2.0, gamma=1.4)
-    H = tp.hybrid(axis, S)
-    assert np.all(ab.raisbeck(H) < -1)
-    scaled = tp.power_scaled(H, tp.power_ratio(axis))
-    np.testing.assert_allclose(ab.raisbeck(scaled), 0.0, atol=1e-12)
-    assert np.all(ab.passive(scaled))
-    np.testing.assert_allclose(ab.llewellyn(scaled), ab.llewellyn(H), atol=1e-12)
+    H = tp.hybrid_matrix(axis, S)
+    assert np.all(ab.raisbeck_criterion(H) < -1)
+    scaled = tp.scale_slave_power(H, tp.power_ratio(axis))
+    np.testing.assert_allclose(ab.raisbeck_criterion(scaled), 0.0, atol=1e-12)
+    assert np.all(ab.is_passive(scaled))
+    np.testing.assert_allclose(
+        ab.llewellyn_criterion(scaled), ab.llewellyn_criterion(H), atol=1e-12
+    )
 
 
 def pd_station(omega, axis):
     """Return the two-port of a position-force station with a PD servo."""
     s = 1j * omega
     Z_s, C = 3.13 * s, 300 + 9000 / s
-    return tp.hybrid(axis, s, servo=(C / (Z_s + C), 1 / (Z_s + C)))
+    return tp.hybrid_matrix(axis, s, servo=(C / (Z_s + C), 1 / (Z_s + C)))
 
 
 def test_position_force_is_not_absolutely_stable_even_without_delay():
     omega = np.geomspace(1.0, 1e4, 4000)
     axis = OneAxis(device_damping=0.0, sigma=0.0)
     H = pd_station(omega, axis)
-    assert not np.any(ab.absolutely_stable(H)[omega > 100])
+    assert not np.any(ab.is_absolutely_stable(H)[omega > 100])
     needed = ab.required_damping(H)
     assert np.max(needed) == pytest.approx(890, rel=0.01)
     # 890 is the value at 10^4 rad/s; it grows without limit, k_f m_s w / 2.
@@ -160,28 +164,28 @@ def test_position_force_is_not_absolutely_stable_even_without_delay():
         assert last == pytest.approx(3.13 * w / 17.5 / 2, rel=1e-2)
     # It is the damping at which no lossless load gives a negative resistance.
     some = slice(1000, None, 100)
-    less = tp.absorb(H, hand=0.999 * needed)
-    more = tp.absorb(H, hand=1.001 * needed)
+    less = tp.absorb_impedances(H, hand=0.999 * needed)
+    more = tp.absorb_impedances(H, hand=1.001 * needed)
     assert np.all(scanned_resistance(less)[some] < 0)
     assert np.all(scanned_resistance(more)[some] > 0)
     # The station's servo damps the slave's velocity and requires much less.
-    paper = tp.hybrid(OneAxis(device_damping=0.0), 1j * np.geomspace(0.01, 1e6, 4000))
+    paper = tp.hybrid_matrix(OneAxis(device_damping=0.0), 1j * np.geomspace(0.01, 1e6, 4000))
     assert np.max(ab.required_damping(paper)) == pytest.approx(95.1, abs=0.1)
 
 
 def test_structured_singular_value_agrees_with_llewellyn():
     H = random_two_ports(20000, 5)
     reference = (2.0, 0.5)
-    mu = ab.structured_singular_value(tp.scattering(H, reference))
-    assert np.array_equal(mu <= 1, ab.absolutely_stable(H))
+    mu = ab.structured_singular_value(tp.scattering_matrix(H, reference))
+    assert np.array_equal(mu <= 1, ab.is_absolutely_stable(H))
     # It does not depend on the power ratio, in contrast to the norm, which is an upper bound.
-    scaled = tp.scattering(tp.power_scaled(H, 7.0), reference)
+    scaled = tp.scattering_matrix(tp.scale_slave_power(H, 7.0), reference)
     np.testing.assert_allclose(ab.structured_singular_value(scaled), mu, rtol=1e-9)
     assert np.all(mu <= ab.scattering_norm(scaled) * (1 + 1e-12))
 
 
 def test_structured_singular_value_is_the_largest_gain_of_passive_terminations():
-    scattered = tp.scattering(random_two_ports(30, 6))
+    scattered = tp.scattering_matrix(random_two_ports(30, 6))
     turns = np.exp(2j * np.pi * np.linspace(0, 1, 5001))
     for one, mu in zip(scattered, ab.structured_singular_value(scattered), strict=True):
         loads = np.zeros((len(turns), 2, 2), dtype=complex)
@@ -226,7 +230,7 @@ def members(hand: ab.ImpedanceRange, wall: ab.ImpedanceRange, n: int):
 
 def test_can_oscillate_finds_a_region_inside_the_other():
     """No edges cross, but a member oscillates."""
-    direct, omega = tp.two_port(np.zeros(1), 1.0, -1.0, 0.0), np.array([2.0])  # Z_to = Z_e
+    direct, omega = tp.two_port_matrix(np.zeros(1), 1.0, -1.0, 0.0), np.array([2.0])  # Z_to = Z_e
     large = ab.ImpedanceRange((-10.0, 10.0), (-10.0, 10.0), (0.0, 0.0))
     small = ab.ImpedanceRange((0.9, 1.1), (-1.1, -0.9), (0.0, 0.0))
     mirrored = ab.ImpedanceRange((-1.1, -0.9), (0.9, 1.1), (0.0, 0.0))
@@ -260,7 +264,7 @@ def test_ranges_without_delay_agree_with_roots_of_their_members():
         growth = roots(axis, *members(hand, wall, 5))
         if np.max(growth) < 0 and np.max(growth) > -0.02 * abs(np.min(growth)):
             continue  # The grid of members is too coarse.
-        H = tp.hybrid(axis, 1j * omega)
+        H = tp.hybrid_matrix(axis, 1j * omega)
         oscillates = np.any(ab.can_oscillate(H, omega, hand, wall))
         mixed = np.min(growth) < 0 < np.max(growth)
         counts[int(mixed), int(oscillates)] += 1
@@ -285,7 +289,7 @@ def first_crossing(mass, damping, stiffness, contact):
 
 @pytest.mark.parametrize(
     "hand",
-    [ab.range_of_grips(), ab.ImpedanceRange((0.099, 0.101), (1.98, 2.02), (49.0, 51.0))],
+    [ab.impedance_range_of_grips(), ab.ImpedanceRange((0.099, 0.101), (1.98, 2.02), (49.0, 51.0))],
     ids=["all grips", "light grip"],
 )
 def test_ranges_with_delay_agree_with_closed_form_of_their_members(hand):
@@ -301,7 +305,7 @@ def test_ranges_with_delay_agree_with_closed_form_of_their_members(hand):
     omega = np.linspace(5.0, 120.0, 3000)
 
     def quiet(delay):
-        H = tp.hybrid(OneAxis(ideal_servo=True, delay=delay), 1j * omega)
+        H = tp.hybrid_matrix(OneAxis(ideal_servo=True, delay=delay), 1j * omega)
         return not np.any(ab.can_oscillate(H, omega, hand, wall))
 
     first = np.min(trips) / 2
@@ -322,15 +326,15 @@ def last(holds, high):
 def test_disc_criterion_is_conservative_by_the_known_factor():
     """Softest rejected wall, by the discs and exactly; Llewellyn rejects all of them."""
     omega = np.geomspace(0.5, 3000.0, 1500)
-    hand = ab.range_of_grips()
+    hand = ab.impedance_range_of_grips()
     for force_scale, delay, exact in (
         (1 / 17.5, 0.0, 3484),
         (1 / 17.5, 0.02, 888),
         (1, 0.005, 112),
     ):
         axis = OneAxis(force_scale=force_scale, delay=delay)
-        H = tp.hybrid(axis, 1j * omega)
-        assert not np.all(ab.absolutely_stable(tp.absorb(H, hand=hand.damping[0])))
+        H = tp.hybrid_matrix(axis, 1j * omega)
+        assert not np.all(ab.is_absolutely_stable(tp.absorb_impedances(H, hand=hand.damping[0])))
 
         def wall(stiffness):
             return ab.ImpedanceRange((0.0, 0.0), (0.0, 0.1), (0.0, stiffness))
@@ -349,10 +353,10 @@ def test_disc_criterion_is_conservative_by_the_known_factor():
 
 
 def test_stiffness_limit_of_an_ideal_servo_is_that_of_its_lightest_grip():
-    omega, hand = np.linspace(1.0, 100.0, 4000), ab.range_of_grips()
+    omega, hand = np.linspace(1.0, 100.0, 4000), ab.impedance_range_of_grips()
     for delay in (0.002, 0.01, 0.05):
         axis = OneAxis(ideal_servo=True, delay=delay)
-        limit = np.min(ab.stiffness_limit(tp.hybrid(axis, 1j * omega), omega, hand))
+        limit = np.min(ab.stiffness_limit(tp.hybrid_matrix(axis, 1j * omega), omega, hand))
         stiffnesses = limit * np.array([0.995, 1.005])
         wall = ab.ImpedanceRange((0.0, 0.0), (0.0, 0.0), tuple(stiffnesses))
         hands, walls = members(hand, wall, 11)
@@ -362,7 +366,7 @@ def test_stiffness_limit_of_an_ideal_servo_is_that_of_its_lightest_grip():
         assert np.min(trip[walls[:, 1] == stiffnesses[0]]) > 2 * delay
         assert np.min(trip[walls[:, 1] == stiffnesses[1]]) < 2 * delay
     # Some hands of the range oscillate without a wall.
-    unstable = tp.absorb(tp.hybrid(axis, 1j * omega), hand=-1e3)
+    unstable = tp.absorb_impedances(tp.hybrid_matrix(axis, 1j * omega), hand=-1e3)
     wide = ab.ImpedanceRange((0.0, 1.0), (0.0, 2e3), (0.0, 1e3))
     assert np.min(ab.stiffness_limit(unstable, omega, wide)) == 0.0
 

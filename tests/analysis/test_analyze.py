@@ -13,7 +13,7 @@ from drake_teleop.lab.analysis import figures as of_summary
 from drake_teleop.lab.analysis.maps import stability_map
 from drake_teleop.lab.analysis.report import print_tables
 from drake_teleop.lab.analysis.task_direction import task_direction
-from drake_teleop.lab.analysis.verdict import verdict
+from drake_teleop.lab.analysis.verdict import verdict_sentences
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 pytestmark = pytest.mark.long
@@ -102,11 +102,11 @@ def test_printed_tables_have_units_and_verdict(run, capsys):
 @pytest.mark.slow
 def test_the_verdict_follows_the_figures(run):
     summary, _ = run
-    assert summary["verdict"] == verdict(summary)
+    assert summary["verdict"] == verdict_sentences(summary)
     for sentence in summary["verdict"]:
         assert len(sentence) <= 100 and sentence.endswith(".") and ". " not in sentence
     other = summary | {"absolute": summary["absolute"] | {"absolutely_stable": True}}
-    assert any("stable: no passive" in sentence for sentence in verdict(other))
+    assert any("stable: no passive" in sentence for sentence in verdict_sentences(other))
 
 
 def figures(scenario: Scenario, direction: str = "z"):
@@ -163,6 +163,11 @@ def test_maps_agree_with_new_map_of_the_scenario(run):
     axis = task_direction(scenario, (0.0, 0.0, 1.0)).axis
     x, y = (sorted({point[i] for point in found["boundary"]["firm"]}) for i in (0, 1))
     one = stability_map(
-        axis, analyze.sampling_of(scenario), "rate", [x[0], x[-1]], "wall_stiffness", [100.0, 1e5]
+        axis,
+        analyze.sampling_of_scenario(scenario),
+        "rate",
+        [x[0], x[-1]],
+        "wall_stiffness",
+        [100.0, 1e5],
     )
     assert one.stable[0].all() and not one.stable[1].any() and y

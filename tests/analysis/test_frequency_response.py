@@ -82,7 +82,7 @@ def test_multisine_has_odd_multiples_and_low_peak():
     lines = EXCITATION.multiples()
     assert (lines % 2 == 1).all() and (np.diff(lines) > 0).all()
     direction = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    segments = EXCITATION.segments(direction, start=0.2)
+    segments = EXCITATION.sines_along(direction, start=0.2)
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.27, 0.0, 0.03])
     steps = 3000
     t = 0.2 + EXCITATION.settle + np.arange(steps) / 2000.0

@@ -16,7 +16,7 @@ from drake_teleop.lab.analysis.linearization import (
 from drake_teleop.lab.analysis.one_axis import device_impedance
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
-from drake_teleop.lab.analysis.two_port import hybrid
+from drake_teleop.lab.analysis.two_port import hybrid_matrix
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.sheet_spring import SheetSpring
@@ -47,12 +47,12 @@ def true_load(scenario: Scenario):
 
 
 def vertical_only(cut: Linearization) -> Linearization:
-    system = cut.close(["pose_command.z"], ["pose_received.z"])
-    return system.close(["wrench_B.z"], ["wrench_received.z"])
+    system = cut.close_loop(["pose_command.z"], ["pose_received.z"])
+    return system.close_loop(["wrench_B.z"], ["wrench_received.z"])
 
 
 def wired(cut: Linearization) -> Linearization:
-    return cut.close("pose_command", "pose_received").close("wrench_B", "wrench_received")
+    return cut.close_loop("pose_command", "pose_received").close_loop("wrench_B", "wrench_received")
 
 
 def stale_weight(scenario: Scenario, direction):
@@ -188,7 +188,7 @@ def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
     low_pass = 2 * (np.cos(np.pi / 8) + np.cos(3 * np.pi / 8))
     low_pass /= 2 * np.pi * scenario.wrist_sensor.bandwidth_hz
     late = np.exp(-s * (PERIOD + low_pass - 1.5 / scenario.rates.sensor_hz))
-    paper = hybrid(axis, s, servo=servo)
+    paper = hybrid_matrix(axis, s, servo=servo)
     device = device_impedance(axis, s)
     paper[:, 0, 0] = device + axis.hand_mass * s + late * (paper[:, 0, 0] - device)
     paper[:, 0, 1] *= late
@@ -202,8 +202,8 @@ def test_sideways_force_rotates_the_tool():
     scenario = replace(LoadScenario("ideal_sensor"), force_scaling__sigma=1.0)
     task = task_direction(scenario, (1.0, 0.0, 0.0))
     cut = linearize(scenario, load_estimate=true_load(scenario))
-    system = cut.close(["pose_command.x"], ["pose_received.x"])
-    system = system.close(["wrench_B.x"], ["wrench_received.x"])
+    system = cut.close_loop(["pose_command.x"], ["pose_received.x"])
+    system = system.close_loop(["wrench_B.x"], ["wrench_received.x"])
     H = hybrid_along(system, OMEGA, task.hand, task.tool)
     axis = changed(task.axis, device_mass=task.axis.device_mass + task.axis.hand_mass)
     assert not 0.9 < task.tool_coupling < 1.1
@@ -226,7 +226,7 @@ def test_sideways_tip_compliance_includes_the_hands_wrist():
         [f"{port}.{a}" for a in others] for port in ("operator_wrench", "hand_wrench")
     )
     omega = np.array([0.5])  # rad/s
-    H = hybrid_along(system.close(operator, hand), omega, task.hand, task.tool)
+    H = hybrid_along(system.close_loop(operator, hand), omega, task.hand, task.tool)
     compliance = (H[0, 1, 1] / (1j * omega[0])).real
     axis = task.axis
     servo = 1 / (axis.slave_mass * axis.velocity_gain * axis.position_gain)
@@ -275,7 +275,7 @@ def frictionless(scenario: Scenario) -> Scenario:
 
 def vertical_mode(system: Linearization) -> complex:
     """Return the slow oscillation that a vertical force of the hand excites most."""
-    system = system.expanded()
+    system = system.with_delays_as_states()
     z, modes = np.linalg.eig(system.A)
     push = np.linalg.solve(modes, system.B[:, system.inputs.index("hand_wrench.z")])
     seen = system.C[system.outputs.index("pose_command.z")] @ modes
@@ -347,10 +347,10 @@ def small_system() -> Linearization:
 def test_closing_with_delay_agrees_with_shift_registers(periods):
     import control
 
-    system = small_system().close(["felt"], ["wrench"], periods)
+    system = small_system().close_loop(["felt"], ["wrench"], periods)
     omega = np.linspace(1.0, 3000.0, 20)
     G = system.frequency_response(omega)
-    assert system.expanded().frequency_response(omega) == pytest.approx(G, rel=1e-9)
+    assert system.with_delays_as_states().frequency_response(omega) == pytest.approx(G, rel=1e-9)
     response = control.frequency_response(system.to_control(), omega)
     assert np.moveaxis(response.frdata, -1, 0) == pytest.approx(G, rel=1e-9)
     # At a multiplier of the closed loop the return difference is singular.
@@ -370,12 +370,12 @@ def test_control_object_has_the_names_of_ports():
 def test_unknown_port_raises():
     said = r"'pose\.x' is no port or component of this model; name one of"
     with pytest.raises(DrakeTeleopError, match=said):
-        small_system().close("pose", "wrench")
+        small_system().close_loop("pose", "wrench")
 
 
 def test_sparse_search_finds_the_largest_multipliers():
-    few = small_system().close(["felt"], ["wrench"], 40)
-    padded = few.expanded()
+    few = small_system().close_loop(["felt"], ["wrench"], 40)
+    padded = few.with_delays_as_states()
     idle = 800
     A = np.zeros((len(padded.A) + idle,) * 2)
     A[:-idle, :-idle] = padded.A

@@ -10,7 +10,7 @@ from registers import growth_rate
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.cut_loop import cut_loop
-from drake_teleop.lab.analysis.maps import StabilityMap, distortion, stability_map
+from drake_teleop.lab.analysis.maps import StabilityMap, force_distortion, stability_map
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
@@ -170,7 +170,7 @@ def test_distortion_is_that_of_the_continuous_station_at_high_rates() -> None:
     own = own + axis.hand_stiffness / s
     expected = np.abs((displayed - ideal) / (own + ideal)).max()
     fast = Sampling(1e5, 1e5, 4e5)
-    assert distortion(axis, cut_loop(axis, fast), w) == pytest.approx(expected, rel=1e-3)
+    assert force_distortion(axis, cut_loop(axis, fast), w) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,12 @@ from registers import closed_map, growth_rate, multipliers
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.cut_loop import (
     CutLoop,
+    count_unstable_multipliers,
     cut_loop,
     delay_margin,
     dominant_multiplier,
     gain_and_phase_margin,
     loop_response,
-    unstable_multipliers,
 )
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import (
@@ -34,7 +34,7 @@ from drake_teleop.lab.analysis.period_map import (
     X_S,
     Sampling,
     _held_response,
-    cut_map,
+    cut_period_map,
     delay_steps,
     sampled_two_port,
 )
@@ -173,7 +173,7 @@ def test_two_port_agrees_with_loop_without_hand_and_wall(sampling: Sampling, ste
     port[:, 0, 0] -= device
     H[:, 0, 0] -= device
     np.testing.assert_allclose(H, port * late, atol=1e-9)
-    M = cut_map(bare, sampling)
+    M = cut_period_map(bare, sampling)
     n = len(M) - 3
     A = M[:n, :n].copy()
     A[:, SAMPLE] += M[:n, RECEIVED]
@@ -199,7 +199,7 @@ def test_argument_principle_agrees_with_eigenvalues(
     delay = steps / sampling.hand_hz
     size = np.abs(multipliers(replace(axis, delay=delay), sampling))
     if np.abs(size - 1).min() > 1e-9:  # a multiplier on the circle has no count
-        count = unstable_multipliers(cut_loop(axis, sampling), delay)
+        count = count_unstable_multipliers(cut_loop(axis, sampling), delay)
         assert count == (size > 1).sum()
 
 
@@ -229,7 +229,7 @@ def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
     np.testing.assert_allclose(back * found ** -np.rint(2 * delay * 2e3), 1.0, atol=1e-8)
     one = growth_rate(OneAxis(delay=0.02), STATION)
     assert np.log(abs(found[0, 0])) * 2e3 == pytest.approx(one, rel=1e-6)
-    assert ((np.abs(found) > 1) == (unstable_multipliers(loop, delay) > 0)).all()
+    assert ((np.abs(found) > 1) == (count_unstable_multipliers(loop, delay) > 0)).all()
 
 
 @settings(max_examples=200, deadline=None)
@@ -243,7 +243,9 @@ def test_count_agrees_with_roots_also_at_both_ends_of_the_circle(
 ) -> None:
     """|L| > 1 at z = 1 or -1, either sign, and unstable cut loops."""
     p, q = np.poly(poles), np.array(numerator)
-    loop = CutLoop.of(np.array(poles, complex), np.roots(np.polysub(p, q)).astype(complex), 1.0)
+    loop = CutLoop.from_multipliers(
+        np.array(poles, complex), np.roots(np.polysub(p, q)).astype(complex), 1.0
+    )
     size = np.abs(np.roots(np.polysub(np.append(p, np.zeros(D)), q)))
     if np.abs(np.concatenate([size, np.abs(poles)]) - 1).min() < 1e-3:
         return  # on the circle
@@ -251,7 +253,7 @@ def test_count_agrees_with_roots_also_at_both_ends_of_the_circle(
     gain = np.abs(loop_response(loop, w))
     grazing = np.abs(gain[1:-1] - 1)[(np.diff(gain)[1:] * np.diff(gain)[:-1]) <= 0]
     if (grazing > 1e-2).all():
-        assert unstable_multipliers(loop, D / 2) == (size > 1).sum()
+        assert count_unstable_multipliers(loop, D / 2) == (size > 1).sum()
 
 
 @pytest.mark.parametrize(
@@ -300,7 +302,7 @@ def test_delay_margin_is_0_if_unstable_and_infinite_without_limit() -> None:
     assert delay_margin(cut_loop(held("light", wall_stiffness=5.1e3), STATION)) == 0.0
     firm = cut_loop(held("firm", wall_stiffness=5.1e3), STATION)
     assert delay_margin(firm) == np.inf
-    assert (unstable_multipliers(firm, np.geomspace(5e-4, 100.0, 1000)) == 0).all()
+    assert (count_unstable_multipliers(firm, np.geomspace(5e-4, 100.0, 1000)) == 0).all()
 
 
 @pytest.mark.long

@@ -65,7 +65,7 @@ def solved_matrix(axis: OneAxis, s: np.ndarray, servo=None) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(10))
 def test_hybrid_equals_the_block_diagram(seed):
     axis = random_axis(np.random.default_rng(seed))
-    H, truth = tp.hybrid(axis, S[::20]), solved_matrix(axis, S[::20])
+    H, truth = tp.hybrid_matrix(axis, S[::20]), solved_matrix(axis, S[::20])
     np.testing.assert_allclose(H, truth, rtol=1e-9)
     wall = axis.wall_damping + axis.wall_stiffness / S[::20]
     felt = tp.transmitted_impedance(H, wall)
@@ -80,14 +80,14 @@ def test_hybrid_with_a_user_supplied_servo():
     axis = random_axis(np.random.default_rng(1))
     m, k, d = 3.13, 9000.0, 300.0
     Z_s, C = m * S[::20], d + k / S[::20]
-    H = tp.hybrid(axis, S[::20], servo=(C / (Z_s + C), 1 / (Z_s + C)))
+    H = tp.hybrid_matrix(axis, S[::20], servo=(C / (Z_s + C), 1 / (Z_s + C)))
     np.testing.assert_allclose(H, solved_matrix(axis, S[::20], (m, k, d, 0.0)), rtol=1e-9)
 
 
 def test_ideal_servo_without_delay_displays_scaled_environment_and_tool():
     axis = random_axis(np.random.default_rng(2), delay=0.0, mass_error=0.0, ideal_servo=True)
     Z_e = 40.0 + 5100.0 / S
-    felt = tp.transmitted_impedance(tp.hybrid(axis, S), Z_e)
+    felt = tp.transmitted_impedance(tp.hybrid_matrix(axis, S), Z_e)
     # F_h = m_m a + b_m v + k_f (gamma F_e + sigma m_t a), slave at l_p times the master.
     v, a = 1.0, S
     F_e = Z_e * axis.position_scale * v
@@ -100,8 +100,8 @@ def test_stiff_servo_tends_to_the_ideal_one():
     slow = S[OMEGA < 200]
     axis = random_axis(np.random.default_rng(3))
     values = {**axis.__dict__, "position_gain": 1e9, "velocity_gain": 1e12}
-    stiff = tp.hybrid(OneAxis(**values), slow)
-    ideal = tp.hybrid(OneAxis(**{**values, "ideal_servo": True}), slow)
+    stiff = tp.hybrid_matrix(OneAxis(**values), slow)
+    ideal = tp.hybrid_matrix(OneAxis(**{**values, "ideal_servo": True}), slow)
     np.testing.assert_allclose(stiff[..., 0, :], ideal[..., 0, :], rtol=1e-6)
 
 
@@ -109,7 +109,7 @@ def test_stiff_servo_tends_to_the_ideal_one():
 def test_estimate_has_no_effect_if_sigma_equals_gamma(scale):
     rng = np.random.default_rng(4)
     H = [
-        tp.hybrid(
+        tp.hybrid_matrix(
             random_axis(np.random.default_rng(4), sigma=scale, gamma=scale, mass_error=error), S
         )
         for error in rng.uniform(-1, 1, 5)
@@ -120,17 +120,17 @@ def test_estimate_has_no_effect_if_sigma_equals_gamma(scale):
 def test_overestimated_mass_is_displayed_as_negative_mass():
     axis = random_axis(np.random.default_rng(5), sigma=0.0, gamma=1.0, delay=0.0, mass_error=0.3)
     values = {**axis.__dict__, "ideal_servo": True}
-    free = tp.transmitted_impedance(tp.hybrid(OneAxis(**values), S), 0.0)
-    exact = tp.hybrid(OneAxis(**{**values, "mass_error": 0.0}), S)[..., 0, 0]
+    free = tp.transmitted_impedance(tp.hybrid_matrix(OneAxis(**values), S), 0.0)
+    exact = tp.hybrid_matrix(OneAxis(**{**values, "mass_error": 0.0}), S)[..., 0, 0]
     felt_mass = (free - exact).imag / OMEGA
     np.testing.assert_allclose(felt_mass, -axis.force_scale * axis.position_scale * 0.3, rtol=1e-9)
 
 
 def test_parameters_may_be_arrays():
     delay = np.array([0.0, 0.05, 0.2])
-    together = tp.hybrid(OneAxis(delay=delay, sigma=0.5), S[:, None])
+    together = tp.hybrid_matrix(OneAxis(delay=delay, sigma=0.5), S[:, None])
     for i, one in enumerate(delay):
-        assert np.array_equal(together[:, i], tp.hybrid(OneAxis(delay=one, sigma=0.5), S))
+        assert np.array_equal(together[:, i], tp.hybrid_matrix(OneAxis(delay=one, sigma=0.5), S))
 
 
 def random_two_ports(n: int, seed: int = 0) -> np.ndarray:
@@ -142,7 +142,7 @@ def test_absorbed_impedances_replace_hand_and_environment():
     H = random_two_ports(200)
     hand, here, there = 0.3 + 0.1j, 1.1 - 0.4j, 0.6 + 2j
     whole = tp.transmitted_impedance(H, here + there) + hand
-    inside = tp.absorb(H, hand=hand, environment=here)
+    inside = tp.absorb_impedances(H, hand=hand, environment=here)
     np.testing.assert_allclose(tp.transmitted_impedance(inside, there), whole, rtol=1e-9)
 
 
@@ -153,10 +153,10 @@ def test_scattering_relates_the_waves():
     b1, b2 = 2.5, 0.4
     waves_in = [(F_h + b1 * V_m) / np.sqrt(b1), (F_e + b2 * minus_V_s) / np.sqrt(b2)]
     waves_out = [(F_h - b1 * V_m) / np.sqrt(b1), (F_e - b2 * minus_V_s) / np.sqrt(b2)]
-    found = np.einsum("nij,jn->in", tp.scattering(H, (b1, b2)), np.array(waves_in))
+    found = np.einsum("nij,jn->in", tp.scattering_matrix(H, (b1, b2)), np.array(waves_in))
     np.testing.assert_allclose(found, waves_out, rtol=1e-9, atol=1e-12)
 
 
 def test_ratio_of_powers_must_be_positive():
     with pytest.raises(DrakeTeleopError, match="ratio"):
-        tp.power_scaled(tp.hybrid(OneAxis(), S), 0.0)
+        tp.scale_slave_power(tp.hybrid_matrix(OneAxis(), S), 0.0)

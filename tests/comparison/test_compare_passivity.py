@@ -30,7 +30,7 @@ pytestmark = pytest.mark.long
 def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALLS", (5100.0,))
     monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))
-    monkeypatch.setattr(study, "LEAVES", {"contact": study.LEAVES["contact"]})
+    monkeypatch.setattr(study, "LEAF_SPRINGS", {"contact": study.LEAF_SPRINGS["contact"]})
     monkeypatch.setattr(study, "ROUND_TRIPS", (0.01, 0.02, 0.03, 0.1))
     monkeypatch.setattr(
         study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drake_teleop.lab.comparison.decision import decide
+from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_runs
 
@@ -43,8 +43,8 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
     ],
 )
 def test_cell_has_the_first_verdict_that_applies(changes, words, share):
-    (cell,) = decide(summary(**changes)).values()
-    assert (cell.words, cell.share) == (words, share)
+    (cell,) = decision_table(summary(**changes)).values()
+    assert (cell.verdict_text, cell.displayed_share) == (words, share)
     (axes,) = draw_decision(summary(**changes)).axes
     written = [text.get_text() for text in axes.texts]
     assert words in written[0] and len(written) == 3

@@ -22,9 +22,9 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     OneDof,
     Task,
-    figures,
-    figures_of,
-    operators_intent,
+    figures_of_run,
+    figures_of_traces,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -168,7 +168,7 @@ def test_longest_round_trip_without_a_method(model, longest):
     none, found = PassivityConfig(), {}
     for round_trip in (0.002, longest, longest + 0.002, 0.05):
         run = run_one_dof(model, none, NetworkConfig(delay=round_trip / 2))
-        found[round_trip] = figures(run, model)
+        found[round_trip] = figures_of_run(run, model)
     assert [result.stable for result in found.values()] == [True, True, False, False]
     assert abs(found[0.002].force_error) < 1e-3
     assert found[0.05].least_energy < -1.0
@@ -198,7 +198,7 @@ def test_same_seed_gives_same_run():
 
 def test_energy_balances_agree_with_spring_and_inertia():
     task = Task(swing=0.1, swung=0.7, press=0.7, pressed=1.0, release=1.3, released=1.5, end=2.0)
-    model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operators_intent(task), 10
+    model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operator_intent(task), 10
     scale = model.gamma * model.force_scale
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
     spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave, 0.0) ** 2
@@ -313,7 +313,7 @@ def test_rise_delay_is_never_negative(share, late, drag, expected):
     pulled = np.where((t > task.press) & (t < middle + 0.25), drag, 0.0)
     felt = np.minimum(wall(t - late), share) + (pulled if drag else 0.0)
     still = np.zeros_like(t)
-    found = figures_of(
+    found = figures_of_traces(
         t=t, master=still, slave=still, felt=felt, pressed=wall(t), energy=still, task=task
     )
     assert found.rise_delay == pytest.approx(expected, abs=2 * PERIOD, nan_ok=True)

@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
-from drake_teleop.lab.run_summary import in_contact
+from drake_teleop.lab.run_summary import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.contact.noise_floor import NoiseFloor
@@ -113,7 +113,7 @@ def test_contact_is_detected_and_reaches_the_hand_after_the_delay(identified, de
     scenario = replace(scenario, channel=Channel(delay=delay))
     station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=noise_floor)
     result = simulate(station, scenario.simulation)
-    touched, slave, hand = in_contact(result), result["contact"], result["contact_at_hand"]
+    touched, slave, hand = is_in_contact(result), result["contact"], result["contact_at_hand"]
     # In samples of 1 ms.
     assert 0 <= slave.argmax() - touched.argmax() <= 4
     assert np.count_nonzero(np.diff(slave[:, 0])) == 2

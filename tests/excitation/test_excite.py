@@ -17,13 +17,18 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from shown import type_in
 
-from drake_teleop.cli.excitation import draw
+from drake_teleop.cli.excitation import draw_trajectory
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
-from drake_teleop.lab.excitation.check import check, check_motion
+from drake_teleop.lab.excitation.check import check_motion, check_trajectory
 from drake_teleop.lab.excitation.excite import excite, sensor_motion
-from drake_teleop.lab.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors
+from drake_teleop.lab.excitation.limits import (
+    LIMITS,
+    empty_motions,
+    write_link_motions,
+    write_sensor_motion,
+)
 from drake_teleop.lab.excitation.motion_film import write_motion_film
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
@@ -174,9 +179,9 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     t = np.arange(0.0, 2.4, period)
     joints = short.trajectory.evaluate(t)
     motions = empty_motions(*joints[0].shape)
-    motions_of(table, *joints, motions)
+    write_link_motions(table, *joints, motions)
     vectors = np.empty((3, len(t), 3))
-    sensor_vectors(motions, vectors)
+    write_sensor_motion(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     constants, memory = sensor_chain_constants(sensor, 6, period)
     estimator, remembered = motion_estimator(motion, sensor, 6, period)
@@ -222,7 +227,10 @@ def test_check_finds_a_violation_of_each_limit(slave, short):
     # Without this clearance all pairs could be beyond the search distance.
     wide = dataclasses.replace(slave, limits=limits._replace(clearance=0.2))
     distance = (
-        0.2 / next(use for use in check(wide, short.trajectory) if use.limit == "clearance").share
+        0.2
+        / next(
+            use for use in check_trajectory(wide, short.trajectory) if use.limit == "clearance"
+        ).share
     )
     less = {
         "position": {"q_half": 0.99 * uses["position"] * limits.q_half},
@@ -235,7 +243,7 @@ def test_check_finds_a_violation_of_each_limit(slave, short):
     }
     for name, changes in less.items():
         tight = dataclasses.replace(slave, limits=limits._replace(**changes))
-        worst = check(tight, short.trajectory)[0]
+        worst = check_trajectory(tight, short.trajectory)[0]
         assert (worst.limit, worst.share > 1, worst.share < 1.03) == (name, True, True)
 
 
@@ -257,7 +265,7 @@ def test_check_finds_self_collision_and_table_contact(slave):
         ([0, -1.9, -2.4, 0, -1.5, 0], {"tool", "link_1", "base", "link_2", "link_6", "link_5"}),
         ([0, -2.2, 0.3, 0, 0, 0], {"world"}),
     ):
-        worst = check(slave, FourierTrajectory(np.array(q, float), t, t, 1.0))
+        worst = check_trajectory(slave, FourierTrajectory(np.array(q, float), t, t, 1.0))
         clearance = next(use for use in worst if use.limit == "clearance")
         assert clearance.share > 1
         assert bodies & set(clearance.what.split(" and "))
@@ -281,7 +289,7 @@ def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
     assert "l0 and l3" in named and "l0 and l6" not in named
     assert "l0 and l2" not in named  # they touch in all postures
     still = FourierTrajectory(found.home, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
-    assert all(use.share < 1 for use in check(found, still))
+    assert all(use.share < 1 for use in check_trajectory(found, still))
     assert len(found.limits.pairs) > 0  # other pairs
 
 
@@ -384,7 +392,7 @@ def test_links_that_always_touch_are_excluded(urdf):
     packages = (urdf.parent / "somewhere",)
     robot = RobotFromModel(urdf, "l6", WristSensorConfig(), package_paths=packages, payload=2.0)
     still = np.zeros((6, 2))
-    uses = check(robot, FourierTrajectory(robot.home, still, still, 1.0))
+    uses = check_trajectory(robot, FourierTrajectory(robot.home, still, still, 1.0))
     assert next(use for use in uses if use.limit == "clearance").share <= 1
 
 
@@ -535,7 +543,7 @@ def test_clearance_to_a_plane_is_checked(tmp_path):
     for angle, is_free in ((0.0, True), (np.pi, False)):
         still = FourierTrajectory(np.array([angle]), np.zeros((1, 2)), np.zeros((1, 2)), 1.0)
         said = []
-        uses = check(robot, still, said.append)
+        uses = check_trajectory(robot, still, said.append)
         np.testing.assert_allclose(said, [0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0], rtol=1e-2)
         share = next(use for use in uses if use.limit == "clearance").share
         assert (share <= 1) == is_free
@@ -709,7 +717,7 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
 
 
 def test_picture_of_a_shortest_motion_states_its_period(short):
-    figure = draw(dataclasses.replace(short, criterion="period"))
+    figure = draw_trajectory(dataclasses.replace(short, criterion="period"))
     assert figure.axes[3].get_title("left") == "period down to 2.4"
 
 

@@ -22,8 +22,8 @@ from drake_teleop.lab.excitation.limits import (
     Limits,
     capsule_distances,
     empty_motions,
-    limit_uses,
-    motions_of,
+    write_limit_uses,
+    write_link_motions,
 )
 from drake_teleop.lab.excitation.optimizer import Problem, Task, _Search
 from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
@@ -188,9 +188,9 @@ def test_largest_use_of_each_limit_matches_its_definition(arm):
     q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
     qd, qdd = rng.normal(size=(2, 30, 6))
     motions = empty_motions(30, 6)
-    motions_of(arm.table, q, qd, qdd, motions)
+    write_link_motions(arm.table, q, qd, qdd, motions)
     smooth, largest, gradient = np.empty(7), np.empty(7), np.empty((7, 3, 30, 6))
-    limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, smooth, largest, gradient)
+    write_limit_uses(arm.table, q, qd, qdd, motions, limits, 20.0, smooth, largest, gradient)
     assert np.all(smooth >= largest)
     R_WS, p_WS = motions[:, -1, 12:].reshape(-1, 3, 3), motions[:, -1, 9:12]
     points = p_WS[:, None] + np.einsum("tij,kj->tki", R_WS, limits.points_S)

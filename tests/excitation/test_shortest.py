@@ -12,7 +12,11 @@ from drake_teleop.lab.excitation.excite import sensor_motion
 from drake_teleop.lab.excitation.optimizer import Task
 from drake_teleop.lab.excitation.prediction import predicted_covariance
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
-from drake_teleop.lab.excitation.shortest import ShortestProblem, reliable_factor, shortest
+from drake_teleop.lab.excitation.shortest import (
+    ShortestProblem,
+    design_shortest_motion,
+    sidak_factor,
+)
 from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
     deviations_over_tolerances,
@@ -37,9 +41,9 @@ def problem_of(slave: Robot, times: float = 1.0) -> ShortestProblem:
 
 
 def test_reliable_factor_grows_with_the_number_of_tolerances() -> None:
-    assert reliable_factor(1) == pytest.approx(1.96, abs=0.001)
+    assert sidak_factor(1) == pytest.approx(1.96, abs=0.001)
     assert pytest.approx(0.95, abs=1e-3) == (1 - 2 * 0.0025573) ** 10
-    assert reliable_factor(10) == pytest.approx(2.7996, abs=1e-3)
+    assert sidak_factor(10) == pytest.approx(2.7996, abs=1e-3)
 
 
 def test_gradients_equal_finite_differences(slave: Robot) -> None:
@@ -69,7 +73,9 @@ def test_shortest_motion_reaches_the_tolerance_within_all_limits(
     slave: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_MAX_VAIN_ROUNDS", 0)
-    found = shortest(slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1)
+    found = design_shortest_motion(
+        slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1
+    )
     assert 3 / 15.0 <= found.excitation.trajectory.period < 0.5
     assert 0.3 < found.reached.max() <= 1.0
     assert all(use.share <= 1.0 for use in found.excitation.uses)
@@ -89,4 +95,4 @@ def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
 def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_MAX_EMPTY_ROUNDS", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
-        shortest(slave, read_tolerance("inertia 0.00001 %"), starts=1)
+        design_shortest_motion(slave, read_tolerance("inertia 0.00001 %"), starts=1)

@@ -11,7 +11,7 @@ from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
-from drake_teleop.live.experiment.guided import HAND, Guided, parse_study
+from drake_teleop.live.experiment.guided import HAND, GuidedExperiment, parse_study
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.session import read_drive
@@ -43,7 +43,7 @@ class Person:
         self.now, self.folder, self.frames = 0.0, folder, []
         self.store = Store(folder)
         self.procedure = Procedure(EXPERIMENT, 1, self.store)
-        self.guided = Guided(
+        self.guided = GuidedExperiment(
             self.procedure,
             {(0, 0): make_apparatus(task, condition, scenario, load)},
             [scenario],
@@ -86,7 +86,7 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person.send(client=2, answer=1)  # a spectator
     assert person.procedure.phase == "answer"
     person.send(answer=2)
-    (row,) = person.store.rows(1)
+    (row,) = person.store.read_rows(1)
     assert row.answer == 2 and row.force_N > 1.0 and row.level > 0.0
     assert person.procedure.phase == "end"
     person.guided.close()

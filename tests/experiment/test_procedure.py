@@ -40,18 +40,18 @@ SHORT = dataclasses.replace(
 
 def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) -> None:
     """Run a participant whose answers depend on the level, or until a number of trials."""
-    while procedure.phase != "end" and procedure.number < most:
+    while procedure.phase != "end" and procedure.trial_number < most:
         if procedure.phase == "interval":
-            result = IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
+            result = IntervalResult(procedure.current_level, force_N=5.0, done=True, time_s=1.0)
             procedure.finish_interval(result)
         elif procedure.phase == "gap":
             procedure.start_second_interval()
         elif procedure.phase == "answer":
             p = correct_probability(procedure.level, threshold, 1.5, 0.0)
             signal = procedure.trial.signal
-            procedure.answer(signal if rng.random() < p else 3 - signal, 0.5)
+            procedure.store_answer(signal if rng.random() < p else 3 - signal, 0.5)
         else:
-            procedure.go()
+            procedure.advance_phase()
 
 
 def test_order_is_random_and_each_round_has_every_condition_once():
@@ -73,13 +73,13 @@ def test_participant_continues_with_the_same_levels(tmp_path):
     rng = np.random.default_rng(1)
     first = Procedure(SMALL, 3, cut)
     go_through(first, rng, 2.0, most=17)
-    first.go()
-    first.finish_interval(IntervalResult(first.present_level))
+    first.advance_phase()
+    first.finish_interval(IntervalResult(first.current_level))
     again = Procedure(SMALL, 3, cut)
-    assert (again.phase, again.number) == ("consent", 17)
+    assert (again.phase, again.trial_number) == ("consent", 17)
     go_through(again, rng, 2.0)
-    assert cut.path(3).read_bytes() == whole.path(3).read_bytes()
-    assert len(cut.rows(3)) == len(plan_trials(SMALL, 3))
+    assert cut.participant_file(3).read_bytes() == whole.participant_file(3).read_bytes()
+    assert len(cut.read_rows(3)) == len(plan_trials(SMALL, 3))
 
 
 def goes_through(folder: str) -> None:
@@ -88,18 +88,18 @@ def goes_through(folder: str) -> None:
         procedure = Procedure(SHORT, 1, store)
         while procedure.phase != "end":
             if procedure.phase == "answer":
-                right = procedure.number % 4 != 2
+                right = procedure.trial_number % 4 != 2
                 signal = procedure.trial.signal
-                procedure.answer(signal if right else 3 - signal, 0.5)
-                print(procedure.number, flush=True)
+                procedure.store_answer(signal if right else 3 - signal, 0.5)
+                print(procedure.trial_number, flush=True)
             elif procedure.phase == "interval":
                 procedure.finish_interval(
-                    IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
+                    IntervalResult(procedure.current_level, force_N=5.0, done=True, time_s=1.0)
                 )
             elif procedure.phase == "gap":
                 procedure.start_second_interval()
             else:
-                procedure.go()
+                procedure.advance_phase()
 
 
 @pytest.mark.slow
@@ -113,23 +113,23 @@ def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     process.kill()
     process.communicate()
     cut = Store(tmp_path / "cut")
-    left = len(cut.rows(1))
+    left = len(cut.read_rows(1))
     assert message <= left < len(plan_trials(SHORT, 1))
     goes_through(str(tmp_path / "cut"))
     goes_through(str(tmp_path / "whole"))
-    assert cut.rows(1) == Store(tmp_path / "whole").rows(1)
+    assert cut.read_rows(1) == Store(tmp_path / "whole").read_rows(1)
 
 
 def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_path):
     procedure = Procedure(SMALL, 1, Store(tmp_path))
-    before = procedure.number
-    procedure.go(), procedure.go(), procedure.go()
+    before = procedure.trial_number
+    procedure.advance_phase(), procedure.advance_phase(), procedure.advance_phase()
     assert procedure.phase == "interval"
-    procedure.answer(1, 0.1)  # not in the phase of an answer
+    procedure.store_answer(1, 0.1)  # not in the phase of an answer
     procedure.finish_interval(IntervalResult(valid=False))
-    assert (procedure.phase, procedure.again, procedure.number) == ("ready", True, before)
+    assert (procedure.phase, procedure.again, procedure.trial_number) == ("ready", True, before)
     go_through(procedure, np.random.default_rng(0), 2.0)
-    counted = [row for row in Store(tmp_path).rows(1) if not row.practice]
+    counted = [row for row in Store(tmp_path).read_rows(1) if not row.practice]
     assert len(counted) == 3 * (6 + 5 + 2)
 
 
@@ -139,16 +139,16 @@ def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
         other = dataclasses.replace(SMALL, conditions=conditions)
         procedure = Procedure(other, 1, Store(tmp_path / str(names)))
         seen = []
-        while procedure.phase != "end" and procedure.number < 12:
-            seen.append(procedure.view())
+        while procedure.phase != "end" and procedure.trial_number < 12:
+            seen.append(procedure.page_state())
             if procedure.phase == "interval":
-                procedure.finish_interval(IntervalResult(procedure.present_level))
+                procedure.finish_interval(IntervalResult(procedure.current_level))
             elif procedure.phase == "gap":
                 procedure.start_second_interval()
             elif procedure.phase == "answer":
-                procedure.answer(procedure.trial.signal, 0.5)
+                procedure.store_answer(procedure.trial.signal, 0.5)
             else:
-                procedure.go()
+                procedure.advance_phase()
         return seen
 
     assert views([0, 1, 2]) == views([2, 0, 1])
@@ -160,12 +160,12 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
         with pytest.raises(DrakeTeleopError, match="another process"):
             open_results(tmp_path, SMALL).__enter__()
         go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0, most=3)
-        assert store.table().shape == (3, 12)
-        text = store.path(1).read_text()
+        assert store.results_table().shape == (3, 12)
+        text = store.participant_file(1).read_text()
         for damaged in (text[:-30], text.replace("\n1,", "\n7,"), "trial\nx"):
-            store.path(1).write_text(damaged)
+            store.participant_file(1).write_text(damaged)
             with pytest.raises(DrakeTeleopError, match=r"01\.csv"):
-                store.rows(1)
+                store.read_rows(1)
     with pytest.raises(DrakeTeleopError, match="another study"):
         open_results(tmp_path, dataclasses.replace(SMALL, seed=1)).__enter__()
 
@@ -203,7 +203,7 @@ def test_practice_has_the_largest_level_and_changes_no_estimate(tmp_path, low, h
     experiment = Experiment(tasks=[task], conditions=[Condition(name="a")])
     store = Store(tmp_path)
     go_through(Procedure(experiment, 1, store), np.random.default_rng(3), 1e9)
-    rows, psi = store.rows(1), Psi(low, high)
+    rows, psi = store.read_rows(1), Psi(low, high)
     assert not all(row.correct for row in rows[:3])
     assert [row.level for row in rows[:4]] == [high, high, high, psi.next_level()]
     psi.update(rows[3].level, bool(rows[3].correct))

@@ -13,8 +13,13 @@ from drake_teleop.cli.experiment import next_participant
 from drake_teleop.common.style import Picture
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment, PegInSlot
 from drake_teleop.live.experiment.procedure import Procedure, plan_trials
-from drake_teleop.live.experiment.results import Result, _draw, results, write_results
-from drake_teleop.live.experiment.store import Row, Store
+from drake_teleop.live.experiment.results import (
+    Result,
+    _draw_results,
+    compute_results,
+    write_results,
+)
+from drake_teleop.live.experiment.store import Store, TrialRow
 
 CONTACT = "threshold of contact [N at the tool]"
 
@@ -24,7 +29,7 @@ def test_table_contains_the_true_thresholds(tmp_path):
     store, rng = Store(tmp_path), np.random.default_rng(2)
     for number in range(1, 6):
         go_through(Procedure(experiment, number, store), rng, 2.0)
-    found = [r for r in results(experiment, store) if r.quantity == CONTACT]
+    found = [r for r in compute_results(experiment, store) if r.quantity == CONTACT]
     each = [r for r in found if r.participant]
     assert len(each) == 5 and {r.trials for r in each} == {40}
     assert sum(r.low <= 2.0 <= r.high for r in each) >= 4
@@ -49,7 +54,9 @@ def test_folder_contains_table_trials_and_picture(tmp_path):
 @pytest.mark.parametrize("least, most", [(27.0, 42.0), (0.03, 0.11), (0.4, 5.0), (0.1, 40.0)])
 def test_axis_of_a_quantity_has_tick_labels(least, most):
     axes = Picture(figsize=(2.9, 2.0)).subplots()
-    _draw(axes, ["a"], [Result("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)])
+    _draw_results(
+        axes, ["a"], [Result("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)]
+    )
     low, high = axes.get_xlim()
     labels = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
     labels = [label for label in labels if low <= label.get_position()[0] <= high]
@@ -73,12 +80,12 @@ def test_shares_have_arithmetic_means_and_times_geometric_ones(tmp_path):
     )
     for number, done, time in ((1, (1, 1, 1, 0), 2.0), (2, (0, 0, 1, 0), 8.0)):
         rows = [
-            Row(k, "PegInSlot", "a", 0, 0.0, 0, 0, ok, time if ok else 30.0, 3.0 * time, 0.0)
+            TrialRow(k, "PegInSlot", "a", 0, 0.0, 0, 0, ok, time if ok else 30.0, 3.0 * time, 0.0)
             for k, ok in enumerate(done)
         ]
         rows.append(dataclasses.replace(rows[2], trial=4, practice=1, time_s=20.0))
-        store.write(number, rows)
-    found = {(r.quantity, r.participant): r for r in results(experiment, store)}
+        store.write_rows(number, rows)
+    found = {(r.quantity, r.participant): r for r in compute_results(experiment, store)}
     shares = [found["share of trials done", n].value for n in (1, 2, 0)]
     assert shares == pytest.approx([0.75, 0.25, 0.5])
     times = [found["time to the floor [s]", n].value for n in (1, 2, 0)]

@@ -14,7 +14,7 @@ from websockets.sync.server import serve
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import show_no_progress
-from drake_teleop.live.device_client import Client
+from drake_teleop.live.device_client import DeviceClient
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_link import DeviceConnection, DeviceLink
 from drake_teleop.live.device_packets import (
@@ -30,7 +30,7 @@ from drake_teleop.live.device_packets import (
 from drake_teleop.live.haply import HaplyDevice, force_message, read_message
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
-from drake_teleop.live.scenarios import with_device
+from drake_teleop.live.scenarios import with_task_space_device
 from drake_teleop.live.session import Session, read_drive
 from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.result import SimulationResult
@@ -102,7 +102,9 @@ def test_invalid_packets_only_change_a_counter(link):
             inputs = link.hand_inputs(1e-4 * k)
             assert all(np.isfinite(value) for value in inputs.values())
             assert np.isfinite(
-                Inputs().changed(inputs).pose(np.zeros(3))[0] if inputs["held"] else 0.0
+                Inputs().with_changes(inputs).intended_pose(np.zeros(3))[0]
+                if inputs["held"]
+                else 0.0
             )
     assert link.refused > 40
     assert read_message(said).state.position == (-2.0, 1.0, 3.0)
@@ -158,7 +160,7 @@ def test_refused_packet_is_counted_with_the_reason(link, packet, reason):
     sender = Sender(link.port)
     for _ in range(3):
         sender.raw(packet)
-    link.poll(0.0)
+    link.receive_state(0.0)
     assert link.status_text().startswith("No device yet (udp://127.0.0.1:")
     assert f". Refused packets: 3; the last one {reason}" in link.status_text()
 
@@ -177,7 +179,7 @@ def test_first_device_is_followed_until_silent_and_late_packets_are_ignored(link
     assert inputs["x"] == pytest.approx(1000.0)
     assert (link.lost, link.refused) == (1, 1)
     assert ". Refused packets: 1; the last one is from a second device" in link.status_text()
-    link.send(np.arange(6.0))
+    link.send_wrench(np.arange(6.0))
     assert one.force() == ForceCommand(4, 0.004, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
     assert link.hand_inputs(0.0991) == {"held": 0, "clutch": 0}
     assert "silent" in link.status_text()
@@ -197,12 +199,15 @@ def test_force_stays_within_limits_and_is_zero_after_50_ms_without_commands():
     for k in range(300):
         wrench = (np.nan,) * 6 if k % 50 == 7 else (40.0, -30.0, 0.0, 1.0, 0.0, 0.0)
         age = MS * max(k - 150, 0) if k < 250 else 0.0
-        now = np.array(guard.tick((0.0, 0.0, 0.0), wrench, age, MS))
+        now = np.array(guard.limit_wrench((0.0, 0.0, 0.0), wrench, age, MS))
         if k == 120:  # a tick was late, and the next one comes at once
-            moves = guard.tick((0.0, 0.0, -0.02), wrench, age, 0.1)
-            moves = guard.tick((0.0, 0.0, 0.02), wrench, age, 1e-5)
+            moves = guard.limit_wrench((0.0, 0.0, -0.02), wrench, age, 0.1)
+            moves = guard.limit_wrench((0.0, 0.0, 0.02), wrench, age, 1e-5)
             assert np.linalg.norm(moves[:3]) <= 5.0 + 1e-12
-            assert np.linalg.norm(guard.tick((0.0, 0.0, 0.0), wrench, age, MS)[:3]) <= 5.0 + 1e-12
+            assert (
+                np.linalg.norm(guard.limit_wrench((0.0, 0.0, 0.0), wrench, age, MS)[:3])
+                <= 5.0 + 1e-12
+            )
         assert np.linalg.norm(now[:3]) <= 5.0 + 1e-12
         assert np.linalg.norm(now[3:]) <= 0.1 + 1e-12
         if k == 149:
@@ -224,12 +229,12 @@ def test_at_most_300_mJ_of_stored_energy_return(axis, force, pressed):
     guard, position, wrench = DeviceGuard(Limits(10.0, slew=1e9)), np.zeros(3), np.zeros(6)
     wrench[axis] = force
     for _ in range(200):
-        guard.tick(position, wrench, 0.0, MS)
+        guard.limit_wrench(position, wrench, 0.0, MS)
     energies = []
     for speed in (-1.0, 1.0):
         for _ in range(round(1.2e4 * pressed)):
             position[axis] += speed * np.sign(force) * 1e-4
-            guard.tick(position, wrench, 0.0, MS)
+            guard.limit_wrench(position, wrench, 0.0, MS)
         energies.append(guard.energy)
     stored = abs(force) * 1.2 * pressed
     assert energies[0] == pytest.approx(stored, rel=1e-2)
@@ -244,8 +249,8 @@ def tap_on_wall(stiffness, grip, delay, *, observe):
     for k in range(950):
         heights.append(virtual.position[2])
         push = max(-stiffness * heights[-1 - delay], 0.0)
-        force = guard.tick(virtual.position, (0.0, 0.0, push, 0.0, 0.0, 0.0), 0.0, MS)
-        virtual.move(force[:3], MS)
+        force = guard.limit_wrench(virtual.position, (0.0, 0.0, push, 0.0, 0.0, 0.0), 0.0, MS)
+        virtual.simulate_motion(force[:3], MS)
         energy.append(virtual.energy)
         if 600 < k < 750:
             speed.append(abs(virtual.velocity[2]))
@@ -283,13 +288,13 @@ class RestingDevice:
 
 def test_client_displays_the_stations_force_and_none_after_silence(link):
     device = RestingDevice()
-    client = Client(device, f"udp://127.0.0.1:{link.port}")
+    client = DeviceClient(device, f"udp://127.0.0.1:{link.port}")
     for k in range(200):
         now = MS * k
-        client.tick(lambda now=now: now)
+        client.exchange_once(lambda now=now: now)
         if k < 100:
             link.hand_inputs(now)
-            link.send(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
+            link.send_wrench(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
         if k == 120:  # of an earlier client
             late = pack_force(ForceCommand(10**6, now, (0.0, 9.0, 9.0, 0.0, 0.0, 0.0)))
             link._socket.sendto(late, link._peer)
@@ -338,7 +343,7 @@ def test_device_address_of_another_machine_or_kind_is_an_error(address):
 
 
 def test_device_drives_without_a_page_and_releases_after_silence(scenario, load, link):
-    live = Live(with_device(scenario), load, None, lambda rows: {}, 0.0, link)
+    live = Live(with_task_space_device(scenario), load, None, lambda rows: {}, 0.0, link)
     sender, seen = Sender(link.port), []
     for k in range(95):
         if k < 60:
@@ -355,14 +360,14 @@ def test_device_drives_without_a_page_and_releases_after_silence(scenario, load,
 
 @pytest.mark.slow
 def test_drive_by_a_device_repeats_to_the_same_bytes(scenario, load, tmp_path):
-    setup = with_device(scenario)
+    setup = with_task_space_device(scenario)
     session = Session(setup, load, log=tmp_path / "log.parquet", record=tmp_path, device=True)
     rendered = []
     for k in range(128):
         down = {"z": -20 * k, "rx": k, "held": k < 100, "clutch": k < 100}
-        session.apply(session.inputs.changed(down))
+        session.apply_inputs(session.inputs.with_changes(down))
         session.advance(2)
-        rendered.append(np.linalg.norm(session.force()[:3]))
+        rendered.append(np.linalg.norm(session.device_wrench()[:3]))
     session.close()
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     drive = read_drive(tmp_path)

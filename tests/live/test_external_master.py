@@ -10,7 +10,7 @@ from drake_teleop.live.external_master import (
     _DISPLAY,
     _FAULT,
     MakeExternalMasterSide,
-    _display_step,
+    _update_displayed_wrench,
 )
 from drake_teleop.station.scenario import LoadScenario
 
@@ -23,7 +23,7 @@ def test_force_and_torque_have_their_own_limits_and_slew_rates(limits, wrench):
     wrench, last, shown = np.array(wrench, float), np.zeros(_DISPLAY), []
     for k in range(500):
         now, held = np.empty(_DISPLAY), k < 400
-        _display_step(wrench, held, PERIOD, np.array(limits), last, now)
+        _update_displayed_wrench(wrench, held, PERIOD, np.array(limits), last, now)
         shown.append(now)
         last = now
     for part, limit in zip((slice(0, 3), slice(3, 6)), limits, strict=True):
@@ -42,7 +42,7 @@ def test_wrench_that_is_not_finite_is_a_fault_and_fades(place, value):
     last, now, wrench = np.zeros(_DISPLAY), np.empty(_DISPLAY), np.ones(6)
     last[0], last[_ALLOWED] = 2.0, 1.0
     wrench[place] = value
-    _display_step(wrench, True, PERIOD, np.array([4.0, 1.0]), last, now)
+    _update_displayed_wrench(wrench, True, PERIOD, np.array([4.0, 1.0]), last, now)
     assert now[_FAULT] > 0.0
     assert now[_ALLOWED] == pytest.approx(0.98)
     np.testing.assert_allclose(now[:6], [2.0 - 0.15 * 4.0, 0, 0, 0, 0, 0])

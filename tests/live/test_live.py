@@ -273,16 +273,20 @@ def test_simulation_waits_without_a_page(scenario, load, clock, tmp_path):
 def test_short_delays_are_caught_up_and_long_ones_given_up():
     pace = Pace(5e-3, 0.0)
     for k in range(10):
-        pace.begin(5e-3 * k)
-    assert pace.factor == pytest.approx(1.0) and pace.lateness() == pytest.approx(0.0, abs=1e-12)
-    pace.begin(0.09)  # 40 ms late: the next ones are due at once
-    assert pace.wait(0.09) == pytest.approx(-0.035) and pace.given_up == 0.0
-    pace.begin(0.3)
-    assert pace.given_up == pytest.approx(0.245) and pace.wait(0.3) == pytest.approx(5e-3)
-    assert pace.factor < 0.2 and pace.lateness() == pytest.approx(0.245)
+        pace.begin_slice(5e-3 * k)
+    assert pace.real_time_factor == pytest.approx(1.0) and pace.lateness() == pytest.approx(
+        0.0, abs=1e-12
+    )
+    pace.begin_slice(0.09)  # 40 ms late: the next ones are due at once
+    assert pace.time_to_next_slice(0.09) == pytest.approx(-0.035) and pace.given_up == 0.0
+    pace.begin_slice(0.3)
+    assert pace.given_up == pytest.approx(0.245) and pace.time_to_next_slice(0.3) == pytest.approx(
+        5e-3
+    )
+    assert pace.real_time_factor < 0.2 and pace.lateness() == pytest.approx(0.245)
     pace.slow = 4.0
-    pace.begin(0.305)
-    assert pace.wait(0.305) == pytest.approx(0.02)
+    pace.begin_slice(0.305)
+    assert pace.time_to_next_slice(0.305) == pytest.approx(0.02)
 
 
 def random_message(rng: np.random.Generator) -> object:
@@ -316,7 +320,7 @@ def test_all_values_stay_finite_after_10000_random_messages(scenario, load, cloc
         if k % 1000 == 0:
             live.handle_message(1, '{"pause": false, "slow": 1}', clock())
             live.requested_scene = ""  # likewise
-            live._session.apply(live._requested)
+            live._session.apply_inputs(live._requested)
             live._session.advance()
     live.requested_scene = ""
     frame = live.frame()

@@ -13,7 +13,7 @@ from drake_teleop.live.device_packets import DeviceState, pack_state
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
-from drake_teleop.live.scenarios import with_device
+from drake_teleop.live.scenarios import with_task_space_device
 from drake_teleop.station.scenario import Scenario, replace
 
 NAMES = ("x", "y", "z", "rx", "ry", "rz")
@@ -27,7 +27,7 @@ def pose_of(inputs: Inputs) -> np.ndarray:
 def inputs_of(values: np.ndarray) -> Inputs:
     """Return the inputs of [m, rad]."""
     units = values / np.repeat([1e-5, 1e-4], 3)
-    return Inputs().changed(dict(zip(NAMES, units.tolist(), strict=True)))
+    return Inputs().with_changes(dict(zip(NAMES, units.tolist(), strict=True)))
 
 
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
@@ -38,7 +38,7 @@ def test_a_motion_within_the_limits_passes_unchanged(slice_s, device):
         begun = min(t / 0.2, 1.0)
         ramp = begun**2 * (3.0 - 2.0 * begun)
         target = inputs_of(ramp * np.array([0.02, 0, -0.01, 0.1, -0.1, 0]) * math.sin(20.0 * t))
-        assert limiter.step(target, free=False) == target
+        assert limiter.limit_inputs(target, free=False) == target
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 4.0])
@@ -49,7 +49,7 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
     for k in range(4000):
         if k % 40 == 0 and k < 3000:
             target = inputs_of(rng.uniform(-0.16, 0.16, 6) * [1, 1, 1, 7, 7, 7])  # partly outside
-        path.append(pose_of(limiter.step(target, free=False)))
+        path.append(pose_of(limiter.limit_inputs(target, free=False)))
     tool = scale * np.array(path)
     speed = np.diff(tool, axis=0) / slice_s
     rounding = 2.0 * scale * 1e-5 / slice_s
@@ -64,7 +64,7 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
 def test_limited_motion_stops_without_overshoot():
     limiter, path = MotionLimiter(2e-3, (1.0, 1.0), device=True), []
     for _ in range(300):
-        path.append(limiter.step(inputs_of(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
+        path.append(limiter.limit_inputs(inputs_of(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
     assert max(each.x for each in path) <= 5000 * 1.01 and path[-1].x == 5000
     assert max(each.rz for each in path) <= 5000 * 1.01 and path[-1].rz == 5000
     assert path[60].x > 2500  # as soon as 20 m/s^2 allow
@@ -72,8 +72,8 @@ def test_limited_motion_stops_without_overshoot():
 
 def test_free_target_may_jump():
     limiter, target = MotionLimiter(2e-3, (1.0, 1.0), device=True), inputs_of(np.full(6, 0.1))
-    assert limiter.step(target, free=True) == target
-    assert limiter.step(target, free=False) == target
+    assert limiter.limit_inputs(target, free=True) == target
+    assert limiter.limit_inputs(target, free=False) == target
 
 
 @pytest.mark.slow
@@ -97,13 +97,13 @@ def test_keys_move_the_hand_equally_per_simulated_second(scenario, load, slow, r
 
 def test_rate_ends_one_second_after_its_last_repetition():
     steering, inputs = RateInputs(), Inputs()
-    inputs = steering.begin({"x": 1000.0, "sigma": 9.0, "held": 1.0}, inputs, 0.0)
+    inputs = steering.set_rates({"x": 1000.0, "sigma": 9.0, "held": 1.0}, inputs, 0.0)
     for k in range(400):
-        inputs = steering.step(inputs, 5e-3, 5e-3 * k)
+        inputs = steering.advance_inputs(inputs, 5e-3, 5e-3 * k)
         assert inputs.sigma == 0
     assert inputs.x == pytest.approx(1000, abs=6)
-    inputs = steering.begin({"x": 1e9}, inputs, 0.0)
-    assert steering.step(inputs, 5e-3, 0.1).x == RANGES["x"][1]
+    inputs = steering.set_rates({"x": 1e9}, inputs, 0.0)
+    assert steering.advance_inputs(inputs, 5e-3, 0.1).x == RANGES["x"][1]
 
 
 def test_a_target_that_is_set_ends_a_rate(scenario, load):
@@ -148,7 +148,7 @@ def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
 ):
     """The device moves up and down by 45 mm with rests; slices come in bursts."""
     link = DeviceLink("udp://127.0.0.1:0")
-    live = Live(with_device(noisy), load, None, lambda rows: {}, 0.0, link)
+    live = Live(with_task_space_device(noisy), load, None, lambda rows: {}, 0.0, link)
     rendered, now, due, number = [], 0.0, 0.0, 0
     while live.ms < 600:
         now, number = now + 1e-3, number + 1

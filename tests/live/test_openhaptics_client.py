@@ -47,7 +47,7 @@ def test_guard_equals_that_of_the_package(tmp_path):
     text = "\n".join(" ".join(map(repr, row)) for row in rows.tolist())
     answer = subprocess.run([program], input=text, capture_output=True, text=True, check=True)
     found = np.array([line.split() for line in answer.stdout.splitlines()], float)
-    expected = [guard.tick(r[:3], (*r[3:6], 0, 0, 0), r[6], r[7])[:3] for r in rows]
+    expected = [guard.limit_wrench(r[:3], (*r[3:6], 0, 0, 0), r[6], r[7])[:3] for r in rows]
     assert guard.slowed > 100 and np.linalg.norm(expected, axis=1).max() > 3.0
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 

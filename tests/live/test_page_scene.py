@@ -25,7 +25,7 @@ def view(scenario) -> PageScene:
 def rows(scenario, load) -> dict[str, np.ndarray]:
     """Return rows with the tool pressed onto the leaf."""
     session = Session(scenario, load)
-    session.apply(session.inputs.changed({"z": -3000, "rx": 1000}))
+    session.apply_inputs(session.inputs.with_changes({"z": -3000, "rx": 1000}))
     session.advance(200)
     return session.new_rows()
 

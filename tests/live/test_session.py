@@ -15,7 +15,7 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import LEAD_TIME_S
-from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, csv_header, csv_row, read_inputs
+from drake_teleop.live.inputs import INPUTS_FILE, RANGES, Inputs, csv_header, csv_row, read_inputs
 from drake_teleop.live.session import Drive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
@@ -29,9 +29,9 @@ END = 300  # ms
 
 def script(scenario: Scenario) -> list[tuple[int, Inputs]]:
     """Return inputs: a press, ramps of sliders, clutch, object, release, another network."""
-    now, changes = Inputs.of(scenario), []
+    now, changes = Inputs.from_scenario(scenario), []
     for ms in range(0, END, 20):
-        now = now.changed(
+        now = now.with_changes(
             {"z": -20 * ms, "rx": 2 * ms, "sigma": ms // 3, "gamma": 100 + ms // 5}
             | {"force_scale": 5714 + 10 * ms, "clutch": ms not in (160, 180)}
             | {"held": ms < 240, "object": ms >= 220}
@@ -54,11 +54,11 @@ def driven(scenario, load, tmp_path_factory):
     session = Session(scenario, load, log=folder / "log.parquet", record=folder)
     changes = dict(script(scenario))
     while session.ms < END:
-        session.apply(changes.get(session.ms, session.inputs))
+        session.apply_inputs(changes.get(session.ms, session.inputs))
         session.advance()
         if session.ms % 50 == 0:
             session.new_rows()
-            session.flush()
+            session.write_log()
     session.close()
     return folder, SimulationResult.read_parquet(folder / "log.parquet")
 
@@ -97,11 +97,11 @@ def test_signals_are_continuous_when_inputs_change(driven, scenario):
 def test_new_network_and_method_continue_the_state(scenario, load):
     """In contact, to another channel and back; the rendered wrench cross-fades."""
     session = Session(scenario, load)
-    now = session.inputs.changed({"z": -2900})
+    now = session.inputs.with_changes({"z": -2900})
     for end, change in ((250, {}), (1050, {"network": 2, "method": 4}), (1400, {"network": 0})):
-        now = now.changed(change | ({"method": 0} if end == 1400 else {}))
-        session.apply(now)
-        assert session.filling == bool(change)
+        now = now.with_changes(change | ({"method": 0} if end == 1400 else {}))
+        session.apply_inputs(now)
+        assert session.is_channel_filling == bool(change)
         while session.ms < end:
             session.advance()
     log = session.log()
@@ -116,7 +116,10 @@ def test_new_network_and_method_continue_the_state(scenario, load):
     assert session._station.simulator.get_integrator().get_num_steps_taken() <= 4 * (1400 - 1050)
     # The clutch is closed at the end, and the channel delivers packets.
     assert np.ptp(command[260:1000], axis=0).max() < 1e-15
-    assert not session.filling and session.apply(now.changed({"z": -1000})) is None
+    assert (
+        not session.is_channel_filling
+        and session.apply_inputs(now.with_changes({"z": -1000})) is None
+    )
     session.advance(100)
     assert session.log()["pose_command"][-1, 6] > command[-1, 2] + 1e-3
 
@@ -148,9 +151,9 @@ def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, lo
     session, rendered = Session(scenario, load), []
 
     def simulate(ms, **changes):
-        session.apply(session.inputs.changed(changes))
+        session.apply_inputs(session.inputs.with_changes(changes))
         session.advance(ms)
-        rendered.append(float(np.linalg.norm(session.force()[:3])))
+        rendered.append(float(np.linalg.norm(session.device_wrench()[:3])))
         return session.removed_force()
 
     assert simulate(500, z=-4000) == 0.0
@@ -169,12 +172,14 @@ def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, lo
 def test_tool_follows_the_target_without_lag_and_stops_at_it(scenario, load):
     """The arm's servo has a lag of 10 ms."""
     session, speed = Session(scenario, load), 0.12
-    session.apply(session.inputs.changed({"z": 1000}))
+    session.apply_inputs(session.inputs.with_changes({"z": 1000}))
     session.advance(50)
     for ms in range(200):
-        session.apply(session.inputs.changed({"x": round(1e5 * speed * (1e-3 * ms + LEAD_TIME_S))}))
+        session.apply_inputs(
+            session.inputs.with_changes({"x": round(1e5 * speed * (1e-3 * ms + LEAD_TIME_S))})
+        )
         session.advance(1)
-    session.apply(session.inputs.changed({"x": round(1e5 * speed * 0.2)}))
+    session.apply_inputs(session.inputs.with_changes({"x": round(1e5 * speed * 0.2)}))
     session.advance(200)
     log = session.log()
     places, R_WS = np.empty((len(log.t), 3)), np.empty((3, 3))
@@ -192,13 +197,13 @@ def test_tool_follows_the_target_without_lag_and_stops_at_it(scenario, load):
 @pytest.mark.slow
 def test_new_grip_object_and_sensor_continue_the_state(scenario, load):
     session = Session(scenario, load)
-    now = session.inputs.changed({"x": 1000, "grip": 0})
-    session.apply(now)
+    now = session.inputs.with_changes({"x": 1000, "grip": 0})
+    session.apply_inputs(now)
     session.advance(120)
     ends = []
     for change in ({"grip": 2}, {"object": 1}, {"sensor": 2}, {"detection": 1}):
-        now = now.changed(change)
-        session.apply(now)
+        now = now.with_changes(change)
+        session.apply_inputs(now)
         ends.append(session.ms)
         session.advance(30)
     log = session.log()
@@ -219,9 +224,9 @@ def test_packets_in_the_channel_arrive_after_a_change_of_grip(scenario, load):
     logs = []
     for grip in (1, 2):
         session = Session(far, load)
-        session.apply(session.inputs.changed({"x": 1000}))
+        session.apply_inputs(session.inputs.with_changes({"x": 1000}))
         session.advance(150)
-        session.apply(session.inputs.changed({"grip": grip}))
+        session.apply_inputs(session.inputs.with_changes({"grip": grip}))
         session.advance(100)
         logs.append(session.log())
     one, other = (log["pose_received"][150:] for log in logs)
@@ -272,8 +277,8 @@ def test_unclosed_drive_loses_two_seconds_of_log_and_no_input(scenario, load, tm
     session = Session(scenario, load, log=tmp_path / "log.parquet", record=tmp_path)
     changes = []
     while session.ms < 2100:
-        changes.append((session.ms, session.inputs.changed({"x": session.ms})))
-        session.apply(changes[-1][1])
+        changes.append((session.ms, session.inputs.with_changes({"x": session.ms})))
+        session.apply_inputs(changes[-1][1])
         session.advance(100)
     session._on_disk.finish()  # the thread has written all parts taken so far
     assert list(read_drive(tmp_path).changes)[1:] == changes[1:]
@@ -287,9 +292,11 @@ HEADER = csv_header(MADE_BY)
 
 def test_inputs_are_clipped_and_invalid_ones_ignored():
     wild = {"x": 1e300, "y": -(10**400), "z": np.nan, "rx": "1", "clutch": 7, "sigma": 12.6}
-    inputs = Inputs().changed(wild | {"unknown": 1, "gamma": None, "held": False, "rz": np.inf})
+    inputs = Inputs().with_changes(
+        wild | {"unknown": 1, "gamma": None, "held": False, "rz": np.inf}
+    )
     assert inputs == Inputs(sigma=13, clutch=1, held=0)
-    assert Inputs().changed({"x": 1e9, "force_scale": -3}) == Inputs(x=15_000, force_scale=0)
+    assert Inputs().with_changes({"x": 1e9, "force_scale": -3}) == Inputs(x=15_000, force_scale=0)
 
 
 @pytest.mark.parametrize(
@@ -328,9 +335,9 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
     ],
 )
 def test_invalid_file_of_inputs_is_one_error_line(tmp_path, text, message):
-    (tmp_path / INPUTS).write_text(text)
+    (tmp_path / INPUTS_FILE).write_text(text)
     with pytest.raises(DrakeTeleopError, match=message):
-        read_inputs(tmp_path / INPUTS, MADE_BY)
+        read_inputs(tmp_path / INPUTS_FILE, MADE_BY)
 
 
 def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
@@ -346,7 +353,7 @@ def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
 
 
 def test_incomplete_last_line_is_ignored(tmp_path):
-    path = tmp_path / INPUTS
+    path = tmp_path / INPUTS_FILE
     path.write_text(
         HEADER + csv_row(0, Inputs()) + csv_row(5, Inputs(x=3)) + csv_row(10, Inputs())[:9]
     )
@@ -356,13 +363,16 @@ def test_incomplete_last_line_is_ignored(tmp_path):
 
 def test_weight_has_its_own_share_and_follows_the_inertia_at_minus_one(scenario, load):
     apart = replace(scenario, force_scaling__sigma_weight=0.5, force_scaling__sigma_inertia=0.25)
-    assert Inputs.of(scenario).sigma_weight == -1 and Inputs().scales["sigma_weight"] is None
-    inputs = Inputs.of(apart)
-    assert (inputs.sigma, inputs.sigma_weight, inputs.scales["sigma_weight"]) == (25, 50, 0.5)
+    assert (
+        Inputs.from_scenario(scenario).sigma_weight == -1
+        and Inputs().force_scales["sigma_weight"] is None
+    )
+    inputs = Inputs.from_scenario(apart)
+    assert (inputs.sigma, inputs.sigma_weight, inputs.force_scales["sigma_weight"]) == (25, 50, 0.5)
     session = Session(scenario, load)
     felt = {}
     for weight in (0, 100):
-        session.apply(session.inputs.changed({"sigma": 0, "sigma_weight": weight}))
+        session.apply_inputs(session.inputs.with_changes({"sigma": 0, "sigma_weight": weight}))
         session.advance(150)
         felt[weight] = session.new_rows()["force_to_master"][-1, 2]
     session.close()

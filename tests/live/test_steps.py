@@ -73,7 +73,7 @@ def test_contact_takes_two_steps_a_tick_and_few_rejected_ones(scenario, load):
     pressed, counts = [], []
     while session.ms < 1500:
         down = 0.5 - 0.5 * np.cos(2e-3 * np.pi * session.ms)
-        session.apply(session.inputs.changed({"z": round(-4000 * down)}))
+        session.apply_inputs(session.inputs.with_changes({"z": round(-4000 * down)}))
         session.advance()
         pressed.append(session.contact_force())
         session.new_rows()

@@ -13,7 +13,7 @@ import yaml
 from drake_teleop.load.identification import Identification, natural_scales
 from drake_teleop.logs.processing import IdentifiedLog, eliminate_log, identify_log
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.replay_log import ReplayLogSource
 
 CASES = Path(__file__).parents[3] / "shared" / "cases" / "logs"
 COM = np.array([0.012, -0.021, 0.064])
@@ -149,7 +149,7 @@ def test_eliminate_subtracts_inertia_alone_where_the_weight_is_removed(tmp_path:
     both = eliminate_log(log, replace(read, weight_removed=False))
     rms = [np.sqrt((x.contact[~x.edge, :3] ** 2).sum(axis=1).mean()) for x in (left, both)]
     assert rms[0] < 0.25 and rms[1] > 5.0 * rms[0]
-    source = LogSource(log, read)
+    source = ReplayLogSource(log, read)
     compensator, rms = Compensator(read, source.dt), []
     while (readings := source.read(0.0)) is not None:
         rms += [compensator.step(x, x.t).contact[:3] for x in readings]

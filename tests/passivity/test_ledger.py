@@ -18,8 +18,8 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     OneDofRun,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -117,7 +117,7 @@ def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
     axis = model(LIGHT, 50e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
     assert run.wall[run.t < 4.0].min() < -50.0, "it should have hit the wall"
-    found = figures(run, axis)
+    found = figures_of_run(run, axis)
     assert found.stable and abs(found.force_error) < 0.01
 
 
@@ -211,10 +211,10 @@ def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
     """Without initial energy and without information about the hand."""
     task = Task(press=3.5, pressed=4.5, release=9.0, released=10.0, end=12.5, judged=1.0)
     network = NetworkConfig(delay=delay, jitter=0.5 if loss else 0.0, loss=loss, burst=0.08)
-    pressing = operators_intent(task)
+    pressing = operator_intent(task)
     axis = model(grip, wall)
     run = run_one_dof(axis, CHARGED_BY_DRAG, network, timeout=PATIENT, intent=pressing)
-    found = figures(run, axis, task)
+    found = figures_of_run(run, axis, task)
     assert found.stable and abs(found.force_error) < 0.01
     assert abs(found.drift) < 1e-4 and found.chatter < 0.05 * found.felt_force
     free = np.abs(run.felt[(run.t > 0.5) & (run.t < 3.5)])
@@ -229,7 +229,7 @@ def test_rendered_force_is_right_with_damped_wall_and_joint_friction(grip, delay
     """Damping that counted as stiffness would be rendered without contact force."""
     axis = model(grip, 2.5e3, wall_damping=300.0, slave_friction=30.0)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
-    found = figures(run, axis)
+    found = figures_of_run(run, axis)
     assert found.stable and abs(found.force_error) < 0.05
     assert run.least_energy_sum(ACTUAL) >= -1e-6
 
@@ -239,7 +239,10 @@ def test_displayed_stiffness_rises_for_a_hand_that_stays(grip):
     """At 300 ms: 20 kN/m are 1.1 kN/m at the hand; the first second displays 300 N/m."""
     axis = model(grip, 20e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=0.15), timeout=PATIENT)
-    found, hard = figures(run, axis), axis.force_scale * 20e3 / (1.0 + 20e3 / axis.servo_stiffness)
+    found, hard = (
+        figures_of_run(run, axis),
+        axis.force_scale * 20e3 / (1.0 + 20e3 / axis.servo_stiffness),
+    )
     assert found.stable and abs(found.force_error) < 0.01
     assert found.felt_force > 0.95 * 0.02 * hard * grip[2] / (hard + grip[2])
 

@@ -11,8 +11,8 @@ from drake_teleop.common.vectors import normalized_quaternion, quaternion_produc
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -276,8 +276,8 @@ def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, 
 
     def found(method):
         passivity = PassivityConfig(method=method)
-        run = run_one_dof(model, passivity, network, intent=operators_intent(task))
-        return figures(run, model, task)
+        run = run_one_dof(model, passivity, network, intent=operator_intent(task))
+        return figures_of_run(run, model, task)
 
     charged, strict = found("charged_tdpa"), found("tdpa")
     assert charged.stable and abs(charged.force_error) < 0.01

@@ -21,8 +21,8 @@ from drake_teleop.lab.comparison.one_dof import (
     REFERENCE,
     OneDofRun,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -181,9 +181,9 @@ def test_four_channels_are_transparent_without_delay():
     task = Task(press=0.5, pressed=1.5, release=4.0, released=5.0, end=6.0, judged=1.0)
     found = run_one_dof(
         MEDIUM, PassivityConfig(method="four_channel"), NetworkConfig(),
-        intent=operators_intent(task), timeout=1.0,
+        intent=operator_intent(task), timeout=1.0,
     )  # fmt: skip
-    assert abs(figures(found, MEDIUM, task).force_error) < 0.02
+    assert abs(figures_of_run(found, MEDIUM, task).force_error) < 0.02
     held = slice(3500, 3900)
     assert found.wall[held].mean() / MEDIUM.servo_stiffness < -2e-4
     np.testing.assert_allclose(found.slave[held], found.master[held], atol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operators_intent, run_one_dof
+from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operator_intent, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.memory import HELD_WRENCH, MEMORY_SIZE
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, method_parameters
@@ -18,7 +18,7 @@ LET_GO = 9000
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "none"])
 def test_released_hand_stays_slow(method, delay):
     """Wall of 5.1 kN/m, about 4 N without delay; 1.3 and 4.4 m/s without the limit."""
-    intent = operators_intent()[:11000]
+    intent = operator_intent()[:11000]
     intent[intent[:, 0] > 0.0] *= 1.375
     grip = np.tile([0.2, 5.0, 300.0], (len(intent), 1))
     grip[LET_GO:] = 0.0

@@ -11,8 +11,8 @@ from drake_teleop.lab.comparison.one_dof import (
     PERIOD,
     OneDof,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
@@ -82,7 +82,7 @@ def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
     """
     model = OneDof(wall_stiffness=1000.0)
     task = Task()
-    intent = np.concatenate([operators_intent(task), operators_intent(task)])
+    intent = np.concatenate([operator_intent(task), operator_intent(task)])
     felt, wall = [], []
     for spans in ([(8.0, 9.0)], []):
         result = run_one_dof(
@@ -157,7 +157,7 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
         result = run_one_dof(model, config, forward, backward, timeout=TIMEOUT)
         assert np.isfinite(result.felt).all() and np.isfinite(result.command).all()
         assert np.abs(result.felt).max() <= 5.0 + 1e-12
-        found = figures(result, model)
+        found = figures_of_run(result, model)
         assert found.stable, found
         assert abs(found.drift) < 2e-3, found
         assert np.abs(result.felt[-1000:]).max() < 0.1

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     ReportFigure,
-    captions,
     compare_with_paper,
     describe_unaccepted,
+    figure_captions,
     parameter_rows,
     write_report,
 )
@@ -48,7 +48,7 @@ def write(path, summary=SUMMARY, replay="replay.html", setup=None) -> str:
         path,
         setup=setup or {"Seed": "7"},
         summary=summary,
-        figures=[ReportFigure("Fig. 6", picture, captions(summary)["fig6"])],
+        figures=[ReportFigure("Fig. 6", picture, figure_captions(summary)["fig6"])],
         parameters=parameter_rows(TRUE, TRUE + 0.01, STD),
         replay=replay,
     )
@@ -113,12 +113,14 @@ def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdic
 
 
 def test_captions_contain_values_of_the_run():
-    text = captions(SUMMARY)
+    text = figure_captions(SUMMARY)
     assert "99.4 N" in text["fig6"] and "1.21 N remain" in text["fig6"]
     assert "5.10 N m" in text["fig7"]
     assert "at 220 ms" in text["fig8"] and "2.5 ms after" in text["fig8"]
     assert "no threshold on it separates" in text["fig8"]
-    other = captions(SUMMARY | {"contact.raw_detectable": True, "contact.false_alarm_0_6_s": True})
+    other = figure_captions(
+        SUMMARY | {"contact.raw_detectable": True, "contact.false_alarm_0_6_s": True}
+    )
     assert "a threshold on it separates" in other["fig8"]
     assert "it also crosses it" in other["fig8"]
 

@@ -20,17 +20,17 @@ from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
     contact_values,
-    free_motion,
     free_values,
     ideal_values,
-    raw_excess,
+    raw_force_excess,
+    simulate_free_motion,
 )
 from drake_teleop.lab.reproduction.report import (
     compare_with_paper,
     describe_unaccepted,
     values_by_full_name,
 )
-from drake_teleop.lab.run_summary import in_contact
+from drake_teleop.lab.run_summary import is_in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import regressor_into
@@ -42,7 +42,13 @@ pytestmark = pytest.mark.long
 FORCE_SCALE = 1 / 17.5
 
 
-EXPERIMENTS = ("identify_load", "free_motion", "ideal_motion", "contact_motion", "_speed")
+EXPERIMENTS = (
+    "identify_load",
+    "simulate_free_motion",
+    "simulate_ideal_motion",
+    "simulate_contact",
+    "_measure_speed",
+)
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +226,7 @@ def motion() -> ContactMotion:
         calculated=touch + residual,
         raw_free=free + residual,
         calculated_free=residual,
-        contact=in_contact(result),
+        contact=is_in_contact(result),
         threshold=0.75,
     )
 
@@ -229,7 +235,7 @@ def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
     figures = contact_values(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
     assert figures["raw_detectable"] is False
-    assert np.all(raw_excess(motion) <= 0)
+    assert np.all(raw_force_excess(motion) <= 0)
     assert figures["false_alarm_0_6_s"] is False
     assert figures["duration_s"] == pytest.approx(0.04)
 
@@ -247,7 +253,7 @@ def test_raw_force_detects_contact_by_its_norm(motion):
     free, told = motion.raw_free.copy(), motion.raw.copy()
     free[:100, 0] = told[:100, 0] = 80.0
     told[motion.contact, 0] = 80.0
-    excess = raw_excess(dataclasses.replace(motion, raw=told, raw_free=free))
+    excess = raw_force_excess(dataclasses.replace(motion, raw=told, raw_free=free))
     assert np.all(excess[:3] <= 0)
     assert excess[3] > 0
 
@@ -310,7 +316,7 @@ def eliminate(mutated, wrench, offsets, s, omega, alpha, phi):
 
 @pytest.fixture(scope="module")
 def ideal_run(run, results):
-    return results["ideal_motion"][0]
+    return results["simulate_ideal_motion"][0]
 
 
 def ideal_rows(values):
@@ -363,7 +369,7 @@ def test_wrong_mass_increases_the_residual():
     )
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     estimate[6:] *= 1.1
-    motion = free_motion(scenario, estimate, lambda done: None)
+    motion = simulate_free_motion(scenario, estimate, lambda done: None)
     assert tuple(motion.scaled) == SIGMAS
     figures = free_values(motion, 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)

@@ -29,7 +29,7 @@ from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.calibration import Evaluation, best_motion, calibrate, evaluate_record
-from drake_teleop.robots.recording import PartRecorder, Recorder
+from drake_teleop.robots.recording import PartRecorder, ReadingRecorder
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Part, Reading, ReadingFlag
 
 DT = 0.005
@@ -75,9 +75,9 @@ class Stream:
 
 def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
-    recorder = Recorder()
+    recorder = ReadingRecorder()
     looks = calibrate(Stream(recorded(20.0, [0, 1, 2])), recorder, path, TOLERANCE)
-    assert recorder.seconds < 8.0
+    assert recorder.longest_part_s < 8.0
     assert [at.sure.all() for at in looks[-3:]] == [False, True, True]
     assert [at.known.all() for at in looks[-3:]] == [False, False, True]
     last = looks[-1]
@@ -102,12 +102,12 @@ class Live(Stream):
 
 
 def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> None:
-    path = tmp_path / Recorder.file
+    path = tmp_path / ReadingRecorder.file
     for seconds in (0.5, 0.8):
         with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-            calibrate(Live(recorded(seconds, [0])), Recorder(), path, TOLERANCE)
+            calibrate(Live(recorded(seconds, [0])), ReadingRecorder(), path, TOLERANCE)
     with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-        calibrate(Live(recorded(0.0, [0])), Recorder(), path, TOLERANCE)  # nothing came
+        calibrate(Live(recorded(0.0, [0])), ReadingRecorder(), path, TOLERANCE)  # nothing came
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2
@@ -192,22 +192,22 @@ def test_advice_is_the_missing_motion(axis: int) -> None:
 
 
 def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: Path) -> None:
-    rows, recorder = recorded(1.0, [0]), Recorder(np.full(6, 80.0))
+    rows, recorder = recorded(1.0, [0]), ReadingRecorder(np.full(6, 80.0))
     broken = rows[3].copy()
     broken[1], rows[5, 0] = np.nan, 80.0
     for reading in (Reading(0, 0.0, rows[0]), DAMAGED, Reading(1, DT, broken),
                     Reading(2, 2 * DT, rows[5]), Reading(3, 3 * DT, rows[7]),
                     Reading(2, 2 * DT, rows[6])):  # fmt: skip
         recorder.add(reading)
-    assert recorder.left_out == 4 and recorder.seconds == pytest.approx(3 * DT)
+    assert recorder.left_out == 4 and recorder.longest_part_s == pytest.approx(3 * DT)
     for k in range(50):
-        assert recorder.clock_changes == 0 and recorder.seconds == pytest.approx(3 * DT)
+        assert recorder.clock_changes == 0 and recorder.longest_part_s == pytest.approx(3 * DT)
         recorder.add(Reading(4 + k, 100.0 + DT * k, rows[8]))
-    assert recorder.clock_changes == 1 and recorder.seconds == pytest.approx(49 * DT)
+    assert recorder.clock_changes == 1 and recorder.longest_part_s == pytest.approx(49 * DT)
     assert recorder.left_out == 4
 
 
-def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
+def take(recorder: ReadingRecorder, *clocks: tuple[float, int]) -> ReadingRecorder:
     """Record a number of readings from each start time."""
     number = 0
     for start, count in clocks:
@@ -220,18 +220,18 @@ def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
 @pytest.mark.parametrize("wrong", [1e6, -1e6, 1e300, 20.0, 0.0])
 @pytest.mark.parametrize("count", [1, 2, 49])
 def test_wrong_stamps_reject_only_their_own_readings(wrong: float, count: int) -> None:
-    recorder = take(Recorder(), (10.0, 800), (wrong, count), (14.0, 200))
+    recorder = take(ReadingRecorder(), (10.0, 800), (wrong, count), (14.0, 200))
     assert (recorder.left_out, recorder.clock_changes) == (count, 0)
-    assert recorder.seconds == pytest.approx(4.0 + 199 * DT)
+    assert recorder.longest_part_s == pytest.approx(4.0 + 199 * DT)
 
 
 @pytest.mark.parametrize(("first", "second"), [(800, 60), (60, 800)])
 def test_longest_part_is_written_after_a_clock_change(
     first: int, second: int, tmp_path: Path
 ) -> None:
-    recorder = take(Recorder(), (0.0, first), (1e6, 1), (500.0, second))
+    recorder = take(ReadingRecorder(), (0.0, first), (1e6, 1), (500.0, second))
     assert (recorder.left_out, recorder.clock_changes) == (1, 1)
-    assert recorder.seconds == pytest.approx(799 * DT)
+    assert recorder.longest_part_s == pytest.approx(799 * DT)
     recorder.write(tmp_path / recorder.file)
     assert len(pl.read_parquet(tmp_path / recorder.file)) == 800
 
@@ -242,11 +242,11 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
     for k in range(1000):
         recorder.add((Part(WRENCH, k, 1e7 if k == 400 else DT * k, wrench), DT * k))
         recorder.add((Part(POSE, k, 1e4 + DT * k, pose), DT * k))
-    assert recorder.seconds == pytest.approx(999 * DT) and recorder.left_out == 1
+    assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
     for k in range(100):  # both were set
         recorder.add((Part(WRENCH, k, 70.0 + DT * k, wrench), DT * k))
         recorder.add((Part(POSE, k, 90.0 + DT * k, pose), DT * k))
-    assert recorder.seconds == pytest.approx(999 * DT) and recorder.left_out == 1
+    assert recorder.longest_part_s == pytest.approx(999 * DT) and recorder.left_out == 1
     assert recorder.clock_changes <= 2
 
 

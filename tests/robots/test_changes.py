@@ -15,11 +15,11 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots import changes
-from drake_teleop.robots.changes import Changes
-from drake_teleop.robots.compensate import compensate_command, run
+from drake_teleop.robots.changes import ChangeMonitor
+from drake_teleop.robots.compensate import compensate_command, compensate_stream
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Compensated, Reading, ReadingFlag
-from drake_teleop.robots.watch import Watch
+from drake_teleop.robots.watch import ContactAndLoadMonitor
 
 OBJECT = phi_from_mass_com_inertia(0.4, [0.0, 0.01, 0.15], np.diag([1e-3, 1e-3, 5e-4]))
 ZERO = np.array([2.0, -1.0, 3.0, 0.05, 0.1, -0.1])
@@ -81,11 +81,11 @@ def compensated(
 ) -> tuple[list[Compensated], list[str]]:
     """Return outputs and reports."""
     messages: list[str] = []
-    sought = Changes(DT, live=live, report=messages.append) if looked_for else None
+    sought = ChangeMonitor(DT, live=live, report=messages.append) if looked_for else None
     sink = ListSink()
-    compensator = Compensator(LOAD, DT, watch=Watch(LOAD, DT, 30.0))
+    compensator = Compensator(LOAD, DT, watch=ContactAndLoadMonitor(LOAD, DT, 30.0))
     # As fast as it comes: the clock of the loop is that of the readings.
-    run(Readings(values, live=False), compensator, sink, changes=sought)
+    compensate_stream(Readings(values, live=False), compensator, sink, changes=sought)
     if sought is not None:
         sought.close()
     return sink.out, messages
@@ -199,17 +199,17 @@ def test_failing_explanation_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPa
 
 def test_record_contains_the_last_20_s_after_a_clock_change() -> None:
     seen = []
-    sought = Changes(DT, live=False, report=print)
+    sought = ChangeMonitor(DT, live=False, report=print)
     sought._executor.shutdown()
     sought._next_attempt = np.inf
     row = np.zeros(15)
     for k, t in enumerate([0.0, *(50.0 + DT * np.arange(11_000))]):
-        sought.take(Reading(k, t, row + t), int(ReadingFlag.STALE if k == 500 else 0))
-    seen = sought._record()[:, 0]
+        sought.add_reading(Reading(k, t, row + t), int(ReadingFlag.STALE if k == 500 else 0))
+    seen = sought._recorded_rows()[:, 0]
     assert len(seen) == 10_000 and (np.diff(seen) > 0.0).all()
     assert seen[-1] == pytest.approx(50.0 + DT * 10_999)
-    sought.take(Reading(0, 3.0, row), 0)
-    assert sought._record()[:, 0].tolist() == [3.0]
+    sought.add_reading(Reading(0, 3.0, row), 0)
+    assert sought._recorded_rows()[:, 0].tolist() == [3.0]
 
 
 @pytest.mark.slow

@@ -18,9 +18,9 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.compensate import run
+from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import JUMP_S, STALE_S, TARE_S, Compensator
-from drake_teleop.robots.replay_log import LogSource
+from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import DAMAGED, Compensated, Reading, ReadingFlag
 
 DT, DELAY = 0.002, 0.0051
@@ -95,9 +95,9 @@ def test_replayed_log_equals_eliminate(log: Path, mode: str, weight: float | Non
     @settings(max_examples=3, deadline=None, derandomize=True)
     @given(chunk=st.integers(1, 2000))
     def at(chunk: int) -> None:
-        source, kept = LogSource(log, load(), delay=DELAY, chunk=chunk), ListSink()
+        source, kept = ReplayLogSource(log, load(), delay=DELAY, chunk=chunk), ListSink()
         late = {"wait": source.wait, "predicted": mode == "predicted"}
-        counts = run(source, Compensator(load(), source.dt, **options, **late), kept)
+        counts = compensate_stream(source, Compensator(load(), source.dt, **options, **late), kept)
         good = [row for row in kept.rows if not row.flags]
         assert counts["gap"] == counts["wrenches"] - len(good) > 0
         assert set(counts) == {"wrenches", "gap"}

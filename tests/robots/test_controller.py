@@ -121,7 +121,7 @@ int main(void) {
     ids=["done", "runs after an invalid reading", "too far", "varies"],
 )
 def test_tare_equals_that_of_python(tmp_path, noise, shift, reading, state):
-    loop = kernel.TARGET.loop()
+    loop = kernel.TARGET.make_compensator()
     count = int(loop.settings["tare_steps"])
     rows = np.zeros((count, 15))
     rows[:, 8] = 9.81
@@ -176,7 +176,7 @@ def with_integer_division(n):
 @needs_cc
 def test_each_supported_operation_has_the_result_of_python(tmp_path):
     c = Translator()
-    c.add(every_operation, x=(4,), n="int", y=("size",))
+    c.translate_function(every_operation, x=(4,), n="int", y=("size",))
     text = c.text.replace("static int every", "int every")
     (tmp_path / "every.c").write_text(HELPERS.replace("static", "static inline") + text)
     library = tmp_path / "every.so"
@@ -199,7 +199,7 @@ def with_new_parameter(n):
 @pytest.mark.parametrize("function", [with_while, with_integer_division, with_new_parameter])
 def test_syntax_that_is_not_supported_is_named(function):
     with pytest.raises(ValueError, match=rf"^{function.__name__}: .*cannot be translated"):
-        Translator().add(function, n="int")
+        Translator().translate_function(function, n="int")
 
 
 @pytest.mark.parametrize(

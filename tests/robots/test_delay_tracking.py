@@ -38,7 +38,7 @@ def followed(
         at, before, after = [(t + e, truth(t + e + error)[1]) for e in (0.0, -0.001, 0.001)]
         ends = (non_contact_wrench(*np.split(each[1], 3), PHI)[0] for each in (before, after))
         wrench[0] += push * np.sign(-np.subtract(*ends))
-        follower.take(at, wrench, before, after)
+        follower.update_delay(at, wrench, before, after)
 
 
 @pytest.mark.parametrize("late", [-0.006, 0.011])
@@ -91,7 +91,7 @@ def test_delay_is_constant_at_rest() -> None:
     for t in np.arange(0.0, 2.0, DT):
         shaken = rest + np.repeat([1e-3, 0.0], [3, 6]) * rng.normal(size=9)
         wrench = still + NOISE * rng.normal(size=6)
-        follower.take((t, rest), wrench, (t - 0.001, rest), (t + 0.001, shaken))
+        follower.update_delay((t, rest), wrench, (t - 0.001, rest), (t + 0.001, shaken))
     assert follower.delay_s == 0.005
 
 

@@ -23,7 +23,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, tolerances_in_units, values_of_required
 from drake_teleop.robots.assembly import Assembly, Parts, PosedByJoints
 from drake_teleop.robots.connections import open_source
-from drake_teleop.robots.ros2_zenoh import Messages
+from drake_teleop.robots.ros2_zenoh import CdrConverter
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.plant import arm_of_model_file
@@ -91,7 +91,7 @@ def test_pose_equals_drake(model: Path) -> None:
 
 
 def test_joint_order_is_arbitrary_and_gripper_joints_are_ignored() -> None:
-    messages = Messages(1.0, joints=NAMES)
+    messages = CdrConverter(1.0, joints=NAMES)
     sent = joint_state(5_250_000_000, [*NAMES[::-1], "finger"], [4.0, 3.0, 2.0, 1.0, 9.0])
     (part,) = messages.parts(JOINTS, sent, b"")
     assert part.stream == JOINTS and part.t == 5.25
@@ -123,7 +123,7 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
     assembly, found = Assembly(Parts(source)), []
     for k, part in enumerate(sent[1:]):
-        found += assembly.take(part, part.t) + assembly.take(
+        found += assembly.complete_readings(part, part.t) + assembly.complete_readings(
             Part(WRENCH, k, part.t, np.zeros(6)), part.t
         )
     good = [each for each in found if not each.flags]

@@ -95,7 +95,7 @@ class Peer:
 @pytest.fixture
 def answers(here) -> Iterator[socket.socket]:
     """Receiver of the wrenches."""
-    with udp.listening(udp.THIS_MACHINE, 49153) as there:
+    with udp.open_udp_receiver(udp.LOCALHOST, 49153) as there:
         there.setblocking(False)
         yield there
 

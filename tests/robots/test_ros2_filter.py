@@ -61,7 +61,7 @@ def inputs(count: int) -> np.ndarray:
 
 def by_python(rows: np.ndarray, **scales: float) -> tuple[np.ndarray, np.ndarray]:
     """Return contact and scaled wrench, both with the sign of the sensor."""
-    loop = kernel.TARGET._replace(dt=DT).loop(**scales)
+    loop = kernel.TARGET._replace(dt=DT).make_compensator(**scales)
     t = np.array([k // 1000 + 1e-9 * (k % 1000 * 1_000_000) for k in range(len(rows))])
     alpha = np.zeros((len(rows), 3))
     alpha[1:] = np.diff(rows[:, 3:6], axis=0) / np.diff(t)[:, None]

@@ -26,7 +26,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, delayed_signals, install_handlers
 from drake_teleop.robots import lines
-from drake_teleop.robots.compensate import Control, compensate_command, run
+from drake_teleop.robots.compensate import TareRequestPort, compensate_command, compensate_stream
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink, open_source
 from drake_teleop.robots.lines import LineSource, read_line, wrench_line
@@ -120,7 +120,7 @@ def test_number_outside_64_bits_is_damaged(number) -> None:
 
 def test_udp_round_trip_accepts_only_this_machine() -> None:
     source = udp.UdpSource("udp://:0", DT)
-    with udp.listening(udp.THIS_MACHINE, 0) as there:
+    with udp.open_udp_receiver(udp.LOCALHOST, 0) as there:
         there.settimeout(5.0)
         sink = open_sink(f"udp://127.0.0.1:{there.getsockname()[1]}")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -169,7 +169,9 @@ def test_lines_from_a_pipe_are_written_to_a_table(tmp_path: Path) -> None:
     os.write(into, lines[1000:] + b"\n{}\n")
     os.close(into)
     sink, messages = open_sink(str(tmp_path / "x" / "out.csv")), []
-    counts = run(LineSource(out, DT), Compensator(load(), DT), sink, report=messages.append)
+    counts = compensate_stream(
+        LineSource(out, DT), Compensator(load(), DT), sink, report=messages.append
+    )
     os.close(out)
     sink.close()
     table = pl.read_csv(tmp_path / "x" / "out.csv")
@@ -296,7 +298,9 @@ class Interrupted:
 
 
 def test_ctrl_c_returns_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Interrupted(), Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+    assert compensate_stream(Interrupted(), Compensator(load(), DT), open_sink("-")) == {
+        "wrenches": 1
+    }
     assert json.loads(capsys.readouterr().out)["number"] == 0
 
 
@@ -326,14 +330,16 @@ def handlers() -> Iterator[None]:
 @pytest.mark.usefixtures("handlers")
 def test_loop_ends_at_a_signal_whose_exception_is_lost() -> None:
     source = SignalLost(signal.SIGTERM)
-    assert run(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+    assert compensate_stream(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
 
 
 def test_loop_of_a_program_ends_at_ctrl_c_whose_exception_is_lost() -> None:
     with hearing_ctrl_c():
         for _ in range(2):
             source = SignalLost(signal.SIGINT)
-            assert run(source, Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
+            assert compensate_stream(source, Compensator(load(), DT), open_sink("-")) == {
+                "wrenches": 1
+            }
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -353,13 +359,13 @@ def test_delayed_signals_are_handled_at_the_end(number: signal.Signals) -> None:
 
 
 def test_control_port_answers_tare_requests() -> None:
-    control = Control(0)
-    control.answer(lambda: "")  # nothing was asked
-    with udp.listening(udp.THIS_MACHINE, 0) as asker:
+    control = TareRequestPort(0)
+    control.answer_request(lambda: "")  # nothing was asked
+    with udp.open_udp_receiver(udp.LOCALHOST, 0) as asker:
         asker.settimeout(5.0)
         for word in (b"tare\n", b"tear"):
-            asker.sendto(word, (udp.THIS_MACHINE, control.port))
-            control.answer(Compensator(load(), DT).tare)
+            asker.sendto(word, (udp.LOCALHOST, control.port))
+            control.answer_request(Compensator(load(), DT).tare)
         messages = [asker.recv(100) for _ in range(2)]
     control.close()
     assert messages[0].startswith(b"refused: fewer than 0.5 s") and messages[1].startswith(

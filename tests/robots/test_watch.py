@@ -14,7 +14,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Reading, ReadingFlag
-from drake_teleop.robots.watch import Detector, Watch
+from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
 DT = 0.002
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -40,7 +40,7 @@ def readings(seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 def flagged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return flags (N,); the wrench is equal with and without the watch."""
-    watched = Compensator(LOAD, DT, watch=Watch(LOAD, DT, 30.0))
+    watched = Compensator(LOAD, DT, watch=ContactAndLoadMonitor(LOAD, DT, 30.0))
     plain = Compensator(LOAD, DT)
     found = []
     for k, row in enumerate(values):
@@ -74,7 +74,9 @@ def test_noise_floor_of_a_free_log_detects_small_contacts(tmp_path: Path) -> Non
     for push in (0.0, 0.5):
         rows = values.copy()
         rows[1000:1250, 1] += push
-        compensator = Compensator(LOAD, DT, detector=Detector(LOAD, free, DT, 30.0, 0.0))
+        compensator = Compensator(
+            LOAD, DT, detector=StreamContactDetector(LOAD, free, DT, 30.0, 0.0)
+        )
         compensator.offsets = tared.copy()
         out = [
             compensator.step(Reading(k, float(t[k]), row), float(t[k]))
@@ -106,7 +108,7 @@ def test_noise_floor_rises_with_acceleration(tmp_path: Path) -> None:
     tared = (values[:250, :6] - non_contact_wrench(*start, PHI)).mean(axis=0)
     # At the centre of mass, as inertia acts: no other channel betrays it.
     values[500:750, :6] += 0.35 * np.array([1.0, 0.0, 0.0, 0.0, 0.06, 0.02])
-    compensator = Compensator(LOAD, DT, detector=Detector(LOAD, free, DT, 30.0, 0.0))
+    compensator = Compensator(LOAD, DT, detector=StreamContactDetector(LOAD, free, DT, 30.0, 0.0))
     compensator.offsets = tared
     out = [
         compensator.step(Reading(k, float(t[k]), row), float(t[k])) for k, row in enumerate(values)
@@ -121,9 +123,9 @@ def test_noise_floor_requires_the_same_rate_and_a_low_pass(tmp_path: Path) -> No
     t, values = readings()
     write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / "free.parquet")
     with pytest.raises(DrakeTeleopError, match="has 500 Hz, and the stream 1000 Hz"):
-        Detector(LOAD, tmp_path / "free.parquet", 0.001, 30.0, 0.0)
+        StreamContactDetector(LOAD, tmp_path / "free.parquet", 0.001, 30.0, 0.0)
     with pytest.raises(DrakeTeleopError, match="needs a low-pass"):
-        Detector(LOAD, tmp_path / "free.parquet", DT, None)
+        StreamContactDetector(LOAD, tmp_path / "free.parquet", DT, None)
 
 
 def test_another_load_is_flagged_after_a_motion() -> None:
@@ -136,7 +138,7 @@ def test_another_load_is_flagged_after_a_motion() -> None:
 
 
 def test_tare_resets_the_watch() -> None:
-    watch = Watch(LOAD, DT, 30.0)
+    watch = ContactAndLoadMonitor(LOAD, DT, 30.0)
     compensator = Compensator(LOAD, DT, watch=watch)
     values = np.concatenate([OFFSETS, [0.0, 0.0, 9.81], np.zeros(6)])
     values[:6] += non_contact_wrench(values[6:9], values[9:12], values[12:], PHI)

@@ -15,7 +15,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import quaternion_product
-from drake_teleop.lab.excitation.check import check
+from drake_teleop.lab.excitation.check import check_trajectory
 from drake_teleop.lab.excitation.excite import excite
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.run import run_scenario
@@ -255,7 +255,7 @@ def test_excitation_of_endless_joints_is_within_speed_limits(tmp_path, chain):
     assert np.isfinite(q).all()
     assert np.abs(q).max() < 3 * np.pi
     assert 0.1 < (np.abs(qd).max(axis=0) / robot.arm.velocity_limit).max() <= 1.0
-    uses = {use.limit: use for use in check(robot, found.trajectory)}
+    uses = {use.limit: use for use in check_trajectory(robot, found.trajectory)}
     assert ("position" in uses) == np.isfinite(robot.arm.upper).any()
     assert all(0.0 <= use.share <= 1.0 for use in uses.values())
 
@@ -288,7 +288,7 @@ def test_summary_of_a_run_and_frame_of_a_page_are_plain_json(tmp_path):
     json.dumps(summary, allow_nan=False)
     assert "turns without end for j1, j3, j5, j7" in summary["assumed"]
     rows = {name: run.result[name] for name in run.result.signals} | {"t": run.result.t}
-    json.dumps(Cockpit(setup).frame(rows, Inputs.of(setup)), allow_nan=False)
+    json.dumps(Cockpit(setup).page_values(rows, Inputs.from_scenario(setup)), allow_nan=False)
 
 
 def test_one_finite_limit_keeps_the_middle_finite():

@@ -15,19 +15,19 @@ from drake_teleop.lab.studies import pictures
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.effects import (
     Factorial,
-    effects,
+    effects_table,
     fill_missing,
-    interval,
     main_effects,
     pair_means,
+    seed_interval,
 )
 from drake_teleop.lab.studies.level_model import (
     NO_RUN,
     NO_SUCCESS,
     NOT_COMPARABLE,
-    comparable,
+    largest_complete_block,
     level_model,
-    reasons,
+    missing_value_reasons,
 )
 
 EFFORT = "effort_Ns"
@@ -91,7 +91,7 @@ def test_effects_compare_equal_combinations_only():
 
 
 def test_effects_table_lists_excluded_combinations():
-    table = effects(TOUCH, rows_of(TOUCH)).filter(factor="force_scaling.gamma")
+    table = effects_table(TOUCH, rows_of(TOUCH)).filter(factor="force_scaling.gamma")
     assert table["level"].to_list() == ["0.25", "1", "4", "8", "16"]
     assert table["runs"].to_list() == [16, 16, 8, 4, 0]
     assert table["combinations"].to_list() == [1] * 5
@@ -102,8 +102,8 @@ def test_effects_table_lists_excluded_combinations():
 def test_pictures_hatch_empty_cells_with_a_legend():
     rows = rows_of(TOUCH)
     main, pairs = (
-        pictures.main_effects(TOUCH, rows, [EFFORT]),
-        pictures.interactions(TOUCH, rows, EFFORT),
+        pictures.draw_main_effects(TOUCH, rows, [EFFORT]),
+        pictures.draw_interactions(TOUCH, rows, EFFORT),
     )
     empty = sum(fails(*point) for point in itertools.product(SIGMAS, GAMMAS))
     for figure, hatched in ((main, 1), (pairs, empty)):
@@ -118,11 +118,11 @@ def test_pictures_hatch_empty_cells_with_a_legend():
 
 def test_largest_comparable_set_of_levels_is_used():
     there = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 0, 1, 0]], dtype=bool)
-    rows, columns = comparable(there)
+    rows, columns = largest_complete_block(there)
     assert rows.tolist() == [True, True, False] and columns.tolist() == [True, True, False, False]
     runs, good = np.array([3, 3, 0, 3]), np.array([2, 0, 0, 1])
     compared = np.array([True, False, False, False])
-    assert reasons(compared, runs, good) == ["", NO_SUCCESS, NO_RUN, NOT_COMPARABLE]
+    assert missing_value_reasons(compared, runs, good) == ["", NO_SUCCESS, NO_RUN, NOT_COMPARABLE]
 
 
 def test_levels_that_never_meet_are_not_compared():
@@ -161,7 +161,7 @@ def test_half_widths_equal_least_squares():
     seen = random.random((6, 4)) < 0.7
     table = fill_missing(np.where(seen, random.normal(size=(6, 4)), np.nan))
     design = Factorial(levels, [3, 2], seen)
-    weights = design.compared(0)[2]
+    weights = design.comparable_levels(0)[2]
     weights -= weights.mean(axis=0)
     X = np.hstack([np.repeat(np.eye(6), 4, axis=0), np.tile(np.eye(4), (6, 1))])[seen.ravel()]
     solve = np.linalg.pinv(X)
@@ -171,7 +171,7 @@ def test_half_widths_equal_least_squares():
     runs = seen.sum(axis=1)
     spread = np.sum((weights @ solve[:6]) ** 2, axis=1) - weights**2 @ ((runs - 1) / 12)
     expected = stdtrit(freedom, 0.975) ** 2 * variance * spread
-    found = design.means(table, weights)[1] ** 2 - interval(weights @ table)[1] ** 2
+    found = design.means(table, weights)[1] ** 2 - seed_interval(weights @ table)[1] ** 2
     assert spread.min() > 0
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
@@ -182,11 +182,11 @@ def test_regression_does_not_extrapolate_into_failed_cells():
     known = points[:, 0] - points[:, 1] < 0.4
     value = np.exp(3 * (points[:, 0] - points[:, 1]))[:, None]
     model = level_model(factors, points.T.tolist(), known)
-    kept, over, terms = model.compared(0)
+    kept, over, terms = model.comparable_levels(0)
     assert kept.all() and 1 <= over.sum() < 5
     means = model.means(value[known], terms)[0]
     assert value[known].min() < means.min() and means.max() < value[known].max()
-    cells, _, terms = model.compared(0, 1)
+    cells, _, terms = model.comparable_levels(0, 1)
     lost = model.failed[0, 1]
     assert np.argwhere(lost).tolist() == [[2, 0], [3, 0], [3, 1], [4, 0], [4, 1]]
     assert np.array_equal(cells, ~lost.ravel())

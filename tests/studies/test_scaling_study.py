@@ -14,7 +14,7 @@ from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
     SELECTIONS,
     TASKS,
-    choice_picture,
+    draw_best_scales,
     rate_scales,
 )
 from drake_teleop.lab.studies.study import LoadStudy
@@ -80,7 +80,7 @@ def test_choice_picture_has_one_scale_and_no_empty_cell():
     failing["press"]["success"][:2, 0, :3] = 0.0  # three of twenty
     answers = {way: rate_scales(failing, criteria) for way, criteria in SELECTIONS.items()}
     sigmas, gammas = [0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8]
-    figure = choice_picture(answers, sigmas, gammas)
+    figure = draw_best_scales(answers, sigmas, gammas)
     images = [image for axes in figure.axes for image in axes.images]
     assert len(images) == len(SELECTIONS)
     assert len({image.norm for image in images}) == 1

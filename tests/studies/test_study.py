@@ -24,7 +24,7 @@ from drake_teleop.lab import run as runs_of_scenarios
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.studies import study as studies
 from drake_teleop.lab.studies.design import Factor, Study
-from drake_teleop.lab.studies.measures import default_measures, measured
+from drake_teleop.lab.studies.measures import default_measures, evaluate_measures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST, StudyProgress, run_study
 from drake_teleop.lab.studies.store import Store, open_store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
@@ -557,7 +557,7 @@ def test_measures_of_a_known_motion():
     signals["force_to_master"][:, 3] = 9.0  # torques are ignored
     signals["true_contact_wrench_W"][100, :3] = 2.0, -3.0, 6.0
     result = SimulationResult(t, signals, [SIGNALS[name] for name in signals])
-    found = measured(result, Scenario(), default_measures(), 1.0)
+    found = evaluate_measures(result, Scenario(), default_measures(), 1.0)
     assert found == pytest.approx(
         {
             "peak_force_to_master_N": 2.0,

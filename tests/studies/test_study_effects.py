@@ -9,7 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drake_teleop.lab.studies.design import Factor, Study
-from drake_teleop.lab.studies.effects import PARETO, effects, estimated, front, pareto
+from drake_teleop.lab.studies.effects import (
+    PARETO,
+    effects_table,
+    estimate_means,
+    is_on_pareto_front,
+    pareto_table,
+)
 from drake_teleop.lab.studies.pictures import write_pictures
 
 MEASURES = ["success", *PARETO]
@@ -45,7 +51,7 @@ def test_intervals_have_their_coverage():
     inside, effect_inside, widths = [], [], []
     for _ in range(2000):
         values = truth[levels] + np.repeat(noise.normal(0, 3.0, 5), 3) + noise.normal(0, 0.5, 15)
-        found = estimated(values, levels, seeds, 3)
+        found = estimate_means(values, levels, seeds, 3)
         inside.append(np.abs(found.mean - truth) <= found.half)
         effect = found.mean - found.mean.mean() - (truth - truth.mean())
         effect_inside.append(np.abs(effect) <= found.effect_half)
@@ -57,13 +63,13 @@ def test_intervals_have_their_coverage():
 
 def test_nan_values_are_ignored():
     values, levels, seeds = np.array([1.0, np.nan, 3.0, 5.0]), np.zeros(4, int), np.arange(4.0)
-    assert estimated(values, levels, seeds, 1).mean[0] == 3.0
-    nothing = estimated(np.full(4, np.nan), levels, seeds, 1)
+    assert estimate_means(values, levels, seeds, 1).mean[0] == 3.0
+    nothing = estimate_means(np.full(4, np.nan), levels, seeds, 1)
     assert np.isnan(nothing.mean[0]) and np.isnan(nothing.half[0])
 
 
 def test_effects_equal_the_synthetic_ones():
-    found = effects(STUDY, table())
+    found = effects_table(STUDY, table())
     assert set(found["factor"]) == {"force_scaling.sigma", "force_scaling.gamma"}
     sigma = found.filter(measure="effort_Ns", factor="force_scaling.sigma")
     np.testing.assert_allclose(sigma["effect"], [1.0, 0.0, -1.0], atol=0.1)
@@ -83,15 +89,15 @@ def test_front_contains_the_non_dominated_points(points):
         )
         for a, b, full in points
     ]  # fmt: skip
-    assert front(values, complete).tolist() == expected
+    assert is_on_pareto_front(values, complete).tolist() == expected
 
 
 def test_points_with_failures_are_not_on_the_front():
-    found = pareto(STUDY, table(failing=5))
+    found = pareto_table(STUDY, table(failing=5))
     assert found["complete"].to_list() == [True] * 5 + [False]
     assert not found["front"][5]
     assert found["front"].sum() >= 3  # one point of each sigma
-    assert pareto(Study(factors=STUDY.factors, measures=["success"]), table()) is None
+    assert pareto_table(Study(factors=STUDY.factors, measures=["success"]), table()) is None
 
 
 @pytest.mark.slow
@@ -111,7 +117,7 @@ def test_only_applicable_pictures_are_written(tmp_path):
 def test_range_of_a_sobol_design_is_cut_into_equal_parts():
     factor = Factor("force_scaling.gamma", low=1.0, high=2.0)
     study = Study(factors=[factor], design="sobol", samples=16, measures=["success"])
-    found = effects(study, table(study))
+    found = effects_table(study, table(study))
     assert found["level"].to_list() == ["1.1", "1.3", "1.5", "1.7", "1.9"]
     assert found["runs"].sum() == 16
     assert found["mean_half"].is_nan().all()  # one repeat

@@ -9,7 +9,7 @@ import pytest
 
 import drake_teleop as dt
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.comparison.delayed_contact import thickness_of
+from drake_teleop.lab.comparison.delayed_contact import leaf_thickness
 from drake_teleop.lab.tuning import search
 from drake_teleop.lab.tuning.press_trial import (
     MAX_REST_FORCE_N,
@@ -59,7 +59,7 @@ def test_unknown_networks_are_refused():
 
 
 def test_leaf_of_a_stiffness_has_this_stiffness():
-    leaf = SheetSpring(length=0.12, width=0.05, thickness=thickness_of(3000.0))
+    leaf = SheetSpring(length=0.12, width=0.05, thickness=leaf_thickness(3000.0))
     assert leaf.stiffness == pytest.approx(3000.0)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import Complex
-from drake_teleop.lab.analysis.two_port import entries, transmitted_impedance
+from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
 
 if TYPE_CHECKING:
     pass
@@ -24,9 +24,9 @@ Flags = NDArray[np.bool_]
 _ROUNDING = 1e-12  # relative to the terms that cancel in a criterion
 
 
-def llewellyn(H: Complex) -> Real:
+def llewellyn_criterion(H: Complex) -> Real:
     """Return Llewellyn's criterion (Proc. IRE 40, 1952; T54); negative: not absolutely stable."""
-    h11, h12, h21, h22 = entries(H)
+    h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     return 2 * h11.real * h22.real - product.real - np.abs(product)
 
@@ -35,23 +35,23 @@ def llewellyn_parameter(H: Complex) -> Real:
     """Return Llewellyn's parameter; absolute stability requires at least 1."""
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        return 1.0 + llewellyn(H) / product
+        return 1.0 + llewellyn_criterion(H) / product
 
 
-def absolutely_stable(H: Complex) -> Flags:
-    """Return True at frequencies where the station is stable with any passive hand and wall."""
-    h11, h12, h21, h22 = entries(H)
+def is_absolutely_stable(H: Complex) -> Flags:
+    """Return where the station is stable with any passive hand and wall."""
+    h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h12 * h21) + np.abs(h11 * h22)
     return (
         (h11.real >= -_ROUNDING * np.abs(h11))
         & (h22.real >= -_ROUNDING * np.abs(h22))
-        & (llewellyn(H) >= -_ROUNDING * size)
+        & (llewellyn_criterion(H) >= -_ROUNDING * size)
     )
 
 
 def required_damping(H: Complex) -> Real:
     """Return the additional device damping [N s/m] for absolute stability; inf: none suffices."""
-    h11, h12, h21, h22 = entries(H)
+    h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     loss = product.real + np.abs(product)
     loss = np.where(loss <= _ROUNDING * np.abs(product), 0.0, loss)
@@ -60,26 +60,26 @@ def required_damping(H: Complex) -> Real:
     return np.where(h22.real < 0, np.inf, through) - h11.real
 
 
-def raisbeck(H: Complex) -> Real:
+def raisbeck_criterion(H: Complex) -> Real:
     """Return Raisbeck's criterion (J. Appl. Phys. 25, 1954; T55); negative: not passive."""
-    h11, h12, h21, h22 = entries(H)
+    h11, h12, h21, h22 = matrix_entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
 
 
-def passive(H: Complex) -> Flags:
-    """Return True at frequencies where the station absorbs power for every input."""
-    h11, h12, h21, h22 = entries(H)
+def is_passive(H: Complex) -> Flags:
+    """Return where the station absorbs power for every input."""
+    h11, h12, h21, h22 = matrix_entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
     return (
         (h11.real >= -_ROUNDING * np.abs(h11))
         & (h22.real >= -_ROUNDING * np.abs(h22))
-        & (raisbeck(H) >= -_ROUNDING * size)
+        & (raisbeck_criterion(H) >= -_ROUNDING * size)
     )
 
 
 def scattering_norm(S: Complex) -> Real:
     """Return the largest singular value of a scattering matrix; passive if at most 1."""
-    return _largest_singular_value(*entries(S))
+    return _largest_singular_value(*matrix_entries(S))
 
 
 def structured_singular_value(
@@ -89,7 +89,7 @@ def structured_singular_value(
 
     With factors of 1 (any passive load), mu <= 1 means absolutely stable.
     """
-    s11, s12, s21, s22 = entries(S)
+    s11, s12, s21, s22 = matrix_entries(S)
     r1, r2 = np.asarray(hand), np.asarray(environment)
     product = s12 * s21 * r1 * r2
     even = np.sqrt(np.abs(product))
@@ -124,7 +124,7 @@ class WorstLoads(NamedTuple):
 
 def worst_loads(H: Complex) -> WorstLoads:
     """Return the lossless loads closest to oscillation; Re h22 must not be 0."""
-    h11, h12, h21, h22 = entries(H)
+    h11, h12, h21, h22 = matrix_entries(H)
     product = h12 * h21
     size = np.abs(product)
     phase = np.where(size > 0, product / np.where(size > 0, size, 1.0), 1.0)
@@ -172,7 +172,7 @@ class ImpedanceRange:
         )
 
 
-def range_of_grips() -> ImpedanceRange:
+def impedance_range_of_grips() -> ImpedanceRange:
     from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
     mass, damping, stiffness = (
@@ -188,11 +188,11 @@ def range_of_grips() -> ImpedanceRange:
 def can_oscillate(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Flags:
-    """Return True at frequencies where some hand and environment of the ranges oscillate (T57).
+    """Return where some hand and environment of the ranges oscillate (T57).
 
     If all are False on a dense grid, the pairs are all stable or all unstable.
     """
-    h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
+    h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
     dz, de = np.roll(z, -1, axis=-2) - z, np.roll(e, -1, axis=-1) - e
     t, u = _edge_crossings(h11, h12 * h21, h22, z, dz, e, de)
@@ -206,8 +206,8 @@ def can_oscillate(
 
 
 def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange) -> Real:
-    """Return per frequency the softest wall [N/m] with which some hand of the range oscillates."""
-    h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
+    """Return the softest wall [N/m] with which some hand of the range oscillates."""
+    h11, h12, h21, h22 = (entry[..., None] for entry in matrix_entries(H))
     z = hand.corners(omega)
     wall: Complex = np.zeros((), dtype=complex)
     stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
@@ -237,10 +237,10 @@ def _edge_crossings(
 def bounded_singular_value(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Real:
-    """Return mu per frequency; below 1 no hand and environment of the ranges can oscillate."""
+    """Return mu; below 1 no hand and environment of the ranges can oscillate."""
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
-    h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
+    h11, h12, h21, h22 = (entry[..., None, None] for entry in matrix_entries(H))
     reduction = 1 / (1 + h22 * e)
     felt = z + h11 - h12 * h21 * e * reduction
     through = h12 * h21 * reduction**2 / felt

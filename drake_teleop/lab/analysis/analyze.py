@@ -25,8 +25,8 @@ from drake_teleop.lab.analysis.linearization import (
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.analysis.report import Curves, print_tables, write_report
 from drake_teleop.lab.analysis.task_direction import TaskDirection, task_direction
-from drake_teleop.lab.analysis.two_port import absorb, hybrid
-from drake_teleop.lab.analysis.verdict import verdict
+from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
+from drake_teleop.lab.analysis.verdict import verdict_sentences
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
@@ -76,7 +76,7 @@ def _analyze(
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
     along = task_direction(linear, DIRECTIONS[direction])
-    sampling = sampling_of(linear)
+    sampling = sampling_of_scenario(linear)
     wall = (5100.0, 0.0)
     if along.axis.wall_stiffness > 0.0:
         wall = (along.axis.wall_stiffness, along.axis.wall_damping)
@@ -89,7 +89,9 @@ def _analyze(
     points = [("free motion", free, axis)]
     if scenario.leaf is not None:
         alone = replace(linear.without_environment(), sheet_spring=scenario.leaf)
-        pressed = linearize(alone, load_estimate=estimate, displacement=leaf_displacement(alone))
+        pressed = linearize(
+            alone, load_estimate=estimate, displacement=displacement_into_leaf(alone)
+        )
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
 
@@ -97,8 +99,8 @@ def _analyze(
     with_hand = hybrid_along(
         close_other_directions(free, linear, along), figures.OMEGA, along.hand, along.tool
     )
-    H = absorb(with_hand, hand=-figures.S * axis.hand_mass)
-    closed_form = hybrid(axis, figures.S)
+    H = absorb_impedances(with_hand, hand=-figures.S * axis.hand_mass)
+    closed_form = hybrid_matrix(axis, figures.S)
     progress(0.3)
     summary: dict[str, Any] = {
         "direction": direction,
@@ -138,11 +140,11 @@ def _analyze(
             linear, along, close_other_directions(free, linear, along)
         )
         measured(1.0)
-    summary = _plain(summary)
-    summary["verdict"] = verdict(summary)
+    summary = _replace_nonfinite_and_arrays(summary)
+    summary["verdict"] = verdict_sentences(summary)
     nyquist = {}
     for grip in GRIP_IMPEDANCES:
-        loop = cut_loop(figures.with_grip(contact, grip), sampling)
+        loop = cut_loop(figures.axis_with_grip(contact, grip), sampling)
         nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
     return summary, Curves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)
 
@@ -159,7 +161,7 @@ def describe_wall(scenario: Scenario, is_known: bool) -> str:
     return "the paper's" + (f", because a {names} is not analysed" if names else "")
 
 
-def sampling_of(scenario: Scenario) -> Sampling:
+def sampling_of_scenario(scenario: Scenario) -> Sampling:
     rates, sensor = scenario.rates, scenario.wrist_sensor
     return Sampling(
         rates.hand_hz,
@@ -169,7 +171,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
     )
 
 
-def leaf_displacement(scenario: Scenario) -> list[float]:
+def displacement_into_leaf(scenario: Scenario) -> list[float]:
     """Return the displacement of the master [m], in B, that bends the leaf spring by 5 mm."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
@@ -186,7 +188,7 @@ def leaf_displacement(scenario: Scenario) -> list[float]:
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
-    return close_network(system, scenario).close("operator_wrench", "hand_wrench")
+    return close_network(system, scenario).close_loop("operator_wrench", "hand_wrench")
 
 
 def close_other_directions(
@@ -199,16 +201,16 @@ def close_other_directions(
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
     others = [axis for k, axis in enumerate(AXES) if len(aligned) and k != aligned[0]]
-    return system.close(
+    return system.close_loop(
         [f"operator_wrench.{axis}" for axis in others], [f"hand_wrench.{axis}" for axis in others]
     )
 
 
-def _plain(value: Any) -> Any:
+def _replace_nonfinite_and_arrays(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: _replace_nonfinite_and_arrays(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
+        return [_replace_nonfinite_and_arrays(entry) for entry in value]
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return _replace_nonfinite_and_arrays(value.tolist())
     return None if isinstance(value, float) and not np.isfinite(value) else value

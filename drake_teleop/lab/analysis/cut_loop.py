@@ -1,7 +1,7 @@
 """Loop of the sampled one-axis model, cut at the displayed force (T60).
 
 The loop is L(z) z^(-D) for a round trip of D hand periods. Multipliers are eigenvalues over a
-period; the argument principle counts the unstable ones.
+period.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Array, Sampling, cut_map
+from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Array, Sampling, cut_period_map
 
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
 _ANGLES = np.pi * np.logspace(-5, 0, 401)
@@ -38,7 +38,7 @@ class CutLoop:
     signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
     @classmethod
-    def of(
+    def from_multipliers(
         cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
     ) -> CutLoop:
         """Return the loop with these multipliers, period [s] and crossings of |L| = level."""
@@ -55,14 +55,14 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
-    """Return the loop without delay, cut at the displayed force; see `cut_map` for errors."""
-    M = cut_map(axis, sampling)
+    """Return the loop without delay, cut at the displayed force; errors as `cut_period_map`."""
+    M = cut_period_map(axis, sampling)
     n = M.shape[-1] - 3
     closed = M[..., :n, :n].copy()
     closed[..., :, SAMPLE] += M[..., :n, n + 3 + RECEIVED]
     opened = np.linalg.eigvals(M[..., :n, :n]).astype(np.complex128)
     zeros = np.linalg.eigvals(closed).astype(np.complex128)
-    return CutLoop.of(opened, zeros, 1 / np.asarray(sampling.hand_hz))
+    return CutLoop.from_multipliers(opened, zeros, 1 / np.asarray(sampling.hand_hz))
 
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
@@ -80,14 +80,14 @@ def gain_and_phase_margin(response: Complex) -> tuple[float, float]:
     if np.abs(response).max() < _MIN_LOOP_GAIN:
         return np.inf, np.inf
     log_gain, angle = np.log(np.abs(response)), np.angle(response)
-    lag = np.mod(_interpolate(np.unwrap(angle), _zero_fraction(log_gain)), 2 * np.pi)
+    lag = np.mod(_interpolate(np.unwrap(angle), _find_zero_crossings(log_gain)), 2 * np.pi)
     phase = np.fmin.reduce(np.minimum(lag, 2 * np.pi - lag), initial=np.inf)
     is_jump = np.abs(np.diff(angle)) >= np.pi
-    factor = np.exp(-_interpolate(log_gain, np.where(is_jump, np.nan, _zero_fraction(angle))))
+    factor = np.exp(-_interpolate(log_gain, np.where(is_jump, np.nan, _find_zero_crossings(angle))))
     return float(np.min(factor[factor > 1], initial=np.inf)), float(phase)
 
 
-def _zero_fraction(value: Array) -> Array:
+def _find_zero_crossings(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
@@ -97,7 +97,7 @@ def _interpolate(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])
 
 
-def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
+def count_unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of unstable multipliers of the closed loop; `delay`: one way [s]."""
     D = (2 * np.asarray(delay) / loop.period)[..., None]
     turns = (loop.phases - D * loop.angles) / (2 * np.pi)
@@ -112,7 +112,7 @@ def delay_margin(loop: CutLoop) -> Array:
     inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
     steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
     first = np.where(inside, steps, np.inf).min(axis=-1) * loop.period
-    return np.where(unstable_multipliers(loop, 0.0) > 0, 0.0, first)
+    return np.where(count_unstable_multipliers(loop, 0.0) > 0, 0.0, first)
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
@@ -124,26 +124,28 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     delay = np.broadcast_to(np.asarray(delay, dtype=float), shape)
     D = 2 * delay / period
 
-    def on_circle(growth: Array) -> CutLoop:
+    def loop_on_circle(growth: Array) -> CutLoop:
         radius = np.exp(growth * period)[..., None]
-        return CutLoop.of(opened / radius, closed / radius, period, radius[..., 0] ** D)
+        return CutLoop.from_multipliers(
+            opened / radius, closed / radius, period, radius[..., 0] ** D
+        )
 
     # Bracket the growth rate: `low` has multipliers outside its circle, `high` has none.
     high, low = np.ones(shape), -np.ones(shape)
     for _ in range(_DOUBLINGS):
-        some = unstable_multipliers(on_circle(high), delay) > 0
-        none = unstable_multipliers(on_circle(low), delay) == 0
+        some = count_unstable_multipliers(loop_on_circle(high), delay) > 0
+        none = count_unstable_multipliers(loop_on_circle(low), delay) == 0
         if not (some | none).any():
             break
         high, low = np.where(some, 2 * high, high), np.where(none, 2 * low, low)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        some = unstable_multipliers(on_circle(middle), delay) > 0
+        some = count_unstable_multipliers(loop_on_circle(middle), delay) > 0
         low, high = np.where(some, middle, low), np.where(some, high, middle)
     # Roots of P (1 - z^-D) + M z^-D with P and M the products over `open` and `closed`. Newton's
     # method starts at the crossings of |L| and at the multipliers without delay.
     radius = np.exp(high * period)[..., None]
-    crossings = np.where(radius > 0, radius * np.exp(1j * on_circle(high).angles), 0)
+    crossings = np.where(radius > 0, radius * np.exp(1j * loop_on_circle(high).angles), 0)
     z = np.concatenate([crossings, closed * (1 + 1e-7)], axis=-1)
     opened, closed, D = opened[..., None, :], closed[..., None, :], D[..., None]
     found = np.zeros(z.shape, dtype=bool)
@@ -164,7 +166,7 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
 
 
 @njit(cache=True)
-def _loop(closed, opened, angle, radius):
+def _loop_gain(closed, opened, angle, radius):
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
     for i in range(opened.shape[0]):
@@ -177,7 +179,7 @@ def _find_crossings(opened, closed, levels, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _loop(zeros, poles, 0.0, 1.0 + _UNIT_TOLERANCE)
+        value = _loop_gain(zeros, poles, 0.0, 1.0 + _UNIT_TOLERANCE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
         if size > level:
@@ -192,12 +194,14 @@ def _find_crossings(opened, closed, levels, angles, found):
                 low, high = before, angle
                 while high - low > 1e-12 * high:
                     middle = 0.5 * (low + high)
-                    if (abs(_loop(zeros, poles, middle, 1.0)) > level) == (last_size > level):
+                    if (abs(_loop_gain(zeros, poles, middle, 1.0)) > level) == (last_size > level):
                         low = middle
                     else:
                         high = middle
                 found[0, n, count] = low
-                found[1, n, count] = _unwrapped_phase(_loop(zeros, poles, low, 1.0), last_phase)
+                found[1, n, count] = _unwrapped_phase(
+                    _loop_gain(zeros, poles, low, 1.0), last_phase
+                )
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
@@ -223,7 +227,7 @@ def _add_pole_angles(angles, poles):
 def _add_extremes(angles, poles, zeros, level):
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
-        values[i] = _loop(zeros, poles, angles[i], 1.0)
+        values[i] = _loop_gain(zeros, poles, angles[i], 1.0)
     size = np.abs(values)
     more = np.empty(angles.shape[0])
     count = 0
@@ -234,13 +238,13 @@ def _add_extremes(angles, poles, zeros, level):
             low, high = angles[i - 1], angles[i + 1]
             for _ in range(_GOLDEN_STEPS):
                 a, b = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
-                at_a, at_b = _loop(zeros, poles, a, 1.0), _loop(zeros, poles, b, 1.0)
+                at_a, at_b = _loop_gain(zeros, poles, a, 1.0), _loop_gain(zeros, poles, b, 1.0)
                 if sign * abs(at_a) > sign * abs(at_b):
                     high = b
                 else:
                     low = a
             more[count] = 0.5 * (low + high)
-            values = np.append(values, _loop(zeros, poles, more[count], 1.0))
+            values = np.append(values, _loop_gain(zeros, poles, more[count], 1.0))
             count += 1
     if count == 0:
         return angles, values

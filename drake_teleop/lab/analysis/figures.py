@@ -1,4 +1,4 @@
-"""Numbers in the summary of `drake-teleop analyze`, one function for each section."""
+"""Numbers in the summary of `drake-teleop analyze`, by section."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from drake_teleop.common.progress import StartStage
 from drake_teleop.lab.analysis import absolute_stability, sampled_wall, transparency
 from drake_teleop.lab.analysis.cut_loop import (
+    count_unstable_multipliers,
     cut_loop,
     delay_margin,
     dominant_multiplier,
     gain_and_phase_margin,
     loop_response,
-    unstable_multipliers,
 )
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
 from drake_teleop.lab.analysis.linearization import MAX_STATES, Linearization, hybrid_along
@@ -25,11 +25,11 @@ from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling, sampled_two_port
 from drake_teleop.lab.analysis.task_direction import TaskDirection
 from drake_teleop.lab.analysis.two_port import (
-    hybrid,
+    hybrid_matrix,
     power_ratio,
-    power_scaled,
     reference_impedances,
-    scattering,
+    scale_slave_power,
+    scattering_matrix,
     transmitted_impedance,
 )
 from drake_teleop.lab.identification import slave_arm
@@ -47,7 +47,7 @@ _MAP_POINTS = 80  # points of a map in each direction
 _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
-def with_grip(axis: OneAxis, grip: str) -> OneAxis:
+def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
     hand = GRIP_IMPEDANCES[grip]
     return dataclasses.replace(
         axis, hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness
@@ -57,7 +57,7 @@ def with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest motion of the linearised Diagram and of the one-axis model."""
+    """Return stability and slowest motion of linearised Diagram and one-axis model."""
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
     one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
@@ -87,13 +87,13 @@ def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -
     compared = OMEGA <= COMPARISON_BAND
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
-    def greatest(other: Complex) -> dict[str, float]:
+    def greatest_deviations(other: Complex) -> dict[str, float]:
         found = np.abs(with_hand[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     return {
-        "closed_form": greatest(hybrid(with_hand_mass, S[compared])),
-        "sampled": greatest(sampled_two_port(with_hand_mass, sampling, OMEGA[compared])),
+        "closed_form": greatest_deviations(hybrid_matrix(with_hand_mass, S[compared])),
+        "sampled": greatest_deviations(sampled_two_port(with_hand_mass, sampling, OMEGA[compared])),
     }
 
 
@@ -103,9 +103,9 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     for grip in GRIP_IMPEDANCES:
         for wall in sorted({*WALLS, own_wall}):
-            held = dataclasses.replace(with_grip(axis, grip), wall_stiffness=wall)
+            held = dataclasses.replace(axis_with_grip(axis, grip), wall_stiffness=wall)
             loop = cut_loop(held, sampling)
-            stable = bool(unstable_multipliers(loop, axis.delay) == 0)
+            stable = bool(count_unstable_multipliers(loop, axis.delay) == 0)
             gain, phase = 1.0, 0.0
             if stable:
                 gain, phase = gain_and_phase_margin(loop_response(loop, omega, axis.delay))
@@ -123,27 +123,28 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """Return criteria of stability and passivity with any passive hand and environment."""
+    """Return criteria for any passive hand and environment."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
-    scaled = power_scaled(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
-    norm = absolute_stability.scattering_norm(scattering(scaled, reference_impedances(axis)))
+    scaled = scale_slave_power(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
+    norm = absolute_stability.scattering_norm(scattering_matrix(scaled, reference_impedances(axis)))
     return {
-        "absolutely_stable": bool(absolute_stability.absolutely_stable(H).all()),
+        "absolutely_stable": bool(absolute_stability.is_absolutely_stable(H).all()),
         "least_parameter": float(parameter[worst]),
         "at_Hz": float(OMEGA[worst] / (2 * np.pi)),
         "lacking_damping_Ns_per_m": float(absolute_stability.required_damping(H).max()),
-        "passive": bool(absolute_stability.passive(scaled).all()),
+        "passive": bool(absolute_stability.is_passive(scaled).all()),
         "scattering_norm": float(norm.max()),
     }
 
 
 def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
     """Return the stiffest stable wall [N/m]: for all hands between light and firm, and per grip."""
-    hands = absolute_stability.range_of_grips()
+    hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {
-        grip: _stiffest_stable_wall(with_grip(axis, grip), sampling) for grip in GRIP_IMPEDANCES
+        grip: _stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
+        for grip in GRIP_IMPEDANCES
     }
     return {"grips": limit if min(each.values()) > 0 else 0.0, "each": each}
 
@@ -152,29 +153,29 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
     stiffness = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
     walls: Any = {"wall_stiffness": stiffness, "wall_damping": 0.0}
     loop = cut_loop(dataclasses.replace(axis, **walls), sampling)
-    (bad,) = np.nonzero(unstable_multipliers(loop, axis.delay))
+    (bad,) = np.nonzero(count_unstable_multipliers(loop, axis.delay))
     return float("inf") if len(bad) == 0 else float(stiffness[max(bad[0] - 1, 0)])
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """Return displayed and ideal impedance in free motion and at the wall, and tracking figures."""
+    """Return displayed and ideal impedances, and tracking figures."""
     fitted = OMEGA <= _FIT_BAND
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}
     for name, environment in environments.items():
         felt = transmitted_impedance(H, environment)
         ideal = transparency.ideal_impedance(axis, S, environment)
-        noticed = transparency.is_noticed(felt, ideal)
+        noticed = transparency.is_difference_noticed(felt, ideal)
         first = int(np.argmax(noticed)) if noticed.any() else len(noticed)
         figures[name] = {
-            which: transparency.apparent(impedance[fitted], OMEGA[fitted])._asdict()
+            which: transparency.fit_apparent_impedance(impedance[fitted], OMEGA[fitted])._asdict()
             for which, impedance in (("felt", felt), ("ideal", ideal))
         }
         figures[name]["unnoticed_to_Hz"] = float(OMEGA[first - 1] / (2 * np.pi)) if first else 0.0
     tracks = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
     end = len(tracks) if tracks.all() else int(np.argmin(tracks))
     figures["tracking_bandwidth_Hz"] = float(OMEGA[max(end - 1, 0)] / (2 * np.pi))
-    width = transparency.transmitted_width(H).decades
+    width = transparency.transmitted_z_width(H).decades
     figures["width_decades"] = {
         f"{hz:g} Hz": float(np.interp(2 * np.pi * hz, OMEGA, width)) for hz in (1.0, 5.0, 10.0)
     }
@@ -261,7 +262,8 @@ def parameter_maps(
     progress, found = stage("Maps"), {}
     for done, (title, (base, *grid)) in enumerate(parameters.items()):
         found[title] = {
-            grip: stability_map(with_grip(base, grip), sampling, *grid) for grip in GRIP_IMPEDANCES
+            grip: stability_map(axis_with_grip(base, grip), sampling, *grid)
+            for grip in GRIP_IMPEDANCES
         }
         progress((done + 1) / len(parameters))
     return found

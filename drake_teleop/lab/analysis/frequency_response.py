@@ -44,7 +44,7 @@ class MultiSine:
         odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
         return odd[odd > 0]
 
-    def segments(self, direction: Array, start: float) -> list[Sine]:
+    def sines_along(self, direction: Array, start: float) -> list[Sine]:
         """Return one sine motion per frequency along `direction` (6,), in B, from `start` [s]."""
         frequencies = self.multiples() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
@@ -137,7 +137,7 @@ def measure_frequency_response(
             remedy="choose a multiple of the step",
         )
     start = max((move.t_start + move.duration for move in approach), default=0.0)
-    intent: list[MinimumJerk | Sine] = [*approach, *excitation.segments(task.hand, start)]
+    intent: list[MinimumJerk | Sine] = [*approach, *excitation.sines_along(task.hand, start)]
     drawing = replace(
         scenario,
         operator=OperatorConfig(grip=scenario.operator.grip, intent=intent),
@@ -151,7 +151,7 @@ def measure_frequency_response(
     spectra: dict[str, Complex] = {
         name: np.fft.rfft(signal[: steps * excitation.periods].reshape(-1, steps))[:, multiples]
         * (2 / steps)
-        for name, signal in _signals(result, scenario, task).items()
+        for name, signal in _signals_along_task(result, scenario, task).items()
     }
     return StationResponse(
         np.asarray(2 * np.pi / excitation.period * multiples, dtype=float),
@@ -160,17 +160,19 @@ def measure_frequency_response(
     )
 
 
-def _signals(result: SimulationResult, scenario: Scenario, task: TaskDirection) -> dict[str, Array]:
+def _signals_along_task(
+    result: SimulationResult, scenario: Scenario, task: TaskDirection
+) -> dict[str, Array]:
     arm = NominalSlave(scenario.slave).arm
     return {
         "hand_force": result["hand_wrench_E"] @ task.hand,
         "hand_velocity": result["twist_master"] @ task.hand,
         "felt_force": result["force_to_master"] @ task.hand,
-        "tool_velocity": _twists(arm, result["slave_state"]) @ task.tool,
+        "tool_velocity": _sensor_twists(arm, result["slave_state"]) @ task.tool,
     }
 
 
-def _twists(arm: ArmModel, states: Array) -> Array:
+def _sensor_twists(arm: ArmModel, states: Array) -> Array:
     n = arm.num_joints
     J, twists = np.empty((6, n)), np.empty((len(states), 6))
     for state, twist in zip(states, twists, strict=True):

@@ -35,7 +35,7 @@ from drake_teleop.common.vectors import (
     quaternion_product,
 )
 from drake_teleop.lab.analysis.one_axis import Complex
-from drake_teleop.lab.analysis.two_port import two_port
+from drake_teleop.lab.analysis.two_port import two_port_matrix
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.point_contact import FRICTION_COLUMNS
 from drake_teleop.station.master.force_display import initial_display_state
@@ -87,11 +87,14 @@ class Linearization:
     #: (outputs, inputs, periods) closed with a delay: u += z^-periods y
     loops: tuple[tuple[tuple[int, ...], tuple[int, ...], int], ...] = ()
 
-    def close(
+    def close_loop(
         self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
     ) -> Linearization:
         """Return the model with feedback of outputs to inputs, u += z^-periods y."""
-        rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
+        rows, columns = (
+            self._indices_of(outputs, self.outputs),
+            self._indices_of(inputs, self.inputs),
+        )
         if periods > 0:
             return dataclasses.replace(self, loops=(*self.loops, (rows, columns, periods)))
         A = self.A + self.B[:, columns] @ self.C[list(rows)]
@@ -119,7 +122,7 @@ class Linearization:
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
         if size <= _MAX_DENSE_STATES:
-            values = np.linalg.eigvals(self.expanded().A)
+            values = np.linalg.eigvals(self.with_delays_as_states().A)
         elif size > MAX_STATES:
             raise DrakeTeleopError(
                 f"{size} states are too many for eigenvalues; most of them represent the delay",
@@ -147,7 +150,7 @@ class Linearization:
                 A[k, k - width] = 1.0
         return A.tocsc()
 
-    def expanded(self) -> Linearization:
+    def with_delays_as_states(self) -> Linearization:
         """Return the model with each delay as a shift register among the states."""
         result = dataclasses.replace(self, loops=())
         for rows, columns, periods in self.loops:
@@ -158,17 +161,17 @@ class Linearization:
         """Return a discrete `control.StateSpace`; the name "port.x" becomes "port[x]"."""
         import control
 
-        system = self.expanded()
+        system = self.with_delays_as_states()
         return control.StateSpace(
             *(system.A, system.B, system.C, system.D, system.dt),
             # python-control rejects dots in the names of inputs and outputs.
-            inputs=[_use_brackets(name) for name in system.inputs],
-            outputs=[_use_brackets(name) for name in system.outputs],
+            inputs=[_bracketed_port_name(name) for name in system.inputs],
+            outputs=[_bracketed_port_name(name) for name in system.outputs],
             states=list(system.states),
         )
 
     @staticmethod
-    def _indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
+    def _indices_of(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
         parts = _port_parts(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
@@ -180,7 +183,7 @@ class Linearization:
         return tuple(known.index(name) for name in parts)
 
 
-def _use_brackets(name: str) -> str:
+def _bracketed_port_name(name: str) -> str:
     port, dot, part = name.rpartition(".")
     return f"{port}[{part}]" if dot else name
 
@@ -223,8 +226,8 @@ def linearize(
 ) -> Linearization:
     """Return the scenario's Diagram, linearised at rest with its loops cut.
 
-    Intended motion, network and passivity method have no effect. `displacement` moves the master
-    from its start [m], in B; the slave follows.
+    Intended motion, network and passivity method have no effect. `displacement` of the master [m]
+    is in B.
     """
     check_scenario(scenario)
     if load_estimate is not None:
@@ -232,8 +235,8 @@ def linearize(
         # The sensor of the linear model has no offset.
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
     period = _Period(scenario, load_estimate)
-    x, A, C = period.rest(np.asarray(displacement, dtype=float))
-    B = period.input_derivative(x)
+    x, A, C = period.find_rest_state(np.asarray(displacement, dtype=float))
+    B = period.differentiate_by_input(x)
     affects = _states_affecting_outputs(A, C)
     names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
     D = np.zeros((len(C), B.shape[1]))
@@ -262,16 +265,16 @@ def linearize_station(
             remedy="linearise with method: none, or identify the frequency response",
         )
     cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
-    return close_network(cut.close("operator_wrench", "hand_wrench"), scenario)
+    return close_network(cut.close_loop("operator_wrench", "hand_wrench"), scenario)
 
 
 def close_network(system: Linearization, scenario: Scenario) -> Linearization:
-    forward, backward = delays(scenario)
-    system = system.close("pose_command", "pose_received", forward)
-    return system.close("wrench_B", "wrench_received", backward)
+    forward, backward = network_delay_periods(scenario)
+    system = system.close_loop("pose_command", "pose_received", forward)
+    return system.close_loop("wrench_B", "wrench_received", backward)
 
 
-def delays(scenario: Scenario) -> tuple[int, int]:
+def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
     """Return the network delays of pose and wrench in hand periods."""
     lines = scenario.channel.networks_of_directions()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
@@ -301,7 +304,7 @@ def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) 
     sm = response("twist_slave", tool, "hand_wrench", hand) / hold
     ss = response("twist_slave", tool, "tool_wrench", tool) / hold
     # -F_e acts on the tool.
-    return two_port(1 / mm, ms / mm, -sm / mm, ss - sm * ms / mm)
+    return two_port_matrix(1 / mm, ms / mm, -sm / mm, ss - sm * ms / mm)
 
 
 def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
@@ -332,7 +335,7 @@ class _Period:
                 remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
             )
         self.dt = 1 / scenario.rates.hand_hz
-        smooth = _linear_part(scenario)
+        smooth = _without_nonlinear_parts(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
         if smooth.surroundings is not None:
             _check_environment(self._diagram)
@@ -372,9 +375,9 @@ class _Period:
             for k in range(len(g.steps))
         )
         self._start_B = np.array([1.0, 0.0, 0.0, 0.0, *smooth.master.position])
-        self._pose = self._eval("kinematic_scaling", "pose_command")
+        self._pose = self._evaluate_output("kinematic_scaling", "pose_command")
         self._hand, self._wrench = np.zeros(6), np.zeros(6)
-        self._apply(np.zeros(24))
+        self._apply_inputs(np.zeros(24))
         self._simulator.Initialize()
 
     def _system(self, name: str) -> Any:
@@ -384,14 +387,14 @@ class _Period:
         root = self._simulator.get_mutable_context()
         return self._system(name).GetMyMutableContextFromRoot(root)
 
-    def _eval(self, system: str, port: str) -> Array:
+    def _evaluate_output(self, system: str, port: str) -> Array:
         return np.array(self._system(system).GetOutputPort(port).Eval(self._context(system)))
 
-    def _fix(self, system: str, port: str, value: object) -> None:
+    def _fix_input(self, system: str, port: str, value: object) -> None:
         self._system(system).GetInputPort(port).FixValue(self._context(system), value)
 
     def _state_groups(self) -> list[_States]:
-        def whole(system: str, group: int, *steps: Array) -> _States:
+        def whole_group(system: str, group: int, *steps: Array) -> _States:
             return _States(system, group, slice(None), np.concatenate(steps))
 
         joints = self._context("slave_plant").num_continuous_states() // 2
@@ -399,12 +402,12 @@ class _Period:
         # The sensor's memory contains angles, which must stay small.
         remembered = np.full(len(self._sensor.motion_dependent_indices), _ANGLE_STEP)
         return [
-            whole("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
-            whole("master_device", 1, np.full(7, _ANGLE_STEP)),
-            whole("master_device", 2, np.full(6, _RATE_STEP)),
+            whole_group("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
+            whole_group("master_device", 1, np.full(7, _ANGLE_STEP)),
+            whole_group("master_device", 2, np.full(6, _RATE_STEP)),
             # The angles for the display; its other states act only after faults.
             _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
-            whole("joint_control", 0, np.full(self._joints, _UNIT_STEP)),
+            whole_group("joint_control", 0, np.full(self._joints, _UNIT_STEP)),
             _States(
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
@@ -417,7 +420,7 @@ class _Period:
         command = _States("inverse_kinematics", 0, slice(0, self._joints), steps)
         return [command] if self._has_ik_state else []
 
-    def get(self) -> Array:
+    def get_state(self) -> Array:
         parts = []
         for group in self._groups:
             context = self._context(group.system)
@@ -427,7 +430,7 @@ class _Period:
                 parts.append(context.get_discrete_state(group.group).value()[group.part])
         return np.concatenate(parts)
 
-    def _set(self, x: Array) -> None:
+    def _set_state(self, x: Array) -> None:
         ends = np.cumsum([len(group.steps) for group in self._groups])
         for group, values in zip(self._groups, np.split(x, ends[:-1]), strict=True):
             context = self._context(group.system)
@@ -438,19 +441,19 @@ class _Period:
                 state.get_mutable_value()[group.part] = values
         self._sensor.reset_queue(self._context("wrist_sensor"))
 
-    def _apply(self, u: Array) -> None:
-        self._fix("master_device", "hand_wrench_E", self._hand + u[:6])
-        self._fix("inverse_kinematics", "pose_command", _displace(self._pose, u[6:12]))
-        self._fix("force_display", "wrench_command", self._wrench + u[12:18])
+    def _apply_inputs(self, u: Array) -> None:
+        self._fix_input("master_device", "hand_wrench_E", self._hand + u[:6])
+        self._fix_input("inverse_kinematics", "pose_command", _displace_pose(self._pose, u[6:12]))
+        self._fix_input("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
-        self._fix("slave_plant", "applied_spatial_force", [self._push])
-        self._fix("wrist_sensor", "applied_wrench_W", push)
+        self._fix_input("slave_plant", "applied_spatial_force", [self._push])
+        self._fix_input("wrist_sensor", "applied_wrench_W", push)
 
     def _slave_state(self) -> Array:
-        return self._eval("slave_plant", f"{ARM_INSTANCE_NAME}_state")
+        return self._evaluate_output("slave_plant", f"{ARM_INSTANCE_NAME}_state")
 
-    def _run(self) -> Array:
+    def _run_one_period(self) -> Array:
         # At this time no event of noise or log interferes.
         context = self._simulator.get_mutable_context()
         context.SetTime(self.dt)
@@ -461,23 +464,26 @@ class _Period:
         self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         self._simulator.AdvanceTo(2 * self.dt)
         self._sensor.take_samples(self._context("wrist_sensor"))
-        return self.get()
+        return self.get_state()
 
-    def _outputs(self) -> Array:
-        pose, state = self._eval("kinematic_scaling", "pose_command"), self._slave_state()
+    def _evaluate_outputs(self) -> Array:
+        pose, state = (
+            self._evaluate_output("kinematic_scaling", "pose_command"),
+            self._slave_state(),
+        )
         J = np.empty((6, self._joints))
         jacobian(self._arm, state[: self._joints], J)
         return np.concatenate(
             [
-                self._eval("operator", "hand_wrench_E"),
+                self._evaluate_output("operator", "hand_wrench_E"),
                 _pose_difference(pose, self._pose),
-                self._eval("force_scaling", "wrench_B"),
-                self._eval("master_device", "twist_master"),
+                self._evaluate_output("force_scaling", "wrench_B"),
+                self._evaluate_output("master_device", "twist_master"),
                 J @ state[self._joints :],
             ]
         )
 
-    def rest(self, displacement: Array) -> tuple[Array, Array, Array]:
+    def find_rest_state(self, displacement: Array) -> tuple[Array, Array, Array]:
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
@@ -491,35 +497,35 @@ class _Period:
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
-        target = self._eval("kinematic_scaling", "pose_command")
+        target = self._evaluate_output("kinematic_scaling", "pose_command")
         ramp = round(_RAMP_S / self.dt) if displacement.any() else 0
         for k in range(ramp + round(_SETTLE_S / self.dt)):
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)
-            self._apply(np.zeros(24))
-            self._run()
+            self._apply_inputs(np.zeros(24))
+            self._run_one_period()
         return self._find_equilibrium(self._balance_hand())
 
     def _balance_hand(self) -> Array:
-        self._wrench = self._eval("force_scaling", "wrench_B")
-        self._apply(np.zeros(24))
-        self._hand = -self._eval("force_display", "force_to_master")
-        self._apply(np.zeros(24))
-        return self.get()
+        self._wrench = self._evaluate_output("force_scaling", "wrench_B")
+        self._apply_inputs(np.zeros(24))
+        self._hand = -self._evaluate_output("force_display", "force_to_master")
+        self._apply_inputs(np.zeros(24))
+        return self.get_state()
 
     def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MAX_NEWTON_STEPS):
-            A, C = self.derivative(x)
+            A, C = self.differentiate_by_state(x)
             free = slave & _states_affecting_outputs(A, C)
-            self._set(x)
-            moved = self._run() - x
+            self._set_state(x)
+            moved = self._run_one_period() - x
             if (np.abs(moved) < _REST_TOLERANCE * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
-            self._set(x)
+            self._set_state(x)
             x = self._balance_hand()
         raise DrakeTeleopError(
             f"the slave does not come to rest (state {self.states[np.argmax(np.abs(moved))]})",
@@ -527,22 +533,22 @@ class _Period:
             remedy="choose another operating point",
         )
 
-    def derivative(self, x: Array) -> tuple[Array, Array]:
+    def differentiate_by_state(self, x: Array) -> tuple[Array, Array]:
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
-        self._apply(np.zeros(24))
+        self._apply_inputs(np.zeros(24))
         for k, step in enumerate(self._steps):
             ends, outputs = [], []
             for sign in (1.0, -1.0):
                 displaced = x.copy()
                 displaced[k] += sign * step
-                self._set(displaced)
-                outputs.append(self._outputs())
-                ends.append(self._run())
+                self._set_state(displaced)
+                outputs.append(self._evaluate_outputs())
+                ends.append(self._run_one_period())
             A[:, k] = (ends[0] - ends[1]) / (2 * step)
             C[:, k] = (outputs[0] - outputs[1]) / (2 * step)
         return A, C
 
-    def input_derivative(self, x: Array) -> Array:
+    def differentiate_by_input(self, x: Array) -> Array:
         B = np.empty((len(x), 24))
         pose, tool = np.full(6, self._command_step), np.full(6, _UNIT_STEP)
         for k, step in enumerate(
@@ -550,14 +556,14 @@ class _Period:
         ):
             ends = []
             for sign in (1.0, -1.0):
-                self._set(x)
-                self._apply(sign * step * np.eye(24)[k])
-                ends.append(self._run())
+                self._set_state(x)
+                self._apply_inputs(sign * step * np.eye(24)[k])
+                ends.append(self._run_one_period())
             B[:, k] = (ends[0] - ends[1]) / (2 * step)
         return B
 
 
-def _displace(pose: Array, change: Array) -> Array:
+def _displace_pose(pose: Array, change: Array) -> Array:
     return np.concatenate(
         [
             quaternion_product(quaternion_exponential(tuple(change[3:])), pose[:4]),
@@ -573,7 +579,7 @@ def _pose_difference(pose: Array, other: Array) -> Array:
     return np.concatenate([pose[4:] - other[4:], turn])
 
 
-def _linear_part(scenario: Scenario) -> Scenario:
+def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
     parts = ("noise", "random_walk", "offset", "drift", "quantisation", "saturation")
     return replace(
         scenario,

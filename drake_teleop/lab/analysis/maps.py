@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.cut_loop import (
     CutLoop,
+    count_unstable_multipliers,
     cut_loop,
     loop_response,
-    unstable_multipliers,
 )
 from drake_teleop.lab.analysis.one_axis import (
     Complex,
@@ -36,7 +36,7 @@ _DISTORTION_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, delibera
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Stability, and distortion of the force at the hand, over a grid of two parameters."""
+    """Stability and force distortion at the hand, over two parameters."""
 
     x_name: str
     y_name: str
@@ -63,36 +63,38 @@ def stability_map(
 
     Names are fields of `OneAxis`, "low_pass_hz", or "rate": all rates in proportion.
     """
-    xs, ys = _increasing(x_name, x), _increasing(y_name, y)
+    xs, ys = _check_increasing(x_name, x), _check_increasing(y_name, y)
 
-    def loops(at_x: Array, at_y: Array) -> tuple[OneAxis, CutLoop]:
-        return _loops(axis, sampling, {x_name: at_x, y_name: at_y})
+    def loops_at(at_x: Array, at_y: Array) -> tuple[OneAxis, CutLoop]:
+        return _loops_with_values(axis, sampling, {x_name: at_x, y_name: at_y})
 
     def is_stable(at_x: Array, at_y: Array) -> NDArray[np.bool_]:
-        moved, loop = loops(at_x, at_y)
-        return unstable_multipliers(loop, moved.delay) == 0
+        moved, loop = loops_at(at_x, at_y)
+        return count_unstable_multipliers(loop, moved.delay) == 0
 
-    moved, loop = loops(xs, ys[:, None])
+    moved, loop = loops_at(xs, ys[:, None])
     shape = len(ys), len(xs)
-    unstable = np.broadcast_to(unstable_multipliers(loop, moved.delay), shape)
+    unstable = np.broadcast_to(count_unstable_multipliers(loop, moved.delay), shape)
     stable = unstable == 0
     # Neighbours in a row, then neighbours in a column.
     row, column = np.nonzero(stable[:, 1:] != stable[:, :-1])
-    along_x = _bisect(
+    along_x = _bisect_stability_limit(
         lambda at: is_stable(at, ys[row]), xs[column], xs[column + 1], stable[row, column]
     )
     row_2, column_2 = np.nonzero(stable[1:] != stable[:-1])
-    along_y = _bisect(
+    along_y = _bisect_stability_limit(
         lambda at: is_stable(xs[column_2], at), ys[row_2], ys[row_2 + 1], stable[row_2, column_2]
     )
     boundary = np.concatenate(
         [np.column_stack([along_x, ys[row]]), np.column_stack([xs[column_2], along_y])]
     )
-    felt = np.broadcast_to(distortion(moved, loop), shape)
+    felt = np.broadcast_to(force_distortion(moved, loop), shape)
     return StabilityMap(x_name, y_name, xs, ys, unstable, felt, boundary)
 
 
-def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
+def force_distortion(
+    axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND
+) -> Array:
     """Return the largest relative error of the operator's force over `frequency` [rad/s]."""
     shape = np.broadcast_shapes(
         loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
@@ -105,7 +107,7 @@ def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_
     return np.abs(exerted / ideal - 1).max(axis=0)
 
 
-def _increasing(name: str, values: ArrayLike) -> Array:
+def _check_increasing(name: str, values: ArrayLike) -> Array:
     if name not in _PARAMETERS:
         raise DrakeTeleopError(
             f"'{name}' is no parameter of a stability map",
@@ -122,7 +124,9 @@ def _increasing(name: str, values: ArrayLike) -> Array:
     return array
 
 
-def _loops(axis: OneAxis, sampling: Sampling, values: dict[str, Any]) -> tuple[OneAxis, CutLoop]:
+def _loops_with_values(
+    axis: OneAxis, sampling: Sampling, values: dict[str, Any]
+) -> tuple[OneAxis, CutLoop]:
     for name, value in values.items():
         if name == RATE:
             factor = value / sampling.hand_hz
@@ -139,7 +143,9 @@ def _loops(axis: OneAxis, sampling: Sampling, values: dict[str, Any]) -> tuple[O
     return axis, cut_loop(axis, sampling)
 
 
-def _bisect(is_stable, low: Array, high: Array, stable_at_low: NDArray[np.bool_]) -> Array:
+def _bisect_stability_limit(
+    is_stable, low: Array, high: Array, stable_at_low: NDArray[np.bool_]
+) -> Array:
     low, high = low.copy(), high.copy()
     for _ in range(_HALVINGS if low.size else 0):
         middle = 0.5 * (low + high)

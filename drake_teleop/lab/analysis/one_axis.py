@@ -52,7 +52,7 @@ class Axis:
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxis(Axis):
-    """Parameters of one direction for the linear analysis: numbers, or arrays that broadcast."""
+    """Parameters of one direction: numbers, or arrays that broadcast."""
 
     device_damping: float = 0.5  #: N s/m
     mass_error: float = 0.0  #: kg, estimated minus true tool mass

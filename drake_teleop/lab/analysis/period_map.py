@@ -29,7 +29,7 @@ _MAX_EVENTS = 1000
 
 @dataclass(frozen=True)
 class Sampling:
-    """Rates of the station; default: those of the shipped scenarios, with the ideal sensor."""
+    """Rates of the station; default: the shipped scenarios with the ideal sensor."""
 
     hand_hz: float = 2000.0  #: of haptic device and channel
     joint_control_hz: float = 2000.0
@@ -43,7 +43,7 @@ def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
     return max(steps, 1) if axis.delay > 0 else 0
 
 
-def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
+def cut_period_map(axis: OneAxis, sampling: Sampling) -> Array:
     """Return the model's matrix over one hand period, with the loop cut at the received force.
 
     The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force.
@@ -55,16 +55,16 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
             remedy="set it to False with high gains, or use two_port.hybrid",
         )
     servo_samples, sensor_samples = (
-        _samples(sampling, name) for name in ("joint_control_hz", "sensor_hz")
+        _periods_per_hand_period(sampling, name) for name in ("joint_control_hz", "sensor_hz")
     )
     hand_period = 1 / np.asarray(sampling.hand_hz, dtype=float)
-    sections = _sections(sampling)
+    sections = _low_pass_sections(sampling)
     n = FILTER + 2 * sections.shape[-2]
     rows = _Rows(axis, n + 3)
-    hand, servo, sensor = rows.hand(hand_period), rows.servo(), rows.sensor(sections)
+    hand, servo, sensor = rows.hand_rows(hand_period), rows.servo_rows(), rows.sensor_rows(sections)
     times = sorted({Fraction(k, m) for m in (servo_samples, sensor_samples) for k in range(m)})
     gaps = [end - time for time, end in itertools.pairwise([*times, Fraction(1)])]
-    flows = {gap: rows.slave(float(gap) * hand_period) for gap in set(gaps)}
+    flows = {gap: rows.slave_rows(float(gap) * hand_period) for gap in set(gaps)}
     shape = np.broadcast_shapes(
         *(part.shape[:-2] for part in (hand, servo, sensor, *flows.values()))
     )
@@ -95,7 +95,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
         wall_stiffness=0.0,
         wall_damping=0.0,
     )
-    M = cut_map(bare, sampling)
+    M = cut_period_map(bare, sampling)
     n, period = M.shape[-1] - 3, 1 / sampling.hand_hz
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     z = np.exp(1j * w * period)
@@ -114,7 +114,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     return np.moveaxis(H, 2, 0)
 
 
-def _samples(sampling: Sampling, name: str) -> int:
+def _periods_per_hand_period(sampling: Sampling, name: str) -> int:
     hand_hz = np.asarray(sampling.hand_hz, dtype=float)
     ratios = np.asarray(getattr(sampling, name) / hand_hz, dtype=float)
     count = round(float(ratios.flat[0]))
@@ -127,7 +127,7 @@ def _samples(sampling: Sampling, name: str) -> int:
     return count
 
 
-def _sections(sampling: Sampling) -> Array:
+def _low_pass_sections(sampling: Sampling) -> Array:
     if sampling.low_pass_hz is None:
         return np.zeros((0, 5))
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
@@ -155,10 +155,10 @@ class _Rows:
             row[..., index] += value
         return row
 
-    def _environment(self) -> dict[int, Any]:
+    def _environment_entries(self) -> dict[int, Any]:
         return {X_S: self._axis.wall_stiffness, V_S: self._axis.wall_damping, _ENVIRONMENT: 1.0}
 
-    def hand(self, period: Array) -> Array:
+    def hand_rows(self, period: Array) -> Array:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
         x, v, push = _held_response(0.0, axis.device_damping / mass, period)
@@ -173,19 +173,19 @@ class _Rows:
             ahead[i] = ahead[i] + self._row({X_M: x[..., i], V_M: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
 
-    def servo(self) -> Array:
+    def servo_rows(self) -> Array:
         kv, kp = self._axis.velocity_gain, self._axis.position_gain
         row = self._row({X_M: kv * kp * self._axis.position_scale})
         return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
 
-    def sensor(self, sections: Array) -> Array:
+    def sensor_rows(self, sections: Array) -> Array:
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         environment = axis.gamma - felt_mass / axis.slave_mass
         value = self._row(
             {
                 index: axis.force_scale * environment * share
-                for index, share in self._environment().items()
+                for index, share in self._environment_entries().items()
             }
         ) + self._row({SERVO: axis.force_scale * felt_mass})
         memory = []
@@ -198,7 +198,7 @@ class _Rows:
             value = filtered
         return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
 
-    def slave(self, time: Array) -> Array:
+    def slave_rows(self, time: Array) -> Array:
         axis = self._axis
         mass = axis.slave_mass
         x, v, push = _held_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)

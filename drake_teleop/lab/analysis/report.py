@@ -29,9 +29,9 @@ from drake_teleop.lab.analysis.maps import StabilityMap
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.two_port import (
     power_ratio,
-    power_scaled,
     reference_impedances,
-    scattering,
+    scale_slave_power,
+    scattering_matrix,
     transmitted_impedance,
 )
 
@@ -138,7 +138,7 @@ def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
             for (label, felt), (colour, line, width) in zip(shown.items(), styles, strict=True):
                 kind: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": width}
                 grid[0, column].loglog(hertz, np.abs(felt), label=label, **kind)
-                grid[1, column].semilogx(hertz, _degrees(felt), **kind)
+                grid[1, column].semilogx(hertz, _phase_degrees(felt), **kind)
             grid[0, column].set_title(name)
             grid[1, column].set_xlabel("frequency [Hz]")
         if measured is not None:
@@ -146,14 +146,14 @@ def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
             dots: dict[str, Any] = {"color": VERMILION, "linestyle": "", "marker": "o", "ms": 3.5}
             label = "Diagram, simulated"
             grid[0, 0].loglog(measured["frequency_Hz"], np.abs(felt), label=label, **dots)
-            grid[1, 0].semilogx(measured["frequency_Hz"], _degrees(felt), **dots)
+            grid[1, 0].semilogx(measured["frequency_Hz"], _phase_degrees(felt), **dots)
         grid[0, 0].set_ylabel("|Z| displayed [N s/m]")
         grid[1, 0].set_ylabel("phase [deg]")
         grid[0, 0].legend()
     return figure
 
 
-def _degrees(felt: Complex) -> Any:
+def _phase_degrees(felt: Complex) -> Any:
     return np.degrees(np.unwrap(np.angle(felt)))
 
 
@@ -177,13 +177,13 @@ def draw_nyquist(curves: Curves) -> Figure:
 
 
 def draw_passive_loads(curves: Curves) -> Figure:
-    """Draw Llewellyn's parameter, the norm of the scattering matrix, and mu over frequency."""
+    """Draw Llewellyn's parameter, the scattering norm, and mu."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
     ratio = power_ratio(axis)
-    scaled = power_scaled(curves.H, ratio) if ratio > 0 else curves.H
-    S = scattering(scaled, reference_impedances(axis))
+    scaled = scale_slave_power(curves.H, ratio) if ratio > 0 else curves.H
+    S = scattering_matrix(scaled, reference_impedances(axis))
     wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
-    hands = absolute_stability.range_of_grips()
+    hands = absolute_stability.impedance_range_of_grips()
     bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
     with plot_style():
         figure = Picture(figsize=(9.0, 3.6))
@@ -210,7 +210,7 @@ def draw_passive_loads(curves: Curves) -> Figure:
 
 
 def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
-    hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_width(curves.H)
+    hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_z_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
     with plot_style():
@@ -240,7 +240,7 @@ def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
 
 
 def draw_maps(curves: Curves, grip: str) -> Figure:
-    """Draw the stability maps with the limits of all grips; distortion is that of `grip`."""
+    """Draw the stability maps; the distortion is that of `grip`."""
     with plot_style():
         rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))

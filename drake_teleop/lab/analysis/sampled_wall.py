@@ -21,8 +21,8 @@ _HALVINGS = 60
 
 def passive_stiffness(device_damping: ArrayLike, wall_damping: ArrayLike, period: float) -> Array:
     """Return the largest stiffness [N/m] of a passive wall, 0 if there is none (T62)."""
-    b = _checked_positive(device_damping, "damping of the device")
-    _checked_positive(period, "period")
+    b = _positive_array(device_damping, "damping of the device")
+    _positive_array(period, "period")
     return np.maximum(2 * (b - np.abs(wall_damping)) / period, 0.0)
 
 
@@ -78,12 +78,11 @@ def sampled_poles(
 def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
-    """Return state matrix (..., 2, 2) and input vector (..., 2) of the device over a sample."""
     from scipy.linalg import expm
 
-    _checked_positive(mass, "mass of the device")
-    _checked_positive(damping, "damping of the device")
-    _checked_positive(period, "period")
+    _positive_array(mass, "mass of the device")
+    _positive_array(damping, "damping of the device")
+    _positive_array(period, "period")
     m, b, k = np.broadcast_arrays(mass, damping, stiffness)
     if not np.all(k >= 0):
         raise DrakeTeleopError(
@@ -98,7 +97,7 @@ def _sampled_device(
     return motion[..., :2, :2], motion[..., :2, 2]
 
 
-def _checked_positive(value: ArrayLike, what: str) -> Array:
+def _positive_array(value: ArrayLike, what: str) -> Array:
     value = np.asarray(value, dtype=float)
     if not np.all(value > 0):
         raise DrakeTeleopError(f"the {what} is not positive", remedy="give values above 0")

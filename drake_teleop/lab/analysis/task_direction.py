@@ -1,4 +1,4 @@
-"""Parameters of the one-axis model along a task direction, from the scenario's true models.
+"""Parameters of the one-axis model along a task direction.
 
 One axis represents the station if a contact force causes no rotation, as along the tool.
 """
@@ -56,8 +56,8 @@ def task_direction(
 ) -> TaskDirection:
     """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
 
-    `displacement` moves the master from its start [m], in B; the slave follows. Without
-    `load_estimate` (16,) the tool mass has no error.
+    `displacement` of the master [m] is in B. Without `load_estimate` (16,) the tool mass has no
+    error.
     """
     check_scenario(scenario)
     n_W = finite_array("direction", direction, 3)
@@ -81,7 +81,7 @@ def task_direction(
     slave = NominalSlave(scenario.slave)
     arm = slave.arm
     displacement_W = scaling.translation_scale * R_WB @ displacement_B
-    q = _slave_posture(slave, displacement_W)
+    q = _find_slave_posture(slave, displacement_W)
     J, R_WS, p_WS = np.empty((6, arm.num_joints)), np.empty((3, 3)), np.empty(3)
     jacobian(arm.table, q, J)
     forward_kinematics(arm.table, q, R_WS, p_WS)
@@ -142,7 +142,7 @@ def _device_mass_and_damping(
     return float(1 / mobility - hand.mass), float(damping)
 
 
-def _slave_posture(slave: SlavePlant, moved: Array) -> Array:
+def _find_slave_posture(slave: SlavePlant, moved: Array) -> Array:
     arm, pose = slave.arm, slave.X_WS_start.copy()
     pose[4:] += moved
     if has_closed_form(arm):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis, device_impedance
-from drake_teleop.lab.analysis.two_port import entries, transmitted_impedance
+from drake_teleop.lab.analysis.two_port import matrix_entries, transmitted_impedance
 
 Real = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Comple
     return device_impedance(axis, s) + axis.force_scale * axis.position_scale * felt
 
 
-class Apparent(NamedTuple):
+class ApparentImpedance(NamedTuple):
     """Displayed impedance as mass, damping and stiffness."""
 
     mass: NDArray[np.float64]  #: kg
@@ -31,7 +31,7 @@ class Apparent(NamedTuple):
     stiffness: NDArray[np.float64]  #: N/m
 
 
-def apparent(felt: Complex, omega: Real) -> Apparent:
+def fit_apparent_impedance(felt: Complex, omega: Real) -> ApparentImpedance:
     """Return the mass, damping and stiffness that fit an impedance (n, ...) best."""
     basis = np.stack([omega, -1 / omega], axis=-1)
     flat = felt.imag.reshape(len(omega), -1)
@@ -39,7 +39,7 @@ def apparent(felt: Complex, omega: Real) -> Apparent:
     size = np.linalg.norm(basis, axis=0)
     parts, *_ = np.linalg.lstsq(basis / size, flat, rcond=None)
     mass, stiffness = (parts / size[:, None]).reshape(2, *felt.shape[1:])
-    return Apparent(mass, felt.real.mean(axis=0), stiffness)
+    return ApparentImpedance(mass, felt.real.mean(axis=0), stiffness)
 
 
 class ZWidth(NamedTuple):
@@ -54,9 +54,9 @@ class ZWidth(NamedTuple):
         return np.log10(np.abs(self.rigid) / np.abs(self.free))
 
 
-def transmitted_width(H: Complex) -> ZWidth:
-    """Return the impedances displayed in free motion and at a rigid wall, which may be infinite."""
-    h11, h12, h21, h22 = entries(H)
+def transmitted_z_width(H: Complex) -> ZWidth:
+    """Return the impedances displayed in free motion and at a rigid wall."""
+    h11, h12, h21, h22 = matrix_entries(H)
     with np.errstate(divide="ignore", invalid="ignore"):
         rigid = np.where(h22 == 0, np.inf, h11 - h12 * h21 / h22)
     return ZWidth(h11, rigid)
@@ -67,8 +67,8 @@ def transmitted_width(H: Complex) -> ZWidth:
 WEBER_FRACTION = 0.23
 
 
-def is_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
-    """Return True where a human can distinguish the displayed impedance from the ideal."""
+def is_difference_noticed(felt: Complex, ideal: Complex) -> NDArray[np.bool_]:
+    """Return where a human distinguishes the displayed impedance from the ideal."""
     return np.abs(felt / ideal - 1) > WEBER_FRACTION
 
 
@@ -86,7 +86,7 @@ def smallest_stiffness_change(
             where="weber",
             remedy="give a fraction, such as 0.23",
         )
-    _, h12, h21, h22 = entries(H)
+    _, h12, h21, h22 = matrix_entries(H)
     s = 1j * omega
     environment = np.asarray(damping) + np.asarray(stiffness) / s
     # |Z_to(Z_e + x / s) - Z_to(Z_e)| = |h12 h21 x / s| / |a (a + b x)| with a = 1 + h22 Z_e and

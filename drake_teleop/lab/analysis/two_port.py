@@ -22,18 +22,20 @@ from drake_teleop.lab.analysis.one_axis import (
 )
 
 
-def two_port(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
+def two_port_matrix(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
     """Return matrices (..., 2, 2) of four entries that broadcast."""
     entries = np.broadcast_arrays(h11, h12, h21, h22)
     stacked = np.stack(entries, axis=-1).astype(complex, copy=False)
     return stacked.reshape(*stacked.shape[:-1], 2, 2)
 
 
-def entries(H: Complex) -> tuple[Complex, Complex, Complex, Complex]:
+def matrix_entries(H: Complex) -> tuple[Complex, Complex, Complex, Complex]:
     return H[..., 0, 0], H[..., 0, 1], H[..., 1, 0], H[..., 1, 1]
 
 
-def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None = None) -> Complex:
+def hybrid_matrix(
+    axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None = None
+) -> Complex:
     """Return the hybrid matrix H (..., 2, 2) of the position-force station at s [rad/s] (T51).
 
     `servo` replaces the axis' servo response and admittance.
@@ -42,7 +44,7 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
     delay_factor = np.exp(-s * axis.delay)
     tool = axis.displayed_tool_mass * s
     slave = axis.position_scale * delay_factor * response
-    return two_port(
+    return two_port_matrix(
         device_impedance(axis, s) + axis.force_scale * delay_factor * tool * slave,
         axis.force_scale * delay_factor * (axis.gamma - tool * slave_admittance),
         -slave,
@@ -50,18 +52,18 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
     )
 
 
-def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
+def scattering_matrix(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
     """Return the scattering matrix S for reference impedances b [N s/m] of both ports.
 
     S maps the waves F + b V to F - b V.
     """
-    h11, h12, h21, h22 = entries(H)
+    h11, h12, h21, h22 = matrix_entries(H)
     b1, b2 = np.asarray(reference[0]), np.asarray(reference[1])
     ratio = np.sqrt(b2 / b1)
     h11, h12, h21, h22 = h11 / b1, h12 * ratio, h21 * ratio, h22 * b2
     determinant = (1 + h11) * (1 + h22) - h12 * h21
     return (
-        two_port(
+        two_port_matrix(
             (h11 - 1) * (h22 + 1) - h12 * h21,
             2 * h12,
             -2 * h21,
@@ -72,7 +74,7 @@ def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) 
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return the reference impedances b [N s/m] of master and slave port for `scattering`."""
+    """Return the reference impedances b [N s/m] of both ports for `scattering_matrix`."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(
@@ -88,26 +90,26 @@ def power_ratio(axis: OneAxis) -> float:
     return axis.force_scale * axis.gamma / axis.position_scale
 
 
-def power_scaled(H: Complex, ratio: ArrayLike) -> Complex:
+def scale_slave_power(H: Complex, ratio: ArrayLike) -> Complex:
     """Return H with the slave's power multiplied by `ratio` > 0."""
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
         raise DrakeTeleopError(
             "the ratio of powers is not positive", where="ratio", remedy="give values above 0"
         )
-    h11, h12, h21, h22 = entries(H)
-    return two_port(h11, h12 / root, h21 * root, h22)
+    h11, h12, h21, h22 = matrix_entries(H)
+    return two_port_matrix(h11, h12 / root, h21 * root, h22)
 
 
-def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
+def absorb_impedances(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
     """Return H that includes parallel impedances [N s/m] of the hand and of the environment."""
-    h11, h12, h21, h22 = entries(H)
+    h11, h12, h21, h22 = matrix_entries(H)
     z = np.asarray(environment)
     reduction = 1 / (1 + h22 * z)
     felt = h11 + np.asarray(hand) - h12 * h21 * z * reduction
-    return two_port(felt, h12 * reduction, h21 * reduction, h22 * reduction)
+    return two_port_matrix(felt, h12 * reduction, h21 * reduction, h22 * reduction)
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
     """Return the impedance displayed to the hand with this impedance of the environment [N s/m]."""
-    return absorb(H, environment=environment)[..., 0, 0]
+    return absorb_impedances(H, environment=environment)[..., 0, 0]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 
-def verdict(figures: dict[str, Any]) -> list[str]:
+def verdict_sentences(figures: dict[str, Any]) -> list[str]:
     sentences = []
     if figures["method"] != "none":
         sentences += [

@@ -1,8 +1,7 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies use the same channel: the whole station presses on leaf springs (`delayed_contact`);
-in one degree of freedom, a hand lets go and taps (`release_and_taps`), and the longest stable round
-trip is found for three walls (`one_dof`).
+Three studies: the whole station presses on leaf springs (`delayed_contact`), a hand lets go and
+taps (`release_and_taps`), and the longest stable round trip (`one_dof`).
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.comparison.decision import decide
+from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.delayed_contact import (
-    LEAVES,
+    LEAF_SPRINGS,
     delayed_contact,
     station_figures,
     vertical_traces,
 )
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
-    Figures,
     OneDof,
+    RunMeasures,
     Task,
     covering_damping,
-    figures,
+    figures_of_run,
     run_one_dof,
 )
 from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
@@ -119,7 +118,7 @@ def compare_command(
             "pressed_N": [pressed for _, pressed in cell.forces],
             "leaked_J": cell.leaked,
         }
-        for (method, network), cell in decide(summary).items()
+        for (method, network), cell in decision_table(summary).items()
     ]
     import polars as pl
 
@@ -143,14 +142,14 @@ def longest_round_trip(
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
         for seed in seeds if jitter or loss else seeds[:1]:
             run = run_one_dof(model, PassivityConfig(method=method), network, seed=seed)
-            if not figures(run, model).stable:
+            if not figures_of_run(run, model).stable:
                 return longest
         longest = round_trip
     return longest
 
 
 def station_base(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment, with the comparison's rates and step sizes."""
+    """Return the scenario without environment, with the comparison's rates."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_STEP),
@@ -162,9 +161,9 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """Run the whole station once with a leaf spring; return its table row and its traces."""
+    """Press on a leaf spring; return the table row and the traces."""
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
-    names = [entry.name for entry in dataclasses.fields(Figures)]
+    names = [entry.name for entry in dataclasses.fields(RunMeasures)]
     names += ["pressed_force", "felt_share", "left_behind", "leaked", "fast_force"]
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
@@ -190,7 +189,7 @@ def station_run(
 
 def _run_to_end_or_hold(
     station: Diagram, scenario: Scenario, task: Task
-) -> tuple[SimulationResult, Figures]:
+) -> tuple[SimulationResult, RunMeasures]:
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
@@ -265,19 +264,21 @@ def _station_study(
     estimate = identified_load(base, stage).estimate
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
-    cases = list(itertools.product(slowest, LEAVES, methods))
+    cases = list(itertools.product(slowest, LEAF_SPRINGS, methods))
     results = _run_parallel(
         station_run,
         [(base, method, network, leaf, estimate) for network, leaf, method in cases],
         jobs,
         stage("The whole station"),
     )
-    order = {name: list(names).index for name, names in (("network", networks), ("leaf", LEAVES))}
+    order = {
+        name: list(names).index for name, names in (("network", networks), ("leaf", LEAF_SPRINGS))
+    }
     rows = sorted(
         (row for row, _ in results),
         key=lambda row: (order["network"](row["network"]), order["leaf"](row["leaf"])),
     )
-    first = next(iter(LEAVES))
+    first = next(iter(LEAF_SPRINGS))
     traces = {
         (row["network"], row["method"]): shown
         for row, shown in results

@@ -1,4 +1,4 @@
-"""Decision table: the first verdict of docs/delay.md that applies to a method and network."""
+"""Decision table: the first applicable verdict of docs/delay.md."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from drake_teleop.lab.comparison.one_dof import TIP
+from drake_teleop.lab.comparison.one_dof import TIP_DISTANCE_M
 from drake_teleop.station.oscillation import MAX_HIGH_FREQUENCY_FORCE_N
 
-UNSTABLE, POSITION_ERROR, CHATTERS = "unstable", "position error", "chatters"
-LEAKS, HOLDS = "leaks", "holds"
+VERDICT_UNSTABLE, VERDICT_POSITION_ERROR, VERDICT_CHATTERS = (
+    "unstable",
+    "position error",
+    "chatters",
+)
+VERDICT_LEAKS, VERDICT_HOLDS = "leaks", "holds"
 MAX_DRIFT_M, MIN_LEAK_J = 5e-3, 1e-3  #: m; J
 
 
 @dataclass(frozen=True)
-class Cell:
+class MethodResult:
     """Result of one method over one network."""
 
     verdict: str
@@ -25,23 +29,23 @@ class Cell:
     leaked: float | None = None  #: largest leaked energy of all runs [J]; None: unstable
 
     @property
-    def words(self) -> str:
-        if self.verdict != LEAKS or self.leaked is None:
+    def verdict_text(self) -> str:
+        if self.verdict != VERDICT_LEAKS or self.leaked is None:
             return self.verdict
         number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")
-        return f"leaks {_two_digits(number)} {unit}"
+        return f"leaks {_format_two_digits(number)} {unit}"
 
     @property
-    def share(self) -> str:
-        """Displayed force over contact force at the worst leaf spring, as text; "" if unstable."""
+    def displayed_share(self) -> str:
+        """Displayed over contact force at the worst leaf spring; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.forces if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
-def decide(summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
-    """Return the table (method, network) -> cell from the `station` and `hands` of a summary."""
+def decision_table(summary: Mapping[str, Any]) -> dict[tuple[str, str], MethodResult]:
+    """Return the table (method, network) -> cell of a summary."""
     return {
-        (row["method"], row["network"]): _cell(
+        (row["method"], row["network"]): _summarise_runs(
             [
                 run
                 for run in summary["station"]
@@ -53,16 +57,18 @@ def decide(summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
     }
 
 
-def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
+def _summarise_runs(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> MethodResult:
     if not all(run["stable"] for run in runs):
-        return Cell(UNSTABLE, unrest=tuple(map(_motion_in_hold, runs)))
+        return MethodResult(VERDICT_UNSTABLE, unrest=tuple(map(_motion_in_hold, runs)))
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
     if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
-        return Cell(POSITION_ERROR, forces, leaked=leaked)
+        return MethodResult(VERDICT_POSITION_ERROR, forces, leaked=leaked)
     if max(run["fast_force"] for run in runs) > MAX_HIGH_FREQUENCY_FORCE_N:
-        return Cell(CHATTERS, forces, leaked=leaked)
-    return Cell(LEAKS if leaked > MIN_LEAK_J else HOLDS, forces, leaked=leaked)
+        return MethodResult(VERDICT_CHATTERS, forces, leaked=leaked)
+    return MethodResult(
+        VERDICT_LEAKS if leaked > MIN_LEAK_J else VERDICT_HOLDS, forces, leaked=leaked
+    )
 
 
 def _motion_in_hold(run: Mapping[str, Any]) -> str:
@@ -70,10 +76,10 @@ def _motion_in_hold(run: Mapping[str, Any]) -> str:
         return "at rest"
     if run["hunting"] is None:
         return "ended early"
-    if TIP * run["turning"] > run["hunting"]:
-        return f"turns by {_two_digits(1e3 * run['turning'])} mrad"
-    return f"moves by {_two_digits(1e3 * run['hunting'])} mm"
+    if TIP_DISTANCE_M * run["turning"] > run["hunting"]:
+        return f"turns by {_format_two_digits(1e3 * run['turning'])} mrad"
+    return f"moves by {_format_two_digits(1e3 * run['hunting'])} mm"
 
 
-def _two_digits(number: float) -> str:
+def _format_two_digits(number: float) -> str:
     return f"{float(f'{number:.2g}'):g}"

@@ -1,4 +1,4 @@
-"""Task of the whole station for each method and network: swing, press on a leaf spring, rest."""
+"""Task of the whole station: swing, press on a leaf spring, rest."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into, quaternion_of
-from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of
+from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
@@ -25,11 +25,11 @@ from drake_teleop.station.slave.plant import NominalSlave
 _START_GAP, _PRESS_DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
 _LEAF_LENGTH, _LEAF_WIDTH = 0.12, 0.05  # m
 #: Leaves by name: thickness [m], light enough not to oscillate.
-LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
+LEAF_SPRINGS = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the times of the task for a round trip [s]; waiting times increase with it."""
+    """Return the times of the task for a round trip [s]."""
     return Task(
         swing=0.3,
         swung=1.8,
@@ -53,8 +53,8 @@ def delayed_contact(
 ) -> tuple[Scenario, Task]:
     """Return the scenario with this task and the task's times.
 
-    `leaf` is a key of `LEAVES` or a stiffness [N/m]; `depth` [m] is the intended displacement of
-    the hand beyond the contact.
+    `leaf` is a key of `LEAF_SPRINGS` or a stiffness [N/m]; `depth` [m] is the hand's intended
+    displacement beyond the contact.
     """
     task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
     settle = 0.5
@@ -80,7 +80,7 @@ def delayed_contact(
         position=[x, y, z - _START_GAP],
         length=_LEAF_LENGTH,
         width=_LEAF_WIDTH,
-        thickness=LEAVES[leaf] if isinstance(leaf, str) else thickness_of(leaf),
+        thickness=LEAF_SPRINGS[leaf] if isinstance(leaf, str) else leaf_thickness(leaf),
     )
     return (
         replace(
@@ -95,23 +95,23 @@ def delayed_contact(
     )
 
 
-def thickness_of(stiffness: float) -> float:
+def leaf_thickness(stiffness: float) -> float:
     """Return the thickness [m] of a leaf spring with this stiffness [N/m]."""
     unit = SheetSpring(length=_LEAF_LENGTH, width=_LEAF_WIDTH, thickness=1e-3)
     return float(unit.thickness * np.cbrt(stiffness / unit.stiffness))
 
 
-def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
-    """Return the measures of a run: vertical motion and force, rotation of the tool, energy."""
+def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> RunMeasures:
+    """Return the measures of a run."""
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
-    return figures_of(
+    return figures_of_traces(
         t=result.t,
         master=result["pose_command"][:, 6],
         slave=heights,
         felt=result["force_to_master"][:, 2],
         pressed=scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
-        energy=energy_between(result, scenario),
+        energy=injected_energy(result, scenario),
         task=task,
         turned=turned,
     )
@@ -124,11 +124,11 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
         "t": result.t,
         "felt": result["force_to_master"][:, 2],
         "pressed": scaling.force_scale * scaling.gamma * result["true_contact_wrench_W"][:, 2],
-        "energy": energy_between(result, scenario),
+        "energy": injected_energy(result, scenario),
     }
 
 
-def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
+def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
     """Return the energy (N,) from hand and environment, plus the method's initial energy [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales().as_array):
@@ -141,13 +141,13 @@ def _slave_motion(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     arm = slave_arm(scenario)
     q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
-    poses = _poses(arm.table, q)
+    poses = _sensor_poses(arm.table, q)
     rotations = Rotation.from_quat(poses[:, [1, 2, 3, 0]])
     return poses[:, 6], (rotations * rotations[0].inv()).as_rotvec()
 
 
 @njit(cache=True)
-def _poses(arm, q):
+def _sensor_poses(arm, q):
     R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
     for k in range(q.shape[0]):
         forward_kinematics(arm, q[k], R, p)

@@ -1,4 +1,4 @@
-"""One degree of freedom of the station: plant, task and measures, for thousands of runs.
+"""One degree of freedom of the station: plant, task and measures.
 
 The station's own `step_channel` connects hand and slave along x at 1 kHz, with held forces.
 """
@@ -37,7 +37,7 @@ HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST = 0.5e-3  # m, peak to peak at rest
-TIP = 0.2  #: m, from the wrist to the tool's tip
+TIP_DISTANCE_M = 0.2  #: m, from the wrist to the tool's tip
 _REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest position, intended depth
 
 
@@ -80,11 +80,7 @@ class OneDof(Axis):
 
 
 REFERENCE = OneDof(
-    hand_mass=0.2,
-    hand_damping=5.0,
-    hand_stiffness=300.0,
-    position_gain=58.5,
-    velocity_gain=234.0,
+    hand_mass=0.2, hand_damping=5.0, hand_stiffness=300.0, position_gain=58.5, velocity_gain=234.0
 )
 """Model of the figures in docs/delay.md, notebook 02 and benchmarks/README.md.
 
@@ -95,7 +91,7 @@ at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 
 @dataclass(frozen=True)
 class OneDofRun:
-    """Time series (N,) of a run, one entry for each period.
+    """Time series (N,) of a run.
 
     `accounts` (N, 4) is the energy [J] that entered the station so far at four places, at the
     master's scale. In a passive station, HAND plus any other place never falls below
@@ -128,7 +124,7 @@ class OneDofRun:
 
 
 @dataclass(frozen=True)
-class Figures:
+class RunMeasures:
     """Measures of one run of the task."""
 
     #: True: at rest in hold and end, within 0.5 mm about a parabola, also at a rotating tool's tip.
@@ -174,7 +170,7 @@ def run_one_dof(
         slave_mass=[model.believed_mass * model.slave_mass] * 2,
     )
     p = methods.method_parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
-    intent = operators_intent() if intent is None else intent
+    intent = operator_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
     # The channel's command belongs to the next step; here it is used at once.
     playout = forward.playout + PERIOD if forward.playout > 0 else 0.0
@@ -219,8 +215,8 @@ def run_one_dof(
     return OneDofRun(t, master, slave, command, felt, pushed, *rest)
 
 
-def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
-    """Return the intended position [m] and velocity [m/s] (N, 2) of a task; the wall is at 0."""
+def operator_intent(task: Task = Task()) -> NDArray[np.float64]:
+    """Return intended position [m] and velocity [m/s] (N, 2); the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION)
     fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))
@@ -236,8 +232,8 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
     return u**3 * (10.0 + u * (6.0 * u - 15.0))
 
 
-def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
-    return figures_of(
+def figures_of_run(run: OneDofRun, model: OneDof, task: Task = Task()) -> RunMeasures:
+    return figures_of_traces(
         t=run.t,
         master=run.master,
         slave=run.slave,
@@ -248,7 +244,7 @@ def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
     )
 
 
-def figures_of(
+def figures_of_traces(
     *,
     t: NDArray[np.float64],
     master: NDArray[np.float64],
@@ -258,7 +254,7 @@ def figures_of(
     energy: NDArray[np.float64],
     task: Task,
     turned: NDArray[np.float64] | None = None,
-) -> Figures:
+) -> RunMeasures:
     """Return the measures of a run of the task from equidistant arrays (N,).
 
     Args:
@@ -269,26 +265,28 @@ def figures_of(
     """
     dt = float(t[1] - t[0])
 
-    def window(start: float, stop: float) -> slice:
+    def window_slice(start: float, stop: float) -> slice:
         return slice(round(start / dt), round(stop / dt))
 
-    hold = window(task.release - task.judged, task.release)
-    rest = window(task.end - task.judged, task.end)
+    hold = window_slice(task.release - task.judged, task.release)
+    rest = window_slice(task.end - task.judged, task.end)
     hunting = max(_peak_to_peak(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
     turning = max((_peak_to_peak(x[part]) for x in angles for part in (hold, rest)), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.released + 2.0) / dt), len(t) - 1)
     start = round(task.press / dt)
-    return Figures(
-        stable=bool(hunting < _MAX_MOTION_AT_REST and turning < _MAX_MOTION_AT_REST / TIP),
+    return RunMeasures(
+        stable=bool(
+            hunting < _MAX_MOTION_AT_REST and turning < _MAX_MOTION_AT_REST / TIP_DISTANCE_M
+        ),
         hunting=hunting,
         turning=turning,
         felt_force=abs(steady),
         chatter=float(felt[hold].std()),
         force_error=steady / goal - 1 if goal != 0 else float("nan"),
         drift=float(slave[after] - master[after]),
-        free_force=float(np.sqrt(np.mean(felt[window(task.swing, task.swung)] ** 2))),
+        free_force=float(np.sqrt(np.mean(felt[window_slice(task.swing, task.swung)] ** 2))),
         rise_delay=_rise_delay(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
@@ -296,10 +294,10 @@ def figures_of(
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
     """Return the least device damping [N s/m] that makes the displayed impedance passive (T43)."""
-    return max(0.0, -float(_resistance(model, round_trip).min()))
+    return max(0.0, -float(_displayed_resistance(model, round_trip).min()))
 
 
-def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
+def _displayed_resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
     s = 1j * _FREQUENCIES
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
@@ -350,7 +348,7 @@ def _simulate(
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
         x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
         v_w = (course[following, 5] - x_w) / PERIOD
-        push = _wall_push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
+        push = _wall_force(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
         wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
         load[0] = -scale * sigma * tool_mass * a_s
@@ -392,8 +390,8 @@ def _simulate(
                 v_s += dt * a_s
                 x_s += dt * v_s
             beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS * PERIOD * v_w)
-            push_then, push = push, _wall_push(wall_stiffness, wall_damping, beyond, v_s - v_w)
-            work = -_mean_positive(push_then, push) * (x_s - x_then)
+            push_then, push = push, _wall_force(wall_stiffness, wall_damping, beyond, v_s - v_w)
+            work = -_mean_if_same_sign(push_then, push) * (x_s - x_then)
             accounts[ACTUAL] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
@@ -412,12 +410,12 @@ def _quantise(x, resolution):
 
 
 @njit(cache=True)
-def _wall_push(stiffness, damping, depth, speed):
+def _wall_force(stiffness, damping, depth, speed):
     return stiffness * depth + (damping * speed if depth > 0.0 else 0.0)
 
 
 @njit(cache=True)
-def _mean_positive(a, b):
+def _mean_if_same_sign(a, b):
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:

@@ -1,4 +1,4 @@
-"""A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`)."""
+"""A hand that lets go while it presses, and one that taps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     OneDofRun,
     Task,
-    operators_intent,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.station.channel.channel import Channel
@@ -27,7 +27,7 @@ _EVALUATED_S = 2.0  # s, evaluated after letting go
 
 @dataclass(frozen=True)
 class ReleaseAndTaps:
-    """Measures of one method over one network after release and during taps, all >= 0."""
+    """Measures after release and during taps, all >= 0."""
 
     release_force: float  #: mean force on the hand in the last 0.1 s before release [N]
     release_speed: float  #: largest speed of the device in the 2 s after release [m/s]
@@ -39,7 +39,9 @@ class ReleaseAndTaps:
 def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
     round_trip, model = 2 * PRESETS[network].delay, OneDof()
 
-    def run(intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None) -> OneDofRun:
+    def simulate_hand(
+        intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None
+    ) -> OneDofRun:
         return run_one_dof(
             model,
             PassivityConfig(method=method),
@@ -53,13 +55,13 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
     release_time = 3.0 + 3 * round_trip
     end = release_time + _EVALUATED_S
     task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, judged=0.1)
-    pressing = operators_intent(task)
+    pressing = operator_intent(task)
     release_row = round(release_time / PERIOD)
     grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
     grip[release_row:] = 0.0
-    released = run(pressing, grip)
+    released = simulate_hand(pressing, grip)
     after = released.master[release_row:]
-    tapping = [run(_tap_intent(rate, round_trip)) for rate in TAP_RATES]
+    tapping = [simulate_hand(_tap_intent(rate, round_trip)) for rate in TAP_RATES]
     scale = model.force_scale * model.gamma
     return ReleaseAndTaps(
         release_force=float(np.abs(released.felt[release_row - 100 : release_row]).mean()),

@@ -15,12 +15,12 @@ from drake_teleop.common.files import write_picture, write_text
 from drake_teleop.common.html import png_data_url, render_page
 from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.comparison.decision import (
-    CHATTERS,
-    HOLDS,
-    LEAKS,
-    POSITION_ERROR,
-    UNSTABLE,
-    decide,
+    VERDICT_CHATTERS,
+    VERDICT_HOLDS,
+    VERDICT_LEAKS,
+    VERDICT_POSITION_ERROR,
+    VERDICT_UNSTABLE,
+    decision_table,
 )
 from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
 from drake_teleop.station.channel.network import PRESETS
@@ -41,11 +41,11 @@ COLUMNS = (
 
 #: Verdict -> mark, colour of the cell, colour of the text. The cells also differ in lightness.
 VERDICTS = {
-    HOLDS: ("✓", "#CBE4F4", BLACK),
-    LEAKS: ("⚠", "#FBEBB8", BLACK),
-    CHATTERS: ("≈", "#F7D39B", BLACK),
-    POSITION_ERROR: ("↷", "#F0B878", BLACK),
-    UNSTABLE: ("✗", "#565C66", "white"),
+    VERDICT_HOLDS: ("✓", "#CBE4F4", BLACK),
+    VERDICT_LEAKS: ("⚠", "#FBEBB8", BLACK),
+    VERDICT_CHATTERS: ("≈", "#F7D39B", BLACK),
+    VERDICT_POSITION_ERROR: ("↷", "#F0B878", BLACK),
+    VERDICT_UNSTABLE: ("✗", "#565C66", "white"),
 }
 _MARKERS = "os^Dv"  # marks of the networks
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
@@ -84,7 +84,7 @@ def table_cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def draw_decision(summary: Mapping[str, Any]) -> Figure:
-    methods, networks, table = summary["methods"], summary["networks"], decide(summary)
+    methods, networks, table = summary["methods"], summary["networks"], decision_table(summary)
     with plot_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
         axes = figure.subplots()
@@ -98,7 +98,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
             axes.text(
                 x,
                 y - offset,
-                f"{mark} {cell.words}",
+                f"{mark} {cell.verdict_text}",
                 color=text_colour,
                 size=9.5,
                 weight="bold",
@@ -160,23 +160,23 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
+    def draw_run(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
 
-    figure = _draw_grid(summary, traces, draw, "force [N]")
+    figure = _draw_grid(summary, traces, draw_run, "force [N]")
     figure.suptitle("Rendered force (blue) and scaled contact force (grey)", x=0.01, ha="left")
     return figure
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw over time the energy from hand and environment, plus the method's initial energy."""
+    """Draw the energy from hand and environment over time."""
 
-    def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
+    def draw_run_energy(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
 
-    figure = _draw_grid(summary, traces, draw, "energy [J]")
+    figure = _draw_grid(summary, traces, draw_run_energy, "energy [J]")
     figure.suptitle(
         "Energy between hand and actual motion:\nbelow 0 the station is active",
         x=0.01,
@@ -237,13 +237,15 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console, table = Console(), decide(summary)
+    console, table = Console(), decision_table(summary)
     grid = Table(title="Rendered share of the contact force", title_justify="left", box=SIMPLE_HEAD)
     grid.add_column("Method", no_wrap=True)
     for network in summary["networks"]:
         grid.add_column(f"{network}\n{2e3 * PRESETS[network].delay:g} ms", overflow="fold")
     for method in summary["methods"]:
         cells = [table[method, network] for network in summary["networks"]]
-        grid.add_row(method, *(f"{cell.words} {cell.share}".strip() for cell in cells))
+        grid.add_row(
+            method, *(f"{cell.verdict_text} {cell.displayed_share}".strip() for cell in cells)
+        )
     console.print(grid)
     console.print(f"written to {out}; open {out / 'report.html'}", highlight=False, markup=False)

@@ -31,7 +31,7 @@ _REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energies (N, 4, 2) [J] by place and by translation and rotation.
+    """Return the energies (N, 4, 2) [J] by place, for translation and rotation.
 
     `MOTOR` is NaN if the log is slower than the joint control.
     """
@@ -66,7 +66,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the displayed work (N, 2) of the slave's load, by translation and rotation [J]."""
+    """Return the displayed work (N, 2) [J] of the slave's load."""
     arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
     a, poses, motion = np.gradient(v, t, axis=0), np.empty((len(t), 7)), np.empty((len(t), 21))
@@ -91,7 +91,7 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return the initial energy (2,) [J] in the passivity method, of translation and rotation."""
+    """Return the passivity method's initial energy (2,) [J]."""
     scales = _motion_scale(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.method_parameters(scenario.passivity, list(power), list(scales))
@@ -108,7 +108,7 @@ def _motion_scale(scenario: Scenario) -> Array:
 
 
 def _motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
-    """Return poses X_WS (N, 7), and the motors' wrench (N, 6) at So in W without the weight."""
+    """Return X_WS (N, 7) and the motors' wrench (N, 6) at So, in W, without the weight."""
     n = q.shape[1]
     arm, zero = slave_arm(scenario).table, np.zeros(n)
     poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))

@@ -24,7 +24,7 @@ _SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
-class Use:
+class LimitUse:
     """Largest use of one limit by a motion.
 
     Attributes:
@@ -43,12 +43,12 @@ class Use:
         return f"{share} of its {self.limit} ({self.what}, at {self.time:.3f} s)"
 
 
-def check(
+def check_trajectory(
     robot: Robot,
     trajectory: FourierTrajectory,
     progress: Callable[[float], None] = lambda done: None,
-) -> list[Use]:
-    """Return the use of every limit by one period of a trajectory, largest first."""
+) -> list[LimitUse]:
+    """Return the use of every limit by one period, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
     before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
     qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
@@ -62,8 +62,8 @@ def check_motion(
     qd: Array,
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
-) -> list[Use]:
-    """Return the use of every limit by a motion of T samples and n joints, largest first."""
+) -> list[LimitUse]:
+    """Return the use of every limit by (T, n) joint motions, largest first."""
     names, limits = robot.arm.joint_names, robot.limits
     motion = _evaluate_bodies(robot, q, qd, qdd, progress)
     uses = [
@@ -81,9 +81,9 @@ def check_motion(
     return sorted((use for use in uses if use.limit not in missing), key=lambda use: -use.share)
 
 
-def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
+def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> LimitUse:
     when, which = np.unravel_index(np.argmax(shares), shares.shape)
-    return Use(limit, float(shares[when, which]), float(t[when]), names[which])
+    return LimitUse(limit, float(shares[when, which]), float(t[when]), names[which])
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def _evaluate_bodies(
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
         query = robot.scene_graph.get_query_output_port().Eval(scene_context)
-        distance, words = _nearest(robot, query, limits.clearance + _SEARCH_MARGIN_M)
+        distance, words = _nearest_obstacle(robot, query, limits.clearance + _SEARCH_MARGIN_M)
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:
@@ -156,7 +156,7 @@ def _outboard_bodies(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
     return found[1:]
 
 
-def _nearest(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
+def _nearest_obstacle(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
         return reach, "all shapes are farther"

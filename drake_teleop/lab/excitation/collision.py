@@ -38,7 +38,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, motions_of
+from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, write_link_motions
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize_plant
@@ -58,7 +58,7 @@ class Capsule:
         return Capsule(X.multiply(self.ends.T).T, self.radius)
 
     def contains(self, other: Capsule) -> bool:
-        distances = _distances(self.ends, other.ends)
+        distances = _distances_to_segment(self.ends, other.ends)
         return bool(np.all(distances + other.radius <= self.radius + 1e-9))
 
 
@@ -68,7 +68,7 @@ def bounding_capsule(shape: Shape) -> Capsule:
     if isinstance(shape, CapsuleShape):
         end = np.array([0.0, 0.0, shape.length() / 2])
         return Capsule(np.array([-end, end]), shape.radius())
-    points = _hull(shape)
+    points = _convex_hull_points(shape)
     middle = (points.max(axis=0) + points.min(axis=0)) / 2
     half = (points.max(axis=0) - points.min(axis=0)) / 2
     candidates = []
@@ -76,14 +76,14 @@ def bounding_capsule(shape: Shape) -> Capsule:
         for share in (0.0, 0.4, 0.6, 0.8, 0.9, 1.0):
             end = share * axis * half
             ends = np.array([middle - end, middle + end])
-            radius = float(_distances(ends, points).max())
+            radius = float(_distances_to_segment(ends, points).max())
             length = 2 * share * float(axis @ half)
             candidates.append((np.pi * radius**2 * (length + 4 / 3 * radius), ends, radius))
     _, ends, radius = min(candidates, key=lambda candidate: candidate[0])
     return Capsule(ends, radius)
 
 
-def _hull(shape: Shape) -> Array:
+def _convex_hull_points(shape: Shape) -> Array:
     if isinstance(shape, Box):
         corners = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, 8).T
         return corners * shape.size()
@@ -101,7 +101,7 @@ def _hull(shape: Shape) -> Array:
     return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
 
 
-def _distances(ends: Array, points: Array) -> Array:
+def _distances_to_segment(ends: Array, points: Array) -> Array:
     along = ends[1] - ends[0]
     length = float(along @ along)
     share = np.clip((points - ends[0]) @ along / length, 0, 1) if length > 0 else 0 * points[:, 0]
@@ -139,7 +139,7 @@ class Scene:
 
     Args:
         reserve: (10,) parameters phi of an additional load on the sensor.
-        visuals_count: True: visual shapes also count as collision shapes.
+        visuals_count: whether visual shapes also collide.
     """
 
     def __init__(
@@ -158,7 +158,6 @@ class Scene:
         self._rows = self._link_rows()
 
     def _link_rows(self) -> dict[BodyIndex, int]:
-        """Return the link of every body, as a row of `link_motions` (-1: world)."""
         rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
@@ -166,13 +165,12 @@ class Scene:
                 rows[body] = row
         return rows
 
-    def without_neighbours(
+    def find_collision_candidates(
         self, postures: Array, start: Array | None
     ) -> tuple[dict[_Pair, Array], list[str]]:
         """Return pairs of shapes that may collide, and names of bodies that touch at the start.
 
-        Excluded are pairs that are on one link, always near, at a constant distance, or in
-        contact in the posture `start`.
+        Pairs on one link, always near, at constant distance, or in contact at `start` are excluded.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -229,7 +227,7 @@ class Scene:
         context = self.diagram.CreateDefaultContext()
         plant_context = self.plant.GetMyContextFromRoot(context)
         q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
-        motions_of(self.arm.table, q, 0 * q, 0 * q, motions)
+        write_link_motions(self.arm.table, q, 0 * q, 0 * q, motions)
         capsules: dict[GeometryId, tuple[int, Capsule]] = {}
         for shape in sorted(
             {shape for pair in candidates for shape in pair}, key=_identifier_number
@@ -237,12 +235,12 @@ class Scene:
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
-            X_LB = X_WB if row < 0 else _pose(motions[0, row]).InvertAndCompose(X_WB)
+            X_LB = X_WB if row < 0 else _transform_of_motion(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
             capsules[shape] = row, capsule.transformed(X_LB @ inspector.GetPoseInFrame(shape))
             if inspector.GetName(shape).endswith(_TABLE):
                 capsules[shape] = row, _TABLE_CAPSULE
-        outer = {shape: _outermost(shape, capsules) for shape in capsules}
+        outer = {shape: _outermost_capsule(shape, capsules) for shape in capsules}
         outer_shapes = sorted({outer[shape] for shape in outer}, key=_identifier_number)
         shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
@@ -254,7 +252,7 @@ class Scene:
         capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
         shapes = [capsules[shape][1] for shape in outer_shapes]
         motions = empty_motions(len(postures), self.arm.num_joints)
-        motions_of(self.arm.table, postures, 0 * postures, 0 * postures, motions)
+        write_link_motions(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in shapes])
         capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
@@ -290,7 +288,7 @@ def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
 def _exclude_coaxial(manager: CollisionFilterManager, distances: dict[_Pair, Array]) -> None:
     """Exclude pairs that are near at a constant distance, and fill in their distances.
 
-    One query of Drake takes up to 0.1 s for two round shapes with the same axis.
+    Drake's query is slow for them.
     """
     for (a, b), of_pair in distances.items():
         first = of_pair[:_FIRST_POSTURES]
@@ -304,7 +302,9 @@ def _identifier_number(shape: GeometryId) -> int:
     return int(shape.get_value())
 
 
-def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]) -> GeometryId:
+def _outermost_capsule(
+    shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]
+) -> GeometryId:
     row, capsule = capsules[shape]
     holding = [
         (other.radius, -_identifier_number(name), name)
@@ -314,7 +314,7 @@ def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]
     return max(holding, key=lambda entry: entry[:2])[2]
 
 
-def _pose(motion: Array) -> RigidTransform:
+def _transform_of_motion(motion: Array) -> RigidTransform:
     return RigidTransform(RotationMatrix(motion[12:].reshape(3, 3)), motion[9:12])
 
 
@@ -332,7 +332,6 @@ def _add_load(
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
-    """Add visual shapes as collision shapes where needed; replace half spaces by plates."""
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))

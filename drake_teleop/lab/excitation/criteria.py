@@ -76,7 +76,7 @@ class Criterion:
         self._columns = columns
 
     def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
-        """Return scaled regression rows (6 T, c) and the information (c, c) per sample."""
+        """Return scaled rows (6 T, c) and the information (c, c) per sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
             V = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
@@ -94,7 +94,9 @@ class Criterion:
         log_value, _ = self._log_criterion_and_gradient(eigenvalues, vectors, 0.0)
         return float(np.exp(log_value) / np.sqrt(RATE * duration))
 
-    def smooth(self, s: Array, omega: Array, alpha: Array, sharpness: float) -> tuple[float, Array]:
+    def smooth_log_and_gradient(
+        self, s: Array, omega: Array, alpha: Array, sharpness: float
+    ) -> tuple[float, Array]:
         """Return the logarithm of the criterion and its gradient by V (T, 6, 10)."""
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)

@@ -11,16 +11,16 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, show_progress
-from drake_teleop.lab.excitation.check import RATE, Use, check
+from drake_teleop.lab.excitation.check import RATE, LimitUse, check_trajectory
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
     empty_motions,
-    limit_uses,
-    motions_of,
-    sensor_vectors,
+    write_limit_uses,
+    write_link_motions,
+    write_sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import Iterate, Problem, Task, design
+from drake_teleop.lab.excitation.optimizer import Iterate, Problem, Task, minimise_criterion
 from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -42,7 +42,7 @@ class Excitation:
     """Trajectory that passed the check.
 
     Attributes:
-        values: value of every criterion over one period at 1 kHz.
+        values: value of every criterion.
         deviations: (16,) predicted standard deviations of offsets and phi with the heaviest load.
         uses: use of every limit, largest first.
         history: (K, 2) number of evaluations, best criterion so far.
@@ -54,7 +54,7 @@ class Excitation:
     criterion: str
     values: dict[str, float]
     deviations: Array
-    uses: list[Use]
+    uses: list[LimitUse]
     history: Array
     seconds: float
 
@@ -72,7 +72,7 @@ def excite(
 ) -> Excitation:
     """Design an excitation trajectory with `harmonics` harmonics in Eq. (9), and check it.
 
-    `criterion` is a name in `CRITERIA`, `period` in s; `design` explains seed, starts, seconds.
+    `criterion` is a name in `CRITERIA`, `period` in s; for the others see `minimise_criterion`.
     """
     task = Task(
         robot.arm.table,
@@ -89,26 +89,28 @@ def excite(
             report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
         problem = Problem(task)
-        found = design(problem, seed=seed, starts=starts, seconds=seconds, progress=report_best)
+        found = minimise_criterion(
+            problem, seed=seed, starts=starts, seconds=seconds, progress=report_best
+        )
         report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
         small = _small_motions(robot, found, problem, seed)
-        trajectory, uses = best_checked(robot, found, stage("Check it at 1 kHz"), small)
-    return checked_excitation(robot, criterion, found, trajectory, uses)
+        trajectory, uses = find_best_within_limits(robot, found, stage("Check it at 1 kHz"), small)
+    return make_checked_excitation(robot, criterion, found, trajectory, uses)
 
 
-def checked_excitation(
+def make_checked_excitation(
     robot: Robot,
     criterion: str,
     found: list[Iterate],
     trajectory: FourierTrajectory,
-    uses: list[Use],
+    uses: list[LimitUse],
 ) -> Excitation:
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,
         trajectory,
         criterion,
-        criteria_of(robot, trajectory),
+        criterion_values(robot, trajectory),
         predicted_deviations(
             *sensor_motion(robot, trajectory), 1 / RATE, robot.noise, robot.limits.phi
         ),
@@ -120,19 +122,19 @@ def checked_excitation(
     )
 
 
-def best_checked(
+def find_best_within_limits(
     robot: Robot,
     found: list[Iterate],
     progress: Callable[[float], None] = lambda done: None,
     others: Iterable[FourierTrajectory] = (),
-) -> tuple[FourierTrajectory, list[Use]]:
-    """Return the best trajectory that passes the check, and its use of the limits.
+) -> tuple[FourierTrajectory, list[LimitUse]]:
+    """Return the best trajectory that passes the check, and its uses.
 
     If none of `found` passes, `others` are checked in their order.
     """
-    worst: Use | None = None
-    for trajectory in chain(_candidates(found, robot), others):
-        uses = check(robot, trajectory, progress)
+    worst: LimitUse | None = None
+    for trajectory in chain(_feasible_candidates(found, robot), others):
+        uses = check_trajectory(robot, trajectory, progress)
         if uses[0].share <= 1:
             return trajectory, uses
         if worst is None or uses[0].share < worst.share:
@@ -146,8 +148,8 @@ def best_checked(
     )
 
 
-def criteria_of(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
-    """Return the value of every criterion over one period at 1 kHz."""
+def criterion_values(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
+    """Return the value of every criterion at 1 kHz."""
     motion = sensor_motion(robot, trajectory)
     return {
         name: Criterion(name, robot.scales).value(*motion, trajectory.period) for name in CRITERIA
@@ -158,15 +160,14 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
     """Return s, omega, alpha (T, 3) of the sensor, in S, over one period at 1 kHz."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
-    motions_of(robot.arm.table, *joints, motions)
+    write_link_motions(robot.arm.table, *joints, motions)
     out = np.empty((3, len(motions), 3))
-    sensor_vectors(motions, out)
+    write_sensor_motion(motions, out)
     s, omega, alpha = out
     return s, omega, alpha
 
 
-def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
-    """Yield trajectories within the limits at 1 kHz, best first."""
+def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
     ranked = sorted(found, key=lambda iterate: iterate.value)
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)
     checks = 0
@@ -176,7 +177,7 @@ def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajector
         last[iterate.start] = iterate.value
         for factor in _SHRINK_FACTORS:
             trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
-            if _uses(robot, trajectory).max() <= 1:
+            if _largest_uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 checks += 1
                 break
@@ -196,16 +197,19 @@ def _small_motions(
     for factor in _SMALL_FACTORS:
         for motion in motions:
             small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home)
-            if _uses(robot, small)[:-1].max() <= 1:  # `check` measures the true clearance
+            # `check_trajectory` measures the true clearance.
+            if _largest_uses(robot, small)[:-1].max() <= 1:
                 yield small
 
 
-def _uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
+def _largest_uses(robot: Robot, trajectory: FourierTrajectory) -> Array:
     """Return the largest use of each of `LIMITS` at 1 kHz; its clearance is that of capsules."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
-    motions_of(robot.arm.table, *joints, motions)
+    write_link_motions(robot.arm.table, *joints, motions)
     smooth, largest = np.empty((2, len(LIMITS)))
     gradients = np.empty((len(LIMITS), 3, *joints[0].shape))
-    limit_uses(robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients)
+    write_limit_uses(
+        robot.arm.table, *joints, motions, robot.limits, 1e3, smooth, largest, gradients
+    )
     return largest

@@ -34,7 +34,7 @@ _FAR_DISTANCE_M = 1.0
 
 
 class Limits(NamedTuple):
-    """Limits of an excitation. The use of a limit is a share; a use of 1 reaches the limit.
+    """Limits of an excitation; a use of 1 reaches a limit.
 
     Attributes:
         q_middle, q_half: (n,) middle and half of the joint ranges [rad]; half may be inf.
@@ -47,7 +47,7 @@ class Limits(NamedTuple):
         capsule_ends: (C, 2, 3) end points of each capsule in the link's frame [m].
         capsule_radius: (C,) radii [m].
         pairs: (K, 2) pairs of capsules with a minimum distance.
-        distances: (K,) these distances [m]; negative where capsules are much larger than shapes.
+        distances: (K,) these distances [m], possibly negative.
         clearance: minimum distance of the true shapes [m].
     """
 
@@ -69,20 +69,20 @@ class Limits(NamedTuple):
     clearance: float
 
 
-def sampled_half(q_half: Array) -> Array:
+def half_ranges_for_sampling(q_half: Array) -> Array:
     """Return the half ranges (n,) for random postures [rad]: pi without limits."""
     return np.where(np.isfinite(q_half), q_half, np.pi)
 
 
 @njit(cache=True)
-def motions_of(table, q, qd, qdd, motions):
+def write_link_motions(table, q, qd, qdd, motions):
     """Write `link_motions` of T samples (q, qd, qdd (T, n)) into `motions` (T, n+1, 21)."""
     for t in range(len(q)):
         link_motions(table, q[t], qd[t], qdd[t], motions[t])
 
 
 @njit(cache=True)
-def sensor_vectors(motions, out):
+def write_sensor_motion(motions, out):
     """Write s, omega, alpha of the sensor, in S, into `out` (3, T, 3)."""
     for t in range(len(motions)):
         motion = motions[t, -1]
@@ -112,7 +112,7 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
 
 
 @njit(cache=True)
-def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
+def write_limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
     """Write the largest use of each of `LIMITS` over all samples, with gradients (T47).
 
     Outputs: smooth and exact maximum (7,), and the gradient (7, 3, T, n) of the smooth one by
@@ -133,12 +133,20 @@ def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, g
             for j in range(n):
                 gradient[k, k, t, j] = use[t, j] * sign[t, j]
     work = np.zeros((n + 1, SEED_SIZE)), np.zeros(n), np.zeros((n + 1, 6))
-    _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[3], work)
+    _write_torque_use(
+        table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[3], work
+    )
     work[1][:] = 0.0
     work[2][:] = 0.0
-    _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[4], work)
-    _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[5], work)
-    _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[6], work)
+    _write_sensor_use(
+        table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[4], work
+    )
+    _write_workspace_use(
+        table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[5], work
+    )
+    _write_clearance_use(
+        table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient[6], work
+    )
 
 
 @njit(cache=True)
@@ -158,7 +166,9 @@ def _smooth_maximum(use, sharpness):
 
 
 @njit(cache=True)
-def _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+def _write_torque_use(
+    table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
+):
     seeds, c, virtual = work
     T, n = q.shape
     tau = np.empty((T, n))
@@ -191,7 +201,7 @@ def _pull_back_sample(table, motions, qd, qdd, t, gradient, work):
 
 
 @njit(cache=True)
-def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+def _write_sensor_use(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
     seeds = work[0]
     T = len(motions)
     use, size = np.empty((T, 4)), np.empty((T, 4))
@@ -226,7 +236,9 @@ def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradien
 
 
 @njit(cache=True)
-def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+def _write_workspace_use(
+    table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
+):
     seeds = work[0]
     T, P = len(motions), len(limits.points_S)
     use, sign = np.empty((T, 3 * P)), np.empty((T, 3 * P))
@@ -255,7 +267,9 @@ def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
 
 
 @njit(cache=True)
-def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work):
+def _write_clearance_use(
+    table, qd, qdd, motions, limits, sharpness, smooth, largest, gradient, work
+):
     seeds = work[0]
     T, K = len(motions), len(limits.pairs)
     if K == 0:

@@ -40,7 +40,7 @@ def write_motion_film(path: Path, found: Excitation) -> None:
     q = trajectory.evaluate(times)[0]
     root = robot.diagram.CreateDefaultContext()
     context = robot.plant.GetMyMutableContextFromRoot(root)
-    poses = [_poses(robot, context, posture) for posture in q]
+    poses = [_link_poses(robot, context, posture) for posture in q]
     path_S = np.array([pose.translation() for _, pose in poses])
     speed = np.linalg.norm(np.gradient(path_S, times, axis=0), axis=1)
     force = np.linalg.norm(
@@ -75,7 +75,7 @@ def write_motion_film(path: Path, found: Excitation) -> None:
     film.write(path, make_scene)
 
 
-def _poses(
+def _link_poses(
     robot: Robot, context: Context, posture: Array
 ) -> tuple[dict[BodyIndex, RigidTransform], RigidTransform]:
     plant = robot.plant
@@ -88,7 +88,6 @@ def _poses(
 
 
 def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
-    """Add visual shapes; for bodies without them collision shapes and bones."""
     plant, inspector = robot.plant, robot.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))

@@ -19,10 +19,10 @@ from drake_teleop.lab.excitation.limits import (
     Limits,
     criterion_gradient,
     empty_motions,
-    limit_uses,
-    motions_of,
-    sampled_half,
-    sensor_vectors,
+    half_ranges_for_sampling,
+    write_limit_uses,
+    write_link_motions,
+    write_sensor_motion,
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 
@@ -94,7 +94,7 @@ class Problem:
         return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion around the home or a random posture."""
+        """Return the unknowns of a random motion."""
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
@@ -103,12 +103,12 @@ class Problem:
         )
         q0 = task.home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
-            half = sampled_half(limits.q_half)
+            half = half_ranges_for_sampling(limits.q_half)
             q0 = limits.q_middle + 0.6 * half * rng.uniform(-1, 1, len(size))
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
     def bounds(self, x: Array) -> Bounds | None:
-        """Return the bounds of the unknowns in a descent from x; None: unbounded."""
+        """Return the bounds of the unknowns; None: unbounded."""
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
@@ -116,14 +116,14 @@ class Problem:
         coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         joints = self._basis @ coefficients
         joints[0] += x[:n]
-        motions_of(task.table, *joints, self._motions)
-        sensor_vectors(self._motions, self._vectors)
+        write_link_motions(task.table, *joints, self._motions)
+        write_sensor_motion(self._motions, self._vectors)
         self._gradients[0] = 0.0
         s, omega, alpha = self._vectors
-        value, g_V = task.criterion.smooth(s, omega, alpha, criterion_sharpness)
+        value, g_V = task.criterion.smooth_log_and_gradient(s, omega, alpha, criterion_sharpness)
         criterion_gradient(task.table, self._motions, joints[1], joints[2], g_V, self._gradients[0])
         smooth, largest = np.empty((2, len(LIMITS)))
-        limit_uses(
+        write_limit_uses(
             task.table, *joints, self._motions, task.limits, limit_sharpness,
             smooth, largest, self._gradients[1:],
         )  # fmt: skip
@@ -167,7 +167,7 @@ _MIN_IMPROVEMENT = 0.995
 
 @dataclass(frozen=True)
 class Iterate:
-    """Feasible trajectory, the best of its start when found after `seconds` of thread CPU time."""
+    """Feasible trajectory, found after `seconds` of thread CPU time."""
 
     seconds: float
     evaluations: int
@@ -176,7 +176,7 @@ class Iterate:
     trajectory: FourierTrajectory
 
 
-def design(
+def minimise_criterion(
     problem: Problem,
     *,
     seed: int,
@@ -186,8 +186,7 @@ def design(
 ) -> list[Iterate]:
     """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
-    `seconds` of thread CPU time replace the number of `starts`; the result is then not
-    reproducible.
+    `seconds` of thread CPU time replace `starts`; then runs differ.
     """
     search = _Search(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeOutError):
@@ -195,7 +194,7 @@ def design(
             if seconds is None and search.start == starts:
                 break
             with suppress(_InfeasibleStartError):
-                search.follow(candidate)
+                search.descend_from(candidate)
             search.start += 1
     return search.found
 
@@ -231,7 +230,6 @@ class _Search:
         self._start_time = time.thread_time()
 
     def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
-        """Yield the best random motions of each batch, best first."""
         while True:
             batch = [
                 self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_NUM_CANDIDATES)
@@ -244,12 +242,14 @@ class _Search:
             for k in np.argsort(merit)[:_NUM_FOLLOWED]:
                 yield batch[k]
 
-    def follow(self, x: Array) -> None:
+    def descend_from(self, x: Array) -> None:
         self._evaluations, self._best_of_start = 0, float("inf")
         for criterion_sharpness, limit_sharpness, weight, iterations in _LBFGS_STAGES:
             options = {"maxiter": iterations}
             stage = (criterion_sharpness, limit_sharpness, weight)
-            x = self._minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
+            x = self._minimize(
+                self._penalised_value_and_gradient, x, stage, "L-BFGS-B", jac=True, options=options
+            ).x
         is_bounded = self._problem.bounds(x) is not None
         for k, stage in enumerate(_SLSQP_STAGES):
             hopeless = self._best_of_start > _MAX_RATIO_TO_BEST * self._best
@@ -281,7 +281,7 @@ class _Search:
         ).x
         return found
 
-    def _penalised(
+    def _penalised_value_and_gradient(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
         point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)

@@ -77,18 +77,18 @@ def predicted_covariance(
     if noise.filters is not None:
         of_s, of_alpha = noise.filters
         of_motion = -spatial_inertia(phi) @ influence[:, :6]
-        through_s = _backwards(of_s, of_motion[:, :3], step)
+        through_s = _filter_backwards(of_s, of_motion[:, :3], step)
         # s of So = s of Ao + p_SoAo x alpha.
         through_alpha = of_motion[:, 3:] + cross_matrix(noise.place).T @ through_s
         influence[:, 6:9] = through_s
-        influence[:, 9:] = _backwards(of_alpha, through_alpha, step)
+        influence[:, 9:] = _filter_backwards(of_alpha, through_alpha, step)
     # A step of a random walk affects all later samples.
     later = np.cumsum(influence[::-1], axis=0)
-    of_white = _products(influence, noise.white) / step
-    return of_white + _products(later, noise.walk) * step
+    of_white = _covariance_of_influence(influence, noise.white) / step
+    return of_white + _covariance_of_influence(later, noise.walk) * step
 
 
-def _products(influence: Array, variances: Array) -> Array:
+def _covariance_of_influence(influence: Array, variances: Array) -> Array:
     rows = (influence * np.sqrt(variances)[:, np.newaxis]).reshape(-1, influence.shape[2])
     return rows.T @ rows
 
@@ -99,7 +99,7 @@ def _error_filter(filter_: SteadyStateFilter, period: float) -> tuple[Array, Arr
     return numerator, denominator
 
 
-def _backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:
+def _filter_backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:
     # Imported late: slower than the station's import.
     from scipy.signal import bilinear, lfilter
 

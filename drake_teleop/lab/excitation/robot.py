@@ -17,7 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.collision import CLEARANCE, Parse, Scene
 from drake_teleop.lab.excitation.criteria import Scales, characteristic_length
-from drake_teleop.lab.excitation.limits import Limits, sampled_half
+from drake_teleop.lab.excitation.limits import Limits, half_ranges_for_sampling
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.station.scenario import Scenario, check_scenario
@@ -74,7 +74,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """Return the station's slave with tool, environment, and a table at z = 0."""
+    """Return the station's slave with surroundings and a table at z = 0."""
     check_scenario(scenario)
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
@@ -150,7 +150,7 @@ def RobotFromModel(
                 where="--payload",
                 remedy="give the total mass beyond the sensor",
             )
-        reserve = _compact_load(mass - load[0])
+        reserve = _compact_body_load(mass - load[0])
     with translate_drake_errors(path):
         scene = Scene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
@@ -184,12 +184,11 @@ def _make_robot(
     assumptions: list[str],
     folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
-    """Return the robot with its limits; `box` is middle and half size in W [m]."""
     arm = scene.arm
     middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
     random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
-    postures = middle + sampled_half(half) * random
-    candidates, touching = scene.without_neighbours(postures, start)
+    postures = middle + half_ranges_for_sampling(half) * random
+    candidates, touching = scene.find_collision_candidates(postures, start)
     if touching:
         assumptions.append(
             f"no clearance required, as they touch in the start posture: {', '.join(touching)}"
@@ -240,6 +239,6 @@ def _read_arm(parse: Parse) -> ArmModel:
     return ArmModelFromPlant(plant, instance, frame.name())
 
 
-def _compact_load(mass: float) -> Array:
+def _compact_body_load(mass: float) -> Array:
     com = np.array([0.0, 0.0, _PAYLOAD_COM_M])
     return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3)

@@ -4,7 +4,7 @@ The logarithm of the period T is an unknown and is minimised; the tolerance is o
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
-with standard deviations d_k after one period and z of `reliable_factor`.
+with standard deviations d_k after one period and z of `sidak_factor`.
 """
 
 from __future__ import annotations
@@ -22,18 +22,24 @@ from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import (
     Excitation,
-    best_checked,
-    checked_excitation,
+    find_best_within_limits,
+    make_checked_excitation,
     sensor_motion,
 )
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
     criterion_gradient,
-    limit_uses,
-    motions_of,
-    sensor_vectors,
+    write_limit_uses,
+    write_link_motions,
+    write_sensor_motion,
 )
-from drake_teleop.lab.excitation.optimizer import Bounds, Evaluation, Problem, Task, design
+from drake_teleop.lab.excitation.optimizer import (
+    Bounds,
+    Evaluation,
+    Problem,
+    Task,
+    minimise_criterion,
+)
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     predicted_covariance,
@@ -48,7 +54,7 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 
-RELIABLE = 0.95
+RELIABLE_PROBABILITY = 0.95
 """Share of the records in which all numbers are within their tolerances together."""
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
@@ -72,14 +78,14 @@ _REGULARISATION = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
-class Shortest:
+class ShortestMotion:
     """Checked motion; `reached` (k,) is z d_k over the tolerances, at most 1."""
 
     excitation: Excitation
     reached: Array
 
 
-def shortest(
+def design_shortest_motion(
     robot: Robot,
     tolerance: Tolerance,
     *,
@@ -87,13 +93,13 @@ def shortest(
     seed: int = 0,
     starts: int = 24,
     progress: Callable[[float, float], None] = lambda done, best: None,
-) -> Shortest:
+) -> ShortestMotion:
     """Design and check the shortest motion that reaches a tolerance.
 
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = derivatives_over_tolerances(tolerance, robot.limits.phi) * reliable_factor(
+    errors = derivatives_over_tolerances(tolerance, robot.limits.phi) * sidak_factor(
         len(tolerance.required_entries)
     )
     factor = np.ones(len(errors))
@@ -101,19 +107,21 @@ def shortest(
         robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
     )
     worst, around = np.inf, None
-    best: Shortest | None = None
+    best: ShortestMotion | None = None
     vain_rounds, empty_rounds = 0, 0
     for k in range(_MAX_ROUNDS):
         problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
         num_starts = starts if around is None else min(starts, _NUM_LATER_STARTS)
-        found = design(problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress)
+        found = minimise_criterion(
+            problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress
+        )
         found = [each for each in found if each.value <= _MAX_PERIOD_S]
         if not found:
             if (empty_rounds := empty_rounds + 1) == _MAX_EMPTY_ROUNDS:
                 break
             around = None
             continue
-        trajectory, uses = best_checked(robot, found)
+        trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
         covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
         reached = deviations_over_tolerances(errors, covariance)
@@ -125,8 +133,8 @@ def shortest(
                 0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
             )
             if trajectory.period < shortest_period:
-                excitation = checked_excitation(robot, "period", found, trajectory, uses)
-                best = Shortest(excitation, reached)
+                excitation = make_checked_excitation(robot, "period", found, trajectory, uses)
+                best = ShortestMotion(excitation, reached)
             if vain_rounds == _MAX_VAIN_ROUNDS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
@@ -145,9 +153,9 @@ def shortest(
     )
 
 
-def reliable_factor(count: int) -> float:
+def sidak_factor(count: int) -> float:
     """Return the factor z with which `count` numbers are within tolerance together (Sidak)."""
-    return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
+    return float(ndtri(0.5 + 0.5 * RELIABLE_PROBABILITY ** (1.0 / count)))
 
 
 class ShortestProblem(Problem):
@@ -167,7 +175,7 @@ class ShortestProblem(Problem):
         self._around, self._at, self.best = around, np.empty(0), around
         self._least = np.inf
         self._errors = errors
-        self._noise = white_noise(robot.noise, robot.limits.phi)
+        self._noise = white_noise_densities(robot.noise, robot.limits.phi)
         self._roots = np.sqrt(robot.noise.white[:6])
         samples, n = self._vectors.shape[1], len(task.home)
         self._gradients = np.empty((2 + len(LIMITS), 3, samples, n))
@@ -177,7 +185,7 @@ class ShortestProblem(Problem):
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return the unknowns of a random motion and period, or a variation of `around`."""
+        """Return the unknowns of a random motion, or a variation of `around`."""
         if self._around is not None and near_home:
             other = _COEFFICIENT_SPREAD * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
@@ -191,7 +199,7 @@ class ShortestProblem(Problem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return bounds of the unknowns; only the last, the log of the period, is bounded."""
+        """Return bounds of the unknowns; only log T is bounded."""
         shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
         around = (
             np.clip(x[-1] + step, shortest_period, largest)
@@ -208,14 +216,14 @@ class ShortestProblem(Problem):
         coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q, qd, qdd = self._basis @ coefficients
         q, qd, qdd = q + x[:n], qd / T, qdd / T**2
-        motions_of(task.table, q, qd, qdd, self._motions)
-        sensor_vectors(self._motions, self._vectors)
+        write_link_motions(task.table, q, qd, qdd, self._motions)
+        write_sensor_motion(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
         use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
         criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMITS)))
-        limit_uses(
+        write_limit_uses(
             task.table,
             q,
             qd,
@@ -246,9 +254,9 @@ class ShortestProblem(Problem):
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
         """Return the standard deviations (k,) in white noise, over the required ones."""
-        return np.sqrt(self._variances(self._rows(*motion), period)[0])
+        return np.sqrt(self._variances(self._regression_rows(*motion), period)[0])
 
-    def _rows(self, s: Array, omega: Array, alpha: Array) -> Array:
+    def _regression_rows(self, s: Array, omega: Array, alpha: Array) -> Array:
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
@@ -270,8 +278,7 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
-        """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V."""
-        rows = self._rows(*self._vectors)
+        rows = self._regression_rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
         logs = 0.5 * np.log(variances)
         weights = np.exp(sharpness * (logs - logs.max()))
@@ -283,8 +290,8 @@ class ShortestProblem(Problem):
         return 1.0 + 0.5 * smooth, 1.0 + 0.5 * float(logs.max()), np.ascontiguousarray(g_V)
 
 
-def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """Return the white noise densities (6, 6) of wrench and motion, relative to the wrench's."""
+def white_noise_densities(noise: SensorNoise, phi: Array) -> Array:
+    """Return the white noise densities (6, 6), relative to the wrench's."""
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
         at_So = np.eye(6)

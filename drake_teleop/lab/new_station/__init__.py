@@ -1,7 +1,7 @@
 """`drake-teleop new DIR --arm FILE --sensor-frame NAME`: creation of a station with a custom arm.
 
-The command finds a start pose with the tool down, chooses scales that match the device, writes a
-commented scenario and a picture of the start, and runs it: free motion, then contact with a wall.
+It finds a start pose, chooses scales, writes a commented scenario and a picture, and runs it: free
+motion, then contact with a wall.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, whole_file, write_picture
 from drake_teleop.lab.new_station.picture import start_picture
 from drake_teleop.lab.new_station.plan import Plan, plan_station
-from drake_teleop.lab.new_station.text import round_row, scenario_text
+from drake_teleop.lab.new_station.text import round_to_four_digits, scenario_text
 from drake_teleop.lab.run import run_command
 from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
@@ -106,8 +106,8 @@ def _print(plan: Plan, scenario: Path, picture: Path) -> None:
     for name, value in (
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
-        ("Start", f"sensor at {round_row(plan.place.position)} m, tool down"),
-        ("Reachable around it", plan.place.reachable),
+        ("Start", f"sensor at {round_to_four_digits(plan.place.position)} m, tool down"),
+        ("Reachable around it", plan.place.reachable_text),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)

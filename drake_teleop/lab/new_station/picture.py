@@ -1,4 +1,4 @@
-"""Picture of a new station at its start: arm, tool, wall and base plane, from two sides."""
+"""Picture of a new station at its start, from two sides."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.new_station.plan import Plan
 from drake_teleop.lab.new_station.random_postures import postures_at
-from drake_teleop.lab.new_station.text import wall_of
+from drake_teleop.lab.new_station.text import wall_of_plan
 from drake_teleop.station.slave.posture_shapes import PostureShapes
 
 _LINK_COLOURS = ((0.74, 0.77, 0.82), (0.52, 0.57, 0.65))
@@ -25,27 +25,29 @@ _BASE_COLOUR, _TOOL_COLOUR, _WALL_COLOUR = (0.36, 0.38, 0.42), (0.84, 0.37, 0.0)
 _WALL_THICKNESS_M = 0.1
 _LIGHT = np.array([0.35, -0.5, 0.8])
 _VIEWS = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth, from the direction of the tool
-_CELLS = 8  # divisions of the wall in the picture
+_WALL_DIVISIONS = 8  # divisions of the wall in the picture
 _TRIAD_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
-_TURNS = np.arange(0.5, 250.0)
+_SPIRAL_STEPS = np.arange(0.5, 250.0)
 _DIRECTIONS = np.column_stack(
     [
-        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.cos(np.pi * (1.0 + 5.0**0.5) * _TURNS),
-        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.sin(np.pi * (1.0 + 5.0**0.5) * _TURNS),
-        1.0 - _TURNS / 125.0,
+        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
+        * np.cos(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
+        np.sqrt(1.0 - (1.0 - _SPIRAL_STEPS / 125.0) ** 2)
+        * np.sin(np.pi * (1.0 + 5.0**0.5) * _SPIRAL_STEPS),
+        1.0 - _SPIRAL_STEPS / 125.0,
     ]
 )
 
 
 def start_picture(plan: Plan, title: str) -> Figure:
     """Draw the shapes at the start; meshes as convex hulls."""
-    shapes, wall = plan.shapes, wall_of(plan)
+    shapes, wall = plan.shapes, wall_of_plan(plan)
     triangles, colours = _arm_triangles(shapes)
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shade(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
-    chain = _chain(plan)
+    chain = _joint_chain_points(plan)
     points = np.vstack([surfaces.reshape(-1, 3), chain])
     lower, upper = points.min(axis=0), points.max(axis=0)
     with plot_style():
@@ -62,13 +64,13 @@ def start_picture(plan: Plan, title: str) -> Figure:
             _draw_plane(axes, lower, upper, plan.plane)
             _draw_triad(axes, shapes, _TRIAD_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
-            _fit(axes, lower, upper, plan.plane)
+            _fit_view(axes, lower, upper, plan.plane)
         figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
     return figure
 
 
 def _caption(plan: Plan) -> str:
-    gap = 1e3 * (plan.lowest[2] - wall_of(plan).position[2])
+    gap = 1e3 * (plan.lowest[2] - wall_of_plan(plan).position[2])
     plane = round(plan.plane, 2) + 0.0  # not -0
     return (
         f"tool (orange) {gap:.0f} mm above the wall; base plane at {plane:g} m; axes of S: x red,"
@@ -109,10 +111,16 @@ def _hull_triangles(points: Array) -> Array:
 
 
 def _box_triangles(top: Array, size: Array) -> Array:
-    """Return small triangles (k, 3, 3) of a box, which sort by depth better than large ones."""
+    """Return small triangles (k, 3, 3), which sort better by depth than large ones."""
     corners = np.array(list(product((0.0, 1.0), repeat=3)))
-    cells = np.array(list(product(range(_CELLS), range(_CELLS), range(2)))) / [_CELLS, _CELLS, 2]
-    pieces = [_hull_triangles(cell + corners / [_CELLS, _CELLS, 2]) for cell in cells]
+    cells = np.array(list(product(range(_WALL_DIVISIONS), range(_WALL_DIVISIONS), range(2)))) / [
+        _WALL_DIVISIONS,
+        _WALL_DIVISIONS,
+        2,
+    ]
+    pieces = [
+        _hull_triangles(cell + corners / [_WALL_DIVISIONS, _WALL_DIVISIONS, 2]) for cell in cells
+    ]
     unit = np.concatenate(pieces)
     is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
     triangles: Array = top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
@@ -135,7 +143,7 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
 
 
-def _chain(plan: Plan) -> Array:
+def _joint_chain_points(plan: Plan) -> Array:
     at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
     return np.vstack([at_start.origins[0], at_start.p_WS])
 
@@ -147,7 +155,7 @@ def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:
         axes.plot(*np.array([start, end]).T, color=colour, linewidth=2.0, zorder=10)
 
 
-def _fit(axes: Any, lower: Array, upper: Array, plane: float) -> None:
+def _fit_view(axes: Any, lower: Array, upper: Array, plane: float) -> None:
     lower = np.minimum(lower, [np.inf, np.inf, plane])
     middle, half = (lower + upper) / 2.0, 0.5 * float(max(upper - lower))
     for set_limits, m in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):

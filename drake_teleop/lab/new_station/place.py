@@ -1,8 +1,7 @@
 """Start of an arm with the tool down, chosen among random postures.
 
-Postures are ranked by distance to joint limits and singularities, elbow up, and overlaps of shapes.
-Of the best, the one with the largest reachable cube is the start. The tool is along an axis of S,
-the z axis of frame A; S and A are the same for tools along z_S.
+Among the best postures (`posture_scores`), the one with the largest reachable cube is the start.
+The tool is along an axis of S, the z axis of frame A; S and A are the same for tools along z_S.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from drake_teleop.lab.new_station.random_postures import (
     Region,
     degrees_of_freedom,
     joint_margins,
+    posture_scores,
     postures_at,
     random_postures,
-    scores,
-    suitable,
+    select_suitable_postures,
     with_tool_axis,
 )
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, NewInstance
@@ -67,7 +66,7 @@ _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
 # Smallest distance to a limit over half the range, and largest torque at rest over its limit: the
 # identification before a run uses 80 % of both.
 _MIN_MARGIN, MAX_TORQUE_USE = 0.22, 0.7
-LEAST_LOAD = 0.05  #: Share of the load that weak arms have to hold.
+MIN_LOAD_SHARE = 0.05  #: Share of the load that weak arms have to hold.
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
@@ -84,12 +83,12 @@ class Place(NamedTuple):
 
     Attributes:
         pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
-        by_position: True if the position is sufficient to specify the pose in a scenario.
+        by_position: True if the position specifies the pose.
         q: (n,) joint positions at the start [rad].
         half: half edge of the reachable cube around the start [m].
         room: smallest distance of a joint to its limit, over half the joint's range.
-        score: merit of the posture, see `scores`, without the cost of overlaps.
-        wall: edge of the wall that the arm does not touch [m].
+        score: merit of the posture, see `posture_scores`, without the cost of overlaps.
+        wall: edge of the free wall [m].
         vertical: True if the arm can only move up and down by `half`.
         overlaps: True if shapes of the arm overlap.
     """
@@ -105,7 +104,7 @@ class Place(NamedTuple):
     overlaps: bool = False
 
     @property
-    def reachable(self) -> str:
+    def reachable_text(self) -> str:
         """Reachable displacements from the start, as a text."""
         directions = "up and down" if self.vertical else "in all directions"
         return f"{1e3 * self.half:g} mm {directions}"
@@ -117,7 +116,7 @@ class Place(NamedTuple):
 
     @property
     def home(self) -> list[float]:
-        """Joint positions for the field `slave.home`; empty if the position is sufficient."""
+        """Joint positions for `slave.home`; empty if the position is sufficient."""
         return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
@@ -146,13 +145,9 @@ def _wall_name(edge: float) -> str:
 
 
 def find_place(
-    arm: ArmModel,
-    shapes: PostureShapes | None = None,
-    *,
-    plane: float = 0.0,
-    axis: str = "z",
+    arm: ArmModel, shapes: PostureShapes | None = None, *, plane: float = 0.0, axis: str = "z"
 ) -> Place:
-    """Find a start with the tool down and reachable space in all directions.
+    """Find a start with the tool down.
 
     Args:
         shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
@@ -161,13 +156,13 @@ def find_place(
     """
     R_SA = TOOL_AXES[axis]
     pointed = with_tool_axis(arm, R_SA.matrix())
-    length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
-    postures, region = suitable(random_postures(pointed), plane, length)
+    length = 0.0 if shapes is None else extent_beyond_sensor(shapes, shapes.tool_bodies, axis)
+    postures, region = select_suitable_postures(random_postures(pointed), plane, length)
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = list[Place]()
     for rows in _rows_to_solve(pointed, postures, region, shapes):
         solved = _candidates(pointed, postures[rows[:_NUM_CANDIDATES]], region, is_free)
-        found += [_examined(shapes, place, region) for place in solved]
+        found += [_with_largest_wall(shapes, place, region) for place in solved]
         if not all(place.overlaps for place in found):
             break
     found.sort(key=lambda place: place.score, reverse=True)
@@ -175,12 +170,15 @@ def find_place(
     best = None
     for places, vertical in ((good[:_NUM_FINALISTS], False), (found, False), (found, True)):
         if best is None or best.half == 0.0:
-            cubes = [_with_cube(pointed, place, is_free, vertical) for place in places[:_NUM_CUBES]]
+            cubes = [
+                _with_reachable_cube(pointed, place, is_free, vertical)
+                for place in places[:_NUM_CUBES]
+            ]
             best = max(cubes, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
-            f"no posture found in which {axis}_S points down and the arm can move in all directions"
-            f" ({_removals(region, len(postures.q))})",
+            f"no posture found in which {axis}_S points down and the arm can move in all"
+            f" directions ({_describe_removals(region, len(postures.q))})",
             where="new",
             remedy="check joint limits and the orientation of sensor_frame",
         )
@@ -197,7 +195,7 @@ def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     If necessary with less load, and then without any condition.
     """
     roomy = joint_margins(arm, q) > _MIN_MARGIN
-    for share in (1.0, LEAST_LOAD):
+    for share in (1.0, MIN_LOAD_SHARE):
         loaded = arm.with_load(share * arm.phi_load)
         torques = np.array([holding_torque(loaded, each) for each in q]).reshape(q.shape)
         strong = (np.abs(torques) < MAX_TORQUE_USE * arm.effort_limit).all(axis=1)
@@ -206,7 +204,7 @@ def _usable_rows(arm: ArmModel, q: Array) -> NDArray[np.intp]:
     return np.flatnonzero(roomy) if roomy.any() else np.arange(len(q))
 
 
-def _removals(region: Region, left: int) -> str:
+def _describe_removals(region: Region, left: int) -> str:
     causes = ", ".join(f"in {count} {name}" for name, count in region.removed if count)
     return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
@@ -214,10 +212,9 @@ def _removals(region: Region, left: int) -> str:
 def _rows_to_solve(
     arm: ArmModel, postures: Postures, region: Region, shapes: PostureShapes | None
 ) -> Iterator[NDArray[np.intp]]:
-    """Yield the usable rows, the best first; then rows of all ranks whose shapes do not overlap."""
     if not len(postures.q):
         return
-    order = np.argsort(scores(arm, postures, region))[::-1]
+    order = np.argsort(posture_scores(arm, postures, region))[::-1]
     usable = order[np.isin(order, _usable_rows(arm, postures.q))]
     yield usable
     if shapes is None:
@@ -234,9 +231,8 @@ def _rows_to_solve(
 def _candidates(
     arm: ArmModel, postures: Postures, region: Region, is_free: bool
 ) -> Iterator[Place]:
-    """Yield starts near postures; `is_free`: with the tool exactly down."""
     if not is_free:  # position and orientation are coupled
-        solved = [(q, _pose(arm, q), False) for q in postures.q]
+        solved = [(q, _sensor_pose_at(arm, q), False) for q in postures.q]
     else:
         solved = [
             start
@@ -247,12 +243,12 @@ def _candidates(
         return
     solved = [solved[k] for k in _usable_rows(arm, np.array([q for q, _, _ in solved]))]
     exact = postures_at(arm, np.array([q for q, _, _ in solved]))
-    merits, rooms = scores(arm, exact, region), joint_margins(arm, exact.q)
+    merits, rooms = posture_scores(arm, exact, region), joint_margins(arm, exact.q)
     for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
         yield Place(pose, by_position, q, 0.0, float(room), float(merit))
 
 
-def _pose(arm: ArmModel, q: Array) -> Array:
+def _sensor_pose_at(arm: ArmModel, q: Array) -> Array:
     pose = np.empty(7)
     pose_into(arm.table, q, pose)
     return pose
@@ -274,7 +270,7 @@ def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Ar
                 yield found, pose, False
 
 
-def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Place:
+def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Region) -> Place:
     """Return the place with the largest free wall; its score is reduced by the cost of overlaps."""
     if shapes is None:
         return place
@@ -306,7 +302,7 @@ def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Pla
 def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
     """Move the walls below the tool, into the space of wall and motion; return their edges."""
     plant, walls = shapes.plant, {}
-    x, y, z = lowest_point(shapes)
+    x, y, z = lowest_tool_point(shapes)
     middle = RigidTransform([x, y, z + (_WALL_ABOVE_M - _WALL_BELOW_M) / 2.0])
     for edge in WALL_EDGES_M:
         body = plant.GetBodyByName(_wall_name(edge))
@@ -315,7 +311,7 @@ def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
     return walls
 
 
-def lowest_point(shapes: PostureShapes) -> Array:
+def lowest_tool_point(shapes: PostureShapes) -> Array:
     """Return the tool's lowest point p_W (3,) [m]; without shapes its centre of mass."""
     points = shapes.points_on_bodies(shapes.tool_bodies)
     if not len(points):
@@ -325,8 +321,8 @@ def lowest_point(shapes: PostureShapes) -> Array:
     return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
 
 
-def extent(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
-    """Return how far bodies reach beyond S along an axis of S, at least 0 [m]."""
+def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
+    """Return the reach of bodies beyond S along an axis of S [m]."""
     points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
@@ -339,9 +335,8 @@ def _merit(place: Place) -> tuple[float, float, bool, float]:
     return enough_room, enough_space, place.by_position, place.half
 
 
-def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
-    """Return the place with the half edge of its largest reachable cube, or 0."""
-    moves = _meets if is_free else _reaches
+def _with_reachable_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
+    moves = _ik_reaches if is_free else _pose_reaches
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
     if vertical or not is_free:
         signs = np.vstack([np.eye(3), -np.eye(3)])
@@ -356,21 +351,21 @@ def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Pl
     return place._replace(half=largest, room=room, vertical=vertical)
 
 
-def _meets(arm: ArmModel, place: Place, displacement: Array) -> bool:
+def _ik_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
     q, status = find_posture(arm, place.pose + np.append(np.zeros(4), displacement), place.q)
     return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_TURN)
 
 
-def _reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
+def _pose_reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
     target = place.pose + np.append(np.zeros(4), displacement)
     q, _ = find_posture(arm, target, place.q)
-    error = np.linalg.norm(_pose(arm, q)[4:] - target[4:])
+    error = np.linalg.norm(_sensor_pose_at(arm, q)[4:] - target[4:])
     return bool(error < _MAX_RELATIVE_ERROR * np.linalg.norm(displacement))
 
 
 _MIN_COS = 0.75  # smallest cosine of the angle between tool and axis
 #: Opposite of each axis.
-OPPOSITE = {axis: axis[1:] if axis.startswith("-") else f"-{axis}" for axis in TOOL_AXES}
+OPPOSITE_AXIS = {axis: axis[1:] if axis.startswith("-") else f"-{axis}" for axis in TOOL_AXES}
 _ROUNDING_M = 1e-9
 _MIN_OFFSET_M = 0.02  # smallest distance of a centre of mass that has a direction
 
@@ -385,14 +380,14 @@ def nearest_axis(direction: Array) -> str:
 
 
 def last_joint_axis(arm: ArmModel) -> str:
-    """Return the axis of S along the last joint, directed away from the joint; empty if none is."""
+    """Return the axis of S along the last joint, away from it; empty if none is."""
     row = arm.table[arm.num_joints]
     along = row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)[2]
     return nearest_axis(-along if row[TRANSLATION_COLUMN + 2] < -_ROUNDING_M else along)
 
 
 def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) -> str:
-    """Return the lines of the model that make the tool axis z_S; empty if it is z_S."""
+    """Return model lines that make the tool axis z_S; empty if it is."""
     if axis == "z":
         return ""
     R_SA = TOOL_AXES[axis]

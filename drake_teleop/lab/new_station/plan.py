@@ -10,16 +10,16 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.new_station.place import (
-    LEAST_LOAD,
     MAX_TORQUE_USE,
-    OPPOSITE,
+    MIN_LOAD_SHARE,
+    OPPOSITE_AXIS,
     TOOL_AXES,
     Place,
     TrialWalls,
-    extent,
+    extent_beyond_sensor,
     find_place,
     last_joint_axis,
-    lowest_point,
+    lowest_tool_point,
     nearest_axis,
     tool_frame_advice,
 )
@@ -54,16 +54,16 @@ class Plan:
     """Start, scales and motions of a new station.
 
     Args:
-        tool: stand-in for a missing tool; None: the model or a file contains the tool.
+        tool: stand-in for a missing tool, or None.
         tool_mass: mass beyond the sensor [kg].
         own_tool: True if the model contains the tool.
         swing: amplitude of the slave in free motion [m].
         lowest: (3,) position in W of the tool's lowest point at the start [m].
-        tip: (3,) p_STip of this point if the tool is not along z_S, else empty [m].
+        tip: (3,) p_STip of this point [m]; empty along z_S.
         axis_note: advice on unusual axes of the sensor frame.
         overlaps: sentences about overlaps of shapes at the start.
         plane: height of the base plane [m].
-        weak_joints: joints whose torque limits in the model cannot hold the arm.
+        weak_joints: joints whose torque limits cannot hold the arm.
         shapes: shapes of arm and tool, at the start.
     """
 
@@ -93,7 +93,7 @@ def plan_station(
     device: str = PHANTOM_NAME,
 ) -> Plan:
     """Choose start, scales and motions for an arm and a device."""
-    stand_in = _stand_in("z", _LENGTH_M)
+    stand_in = _stand_in_tool("z", _LENGTH_M)
     slave = Slave(
         model=str(arm),
         sensor_frame=sensor_frame,
@@ -109,7 +109,7 @@ def plan_station(
     plane = base_plane(shapes)
     place, axis, shapes = _find_start(slave, shapes, plane, axis)
     on_sensor = None if tool is not None else slave.tool
-    share = 1.0 if own_tool else LEAST_LOAD if tool is None else 0.0
+    share = 1.0 if own_tool else MIN_LOAD_SHARE if tool is None else 0.0
     model, weak_joints, assumed = _without_weak_limits(shapes.arm, place.q, share)
     if on_sensor is not None:
         on_sensor.mass = _mass_to_hold(model, place.q)
@@ -124,7 +124,7 @@ def plan_station(
         1.0,
     )
     shapes.move_to(place.q)
-    lowest = lowest_point(shapes)
+    lowest = lowest_tool_point(shapes)
     swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
     swing = min(swing, max(lowest[2] - plane, _MIN_SWING_M) / 2.0)
     return Plan(
@@ -155,10 +155,10 @@ def _find_start(
     errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
     for axis in dict.fromkeys((natural, "z", *TOOL_AXES)):
-        if axis == OPPOSITE[natural] and axis != "z":
+        if axis == OPPOSITE_AXIS[natural] and axis != "z":
             continue
         if is_stand_in:
-            slave.tool = _stand_in(axis, _rod_length(shapes, axis))
+            slave.tool = _stand_in_tool(axis, _rod_length(shapes, axis))
             if axis != "z" or slave.tool.shapes[0].position[2] != _LENGTH_M:
                 shapes = PostureShapes(slave, TrialWalls(), sticks=True)
         try:
@@ -171,7 +171,7 @@ def _find_start(
         raise errors[0]
     best = max(found, key=lambda each: each[0].score)
     if is_stand_in:
-        slave.tool = _stand_in(best[1], _rod_length(best[2], best[1]))
+        slave.tool = _stand_in_tool(best[1], _rod_length(best[2], best[1]))
     return best
 
 
@@ -184,8 +184,8 @@ def _tool_axis(shapes: PostureShapes, load: Array) -> str:
 
 def _reaches_beyond_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
-    link_end = extent(shapes, shapes.sensor_link() - shapes.tool_bodies, axis)
-    return extent(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
+    link_end = extent_beyond_sensor(shapes, shapes.sensor_link() - shapes.tool_bodies, axis)
+    return extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
 def base_plane(shapes: PostureShapes) -> float:
@@ -197,15 +197,14 @@ def base_plane(shapes: PostureShapes) -> float:
     return float(heights.min()) if len(heights) else min(float(shapes.arm.table[0, 11]), 0.0)
 
 
-def _stand_in(axis: str, length: float) -> Tool:
+def _stand_in_tool(axis: str, length: float) -> Tool:
     along = TOOL_AXES[axis].matrix()[:, 2]
     ball = Ball(_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
     return Tool(mass=_STAND_IN_MASSES_KG[0], com=(_COM_M * along).round(6).tolist(), shapes=[ball])
 
 
 def _rod_length(shapes: PostureShapes, axis: str) -> float:
-    """Return the length of a rod that ends beyond the other shapes on the sensor's link [m]."""
-    end = extent(shapes, shapes.sensor_link() - {shapes.tool_body}, axis)
+    end = extent_beyond_sensor(shapes, shapes.sensor_link() - {shapes.tool_body}, axis)
     return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
 
 

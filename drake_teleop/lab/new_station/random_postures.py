@@ -1,4 +1,4 @@
-"""Random postures of an arm, and the conditions on a start posture that each one meets."""
+"""Random postures of an arm, and conditions on a start posture."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _GOOD_MARGIN, _GOOD_SINGULAR_VALUE, _GOOD_ELBOW = 0.3, 0.05, 0.7
 
 @dataclass(frozen=True, eq=False)
 class Postures:
-    """Joint positions with the frames that they give; arrays with a row for each posture.
+    """Joint positions and their frames, with a row for each posture.
 
     Attributes:
         q: (k, n) joint positions [rad, m].
@@ -67,9 +67,9 @@ class Region:
         tool_length: distance of the tool's end from S [m].
         first: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
-        raised: (n,) True for joints that belong above the base plane, and not to a mobile base.
+        raised: (n,) True for joints above the base plane, not of a mobile base.
         side: direction of the region about z_W, from x_W [rad].
-        removed: number of random postures that each condition removed, in this order.
+        removed: number of postures that each condition removed.
     """
 
     plane: float
@@ -120,8 +120,10 @@ def random_postures(arm: ArmModel) -> Postures:
     return postures_at(arm, random.uniform(lower, upper, (NUM_POSTURES, arm.num_joints)))
 
 
-def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Postures, Region]:
-    """Return the postures that suit a start, and the region on the side with most of them."""
+def select_suitable_postures(
+    postures: Postures, plane: float, tool_length: float
+) -> tuple[Postures, Region]:
+    """Return suitable postures, and the region on the side with most of them."""
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first
     radius = np.hypot(from_first[:, 0], from_first[:, 1])
@@ -134,8 +136,8 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
         ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
         (
             "S is too near to the first joint, too far, too low or too high",
-            _within(radius / reach, _RADIUS)
-            & _within(from_first[:, 2] / reach, _HEIGHT)
+            _is_within(radius / reach, _RADIUS)
+            & _is_within(from_first[:, 2] / reach, _HEIGHT)
             & (tool_height > _MIN_TOOL_HEIGHT_M)
             & (np.abs(postures.p_WS) < _MAX_COORDINATE_M).all(axis=1),
         ),
@@ -150,33 +152,32 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
         rows = rows[met[rows]]
     angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
     sides = 2.0 * np.pi * np.arange(_NUM_SIDES) / _NUM_SIDES
-    counts = np.array([float(_on_side(angle, side).sum()) for side in sides])
+    counts = np.array([float(_is_on_side(angle, side).sum()) for side in sides])
     counts[0] *= _FRONT_ADVANTAGE
     side = float(sides[int(np.argmax(counts))])
     region = Region(plane, tool_length, first, reach, raised, side, tuple(removed))
-    return postures[rows[_on_side(angle, side)]], region
+    return postures[rows[_is_on_side(angle, side)]], region
 
 
-def _within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
+def _is_within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
     inside: NDArray[np.bool_] = (values > limits[0]) & (values < limits[1])
     return inside
 
 
-def _on_side(angle: Array, side: float) -> NDArray[np.bool_]:
+def _is_on_side(angle: Array, side: float) -> NDArray[np.bool_]:
     near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_RAD)
     return near
 
 
-def scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
+def posture_scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
     """Return a score (k,) of each posture; the highest is the best.
 
-    Distance from limits and singularities and a raised elbow increase it. Links below the base
-    plane and distance of the sensor from the preferred place decrease it.
+    It combines limits, singularities, elbow, base plane and preferred place.
     """
     margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
     L = orientation_length(arm)
     sigma = np.minimum(smallest_singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
-    elbow = np.minimum(elbow_up(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
+    elbow = np.minimum(elbow_up_share(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
     origins = postures.origins[:, region.raised, 2]
     low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
@@ -204,7 +205,7 @@ def _singular_values(arm: ArmModel, postures: Postures) -> Array:
 
 
 def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
-    """Return in how many directions the sensor can move, which may be fewer than the joints."""
+    """Return the number of directions in which the sensor can move."""
     few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
     values = _singular_values(arm, few)
     return int((values > _ROUNDING * values[:, :1]).sum(axis=1).max())
@@ -216,7 +217,7 @@ def smallest_singular_values(arm: ArmModel, postures: Postures) -> Array:
     return smallest
 
 
-def elbow_up(postures: Postures, reach: float) -> Array:
+def elbow_up_share(postures: Postures, reach: float) -> Array:
     """Return the upward share (k,) of the elbow's offset from the line shoulder-wrist, -1 to 1.
 
     The elbow is the joint that is farthest from the line of the first and last joint.
@@ -235,7 +236,7 @@ def elbow_up(postures: Postures, reach: float) -> Array:
 
 
 def with_tool_axis(arm: ArmModel, R_SA: Array) -> ArmModel:
-    """Return the arm with the frame A, whose z is the tool axis, instead of S."""
+    """Return the arm with the frame A instead of S."""
     table = arm.table.copy()
     R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA
     table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN] = R.ravel()

@@ -26,7 +26,7 @@ def scenario_text(
     s, swing = plan.translation_scale, plan.swing
     down = 1.5 * swing + min(_MAX_DEPTH_M, swing / 4.0)
     if plan.place.by_position:
-        slave["position"] = round_row(plan.place.position)
+        slave["position"] = round_to_four_digits(plan.place.position)
     else:
         slave["home"] = plan.place.home
     comments = {
@@ -34,7 +34,7 @@ def scenario_text(
         "slave.home": "joints at the start, tool down [rad, m]",
         "slave.tip": "contact point, p_STip [m]",
         "slave.torque_limits": "those of the model cannot hold the arm",
-        "kinematic_scaling": f"the arm can move {plan.place.reachable}",
+        "kinematic_scaling": f"the arm can move {plan.place.reachable_text}",
         "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
         "operator.intent": "of the hand: up and down, then down onto the wall",
         "rates": "of the device",
@@ -50,12 +50,15 @@ def scenario_text(
     if plan.weak_joints:
         slave["torque_limits"] = dict.fromkeys(plan.weak_joints, float("inf"))
     if plan.tip:
-        slave["tip"] = round_row(plan.tip)
+        slave["tip"] = round_to_four_digits(plan.tip)
     swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
-    swing_motion |= {"frequency": SWING_HZ, "translation": round_row([0.0, 0.0, swing / s])}
+    swing_motion |= {
+        "frequency": SWING_HZ,
+        "translation": round_to_four_digits([0.0, 0.0, swing / s]),
+    }
     press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
-    press_motion |= {"translation": round_row([0.0, 0.0, -down / s])}
-    wall = wall_of(plan)
+    press_motion |= {"translation": round_to_four_digits([0.0, 0.0, -down / s])}
+    wall = wall_of_plan(plan)
     size = {} if wall.size == Wall().size else {"size": wall.size}
     data = {
         "description": f"{Path(slave['model']).stem} commanded by {device}",
@@ -75,11 +78,11 @@ def scenario_text(
     return to_yaml_text(data, head=[head], comments=comments)
 
 
-def wall_of(plan: Plan) -> Wall:
+def wall_of_plan(plan: Plan) -> Wall:
     """Return the wall below the tool."""
     x, y, z = plan.lowest
     return Wall(
-        position=round_row([x, y, z - 1.5 * plan.swing]),
+        position=round_to_four_digits([x, y, z - 1.5 * plan.swing]),
         size=[plan.place.wall, plan.place.wall],
         stiffness=WALL_STIFFNESS,
     )
@@ -90,6 +93,6 @@ def _device_rates(device: str) -> dict[str, Any]:
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 
-def round_row(values: Any) -> list[float]:
+def round_to_four_digits(values: Any) -> list[float]:
     """Return numbers with four significant digits, for a file."""
     return [float(f"{value:.4g}") for value in values]

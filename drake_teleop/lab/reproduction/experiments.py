@@ -1,4 +1,4 @@
-"""Experiments of the paper and their values: free movements (Figs. 6, 7), contact (Fig. 8)."""
+"""The paper's experiments: free movements (Figs. 6, 7), contact (Fig. 8)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import StartStage, UpdateProgress
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
-from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact
+from drake_teleop.lab.run_summary import FILTER_TAIL_S, is_in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.operator.operator import Sine
@@ -83,34 +83,36 @@ class ContactMotion:
     threshold: float
 
 
-def free_motion(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> FreeMotion:
+def simulate_free_motion(
+    scenario: Scenario, estimate: Array, progress: UpdateProgress
+) -> FreeMotion:
     """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
-    scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
+    scaled = {sigma: _scaled_wrench_at_slave(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
-def contact_motion(scenario: Scenario, estimate: Array, stage: StartStage) -> ContactMotion:
+def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> ContactMotion:
     """Simulate the contact transition with and without the leaf spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
-    free = _simulate(without_sheet(scenario), estimate, free_stage)
-    calculated_free = _scaled(free, estimate, 0.0)
+    free = _simulate(without_leaf_spring(scenario), estimate, free_stage)
+    calculated_free = _scaled_wrench_at_slave(free, estimate, 0.0)
     return ContactMotion(
         scenario=scenario,
         touched=touched,
         free=free,
-        raw=_scaled(touched, estimate, 1.0),
-        calculated=_scaled(touched, estimate, 0.0),
-        raw_free=_scaled(free, estimate, 1.0),
+        raw=_scaled_wrench_at_slave(touched, estimate, 1.0),
+        calculated=_scaled_wrench_at_slave(touched, estimate, 0.0),
+        raw_free=_scaled_wrench_at_slave(free, estimate, 1.0),
         calculated_free=calculated_free,
-        contact=in_contact(touched),
+        contact=is_in_contact(touched),
         threshold=_THRESHOLD_OVER_FREE * float(_force_norm(calculated_free).max()),
     )
 
 
-def ideal_motion(progress: UpdateProgress) -> IdealMotion:
-    """Simulate a free movement that moves and rotates the tool about all axes."""
+def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
+    """Simulate a movement along and about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
     )
@@ -141,7 +143,7 @@ def ideal_motion(progress: UpdateProgress) -> IdealMotion:
 
 
 def ideal_values(run: IdealMotion) -> Values:
-    """Return the errors of the calculated load wrench, by elimination and by regressor."""
+    """Return the errors of the calculated load wrench."""
     load = regressor(*run.motion) @ run.phi
     left = np.concatenate(
         [contact_wrench(run.reaction, np.zeros(6), *run.motion, run.phi), run.reaction - load]
@@ -179,7 +181,7 @@ def contact_values(run: ContactMotion) -> Values:
         "true_s": _first_time(t, run.contact),
         "detected_s": _first_time(t, detected),
         "threshold_N": run.threshold,
-        "raw_detectable": bool(raw_excess(run).max() > 0),
+        "raw_detectable": bool(raw_force_excess(run).max() > 0),
         "false_alarm_0_6_s": bool(detected[after].any()),
         "peak_contact_N": float(force_norm.max()),
         "peak_true_contact_N": _largest_norm(run.touched["true_contact_wrench_W"][:, :3]),
@@ -191,7 +193,7 @@ def contact_values(run: ContactMotion) -> Values:
     }
 
 
-def raw_excess(run: ContactMotion) -> Array:
+def raw_force_excess(run: ContactMotion) -> Array:
     """Return how far raw f_x, f_y, f_z, |f| leave their contact-free range in contact (4,) [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
@@ -226,7 +228,7 @@ def identification_values(load: LoadIdentification, scenario: Scenario) -> Value
     }
 
 
-def without_sheet(scenario: Scenario) -> Scenario:
+def without_leaf_spring(scenario: Scenario) -> Scenario:
     """Return the scenario without the leaf spring, with the next seed."""
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
@@ -241,7 +243,7 @@ def true_parameters(scenario: Scenario) -> Array:
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 
-def _scaled(result: SimulationResult, estimate: Array, sigma: float) -> Array:
+def _scaled_wrench_at_slave(result: SimulationResult, estimate: Array, sigma: float) -> Array:
     wrench, s, omega, alpha = sensor_samples(result)
     offsets, phi, no_object = estimate[:6], estimate[6:], np.zeros(10)
     scales = {"sigma_gripper": sigma, "sigma_object": sigma, "gamma": 1.0}
@@ -257,7 +259,7 @@ def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
 
 
 def reversal_without_contact(run: ContactMotion) -> float | None:
-    """Return the time of the largest raw force after the contact [s]; None without contact."""
+    """Return the time of the largest raw force after contact [s], or None."""
     t, force_norm = run.touched.t, _force_norm(run.raw)
     window = _contact_window(run)
     if not window.any():

@@ -1,4 +1,4 @@
-"""Figs. 6 to 8 from plain arrays, with the paper's layout and equal scales in all subplots."""
+"""Figs. 6 to 8 from arrays, in the paper's layout."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def scaling_figure(
 
     `symbol` is matplotlib text; `downscaling` is force at the slave over force at the master.
     """
-    time, time_unit = _time(t)
+    time, time_unit = _time_axis(t)
     traces = [np.asarray(trace, float) for trace in values]
     with plot_style():
         figure = Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
@@ -43,7 +43,7 @@ def scaling_figure(
             axes.plot(time, trace, color=BLUE if sigma else GREEN)
             axes.set_title(_sigma_title(sigma))
             peak = float(np.abs(trace).max())
-            _note(
+            _draw_note(
                 axes,
                 f"peak {_format_number(peak)} {unit}"
                 f"   ·   {_format_number(peak / downscaling)} {unit}"
@@ -72,7 +72,7 @@ def contact_figure(
 
     `threshold` [N] and `detected_s` are of the detection; `turning_s`: reversal without contact.
     """
-    time, time_unit = _time(t)
+    time, time_unit = _time_axis(t)
     per_second = 1e3 if time_unit == "ms" else 1.0
     traces = [np.asarray(trace, float) for trace in (measured, contact_force)]
     touched = np.asarray(contact, bool)
@@ -86,14 +86,14 @@ def contact_figure(
             axes.set_title(title)
             axes.set_ylabel(f"{symbol} [N]")
             if turning_s is not None:
-                _mark(axes, turning_s * per_second, "no contact", GREY)
+                _mark_time(axes, turning_s * per_second, "no contact", GREY)
         if touched.any():
-            _mark(rows[0], time[np.argmax(touched)], "contact", VERMILION)
-        _mark(rows[1], detected_s * per_second, "detected", VERMILION)
+            _mark_time(rows[0], time[np.argmax(touched)], "contact", VERMILION)
+        _mark_time(rows[1], detected_s * per_second, "detected", VERMILION)
         for level in (-threshold, threshold):
             rows[1].axhline(level, color=VERMILION, linewidth=0.8, linestyle=":")
-        _note(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
-        _note(
+        _draw_note(rows[0], f"peak {_format_number(np.abs(traces[0]).max())} N")
+        _draw_note(
             rows[1],
             f"peak {_format_number(np.abs(traces[1]).max())} N"
             f"   ·   threshold {_format_number(threshold)} N",
@@ -104,7 +104,7 @@ def contact_figure(
     return figure
 
 
-def _time(t: ArrayLike) -> tuple[Array, str]:
+def _time_axis(t: ArrayLike) -> tuple[Array, str]:
     seconds = np.asarray(t, float)
     return (seconds * 1e3, "ms") if seconds[-1] - seconds[0] <= 2 else (seconds, "s")
 
@@ -127,7 +127,7 @@ def _format_number(value: float) -> str:
     return f"{rounded:.{decimals}f}"
 
 
-def _note(axes: Axes, text: str) -> None:
+def _draw_note(axes: Axes, text: str) -> None:
     axes.set_title(text, loc="right", color=GREY, fontsize=8.5)
 
 
@@ -140,7 +140,7 @@ def _master_axis(axes: Axes, downscaling: float, label: str) -> None:
     right.spines["right"].set_visible(True)
 
 
-def _mark(axes: Axes, time: float, text: str, colour: str) -> None:
+def _mark_time(axes: Axes, time: float, text: str, colour: str) -> None:
     axes.axvline(time, color=colour, linewidth=0.9, linestyle="--")
     axes.annotate(
         text,

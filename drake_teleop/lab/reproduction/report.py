@@ -35,7 +35,7 @@ _VERDICTS_OF_FOUND = ("agrees", "differs")
 
 @dataclass(frozen=True)
 class Comparison:
-    """Row of the table that compares paper and reproduction.
+    """Row that compares paper and reproduction.
 
     Args:
         origin: "set" if the scenario was chosen to match the paper's value; else "found".
@@ -78,7 +78,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """Row of the identification table: identified and true value of a parameter, in `unit`."""
+    """Row of the identification table, in `unit`."""
 
     symbol: str
     index: str
@@ -90,7 +90,7 @@ class ParameterRow:
 
 
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
-    """Return the rows of the table that compares paper and reproduction."""
+    """Return the rows that compare paper and reproduction."""
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     share = s["contact.peak_contact_N"] / s["contact.peak_inertial_N"]
@@ -117,9 +117,9 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
                    1e3 * s["contact.true_s"], "ms", 205, 235),
         _range_row("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
                    delay_ms, "ms", 0, 10),
-        _answer_row("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
+        _yes_no_row("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
                     s["contact.raw_detectable"], False),
-        _answer_row("Fig. 8: false alarm at about 600 ms", "no contact there",
+        _yes_no_row("Fig. 8: false alarm at about 600 ms", "no contact there",
                     s["contact.false_alarm_0_6_s"], False),
         _range_row("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
                    share, "", 0, 0.7),
@@ -131,7 +131,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def describe_unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return as text the rows whose values are outside the accepted range."""
+    """Return the rows outside the accepted range as text."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
         for row in compare_with_paper(values_by_full_name(summary))
@@ -148,7 +148,7 @@ def values_by_full_name(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, A
     }
 
 
-def captions(summary: Mapping[str, Any]) -> dict[str, str]:
+def figure_captions(summary: Mapping[str, Any]) -> dict[str, str]:
     s = summary
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     threshold = "a threshold" if s["contact.raw_detectable"] else "no threshold"
@@ -195,7 +195,7 @@ def parameter_rows(
     return rows
 
 
-def versions() -> dict[str, str]:
+def library_versions() -> dict[str, str]:
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
 
@@ -209,13 +209,13 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures; equal runs give equal pages."""
+    """Write the HTML page with embedded figures."""
     page = render_page(
         "drake_teleop.lab.reproduction",
         "report.html.j2",
         setup=dict(setup),
-        versions=versions(),
-        tiles=_tiles(summary),
+        versions=library_versions(),
+        tiles=_summary_tiles(summary),
         comparisons=compare_with_paper(summary),
         figures=[(item, png_data_url(item.png)) for item in figures],
         parameters=parameters,
@@ -225,7 +225,7 @@ def write_report(
     write_text(path, page)
 
 
-def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _summary_tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     return [
         (f"{s['free_force.peak_raw_N']:.0f}", "N", "on the sensor from moving the tool alone"),
@@ -247,7 +247,7 @@ def _range_row(
     return Comparison(what, paper, _format_value(value, unit), origin, bounds.strip(), holds)
 
 
-def _answer_row(what: str, paper: str, value: bool, expected: bool) -> Comparison:
+def _yes_no_row(what: str, paper: str, value: bool, expected: bool) -> Comparison:
     words, holds = {True: "yes", False: "no"}, bool(value) == expected
     return Comparison(what, paper, words[bool(value)], "found", words[expected], holds)
 

@@ -1,4 +1,4 @@
-"""`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order."""
+"""`drake-teleop reproduce`: the paper's experiments, Figs. 6 to 8."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from drake_teleop.lab.reproduction.experiments import (
     ContactMotion,
     FreeMotion,
     Values,
-    contact_motion,
     contact_values,
-    free_motion,
     free_values,
-    ideal_motion,
     ideal_values,
     identification_values,
     reversal_without_contact,
+    simulate_contact,
+    simulate_free_motion,
+    simulate_ideal_motion,
     true_parameters,
-    without_sheet,
+    without_leaf_spring,
 )
 from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     ReportFigure,
-    captions,
     compare_with_paper,
+    figure_captions,
     parameter_rows,
     values_by_full_name,
     write_report,
@@ -76,10 +76,14 @@ def reproduce_command(
             )
         )
         load = identify_load(identification_scenario(force, seed), stage)
-        force_run = free_motion(force, load.estimate, stage("Fig. 6: vertical free motion"))
-        torque_run = free_motion(torque, load.estimate, stage("Fig. 7: horizontal free motion"))
-        ideal_run = ideal_motion(stage("Rotation about all axes, ideal sensor"))
-        contact_run = contact_motion(contact, load.estimate, stage)
+        force_run = simulate_free_motion(
+            force, load.estimate, stage("Fig. 6: vertical free motion")
+        )
+        torque_run = simulate_free_motion(
+            torque, load.estimate, stage("Fig. 7: horizontal free motion")
+        )
+        ideal_run = simulate_ideal_motion(stage("Rotation about all axes, ideal sensor"))
+        contact_run = simulate_contact(contact, load.estimate, stage)
         summary = {
             "free_force": free_values(force_run, _FORCE_Z, "N"),
             "free_torque": free_values(torque_run, _TORQUE_X, "Nm"),
@@ -87,11 +91,11 @@ def reproduce_command(
             "contact": contact_values(contact_run),
             "identification": identification_values(load, force),
         }
-        session = {"speed": _speed(stage("Measure the speed"))}
-        pictures = draw(force_run, torque_run, contact_run, summary)
+        session = {"speed": _measure_speed(stage("Measure the speed"))}
+        pictures = draw_figures(force_run, torque_run, contact_run, summary)
         written = stage("Write figures, replay and report")
         with output_folder(out):
-            _write(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
+            _write_results(out, seed, summary, load, (force_run, torque_run, contact_run), pictures)
             write_json(out / "session.json", session)
             write_json(out / "summary.json", summary)
         written(1.0)
@@ -100,7 +104,7 @@ def reproduce_command(
     return summary | session
 
 
-def draw(
+def draw_figures(
     force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Values
 ) -> dict[str, Figure]:
     pictures = {
@@ -135,7 +139,7 @@ def _log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
     return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
 
 
-def _speed(progress: UpdateProgress) -> Values:
+def _measure_speed(progress: UpdateProgress) -> Values:
     scenario = LoadScenario("free_motion_force")
     cost = cpu_seconds(
         {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress
@@ -146,7 +150,7 @@ def _speed(progress: UpdateProgress) -> Values:
     }
 
 
-def _write(
+def _write_results(
     out: Path,
     seed: int,
     summary: Values,
@@ -161,7 +165,7 @@ def _write(
         ("free_motion_force", force.result, force.scenario),
         ("free_motion_torque", torque.result, torque.scenario),
         ("contact_transition", contact.touched, contact.scenario),
-        ("contact_transition_without_sheet", contact.free, without_sheet(contact.scenario)),
+        ("contact_transition_without_sheet", contact.free, without_leaf_spring(contact.scenario)),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
@@ -190,7 +194,7 @@ def _captioned_figures(out: Path, figures: Values) -> list[ReportFigure]:
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",
         "fig8": "Fig. 8: contact transition",
     }
-    words = captions(figures)
+    words = figure_captions(figures)
     return [ReportFigure(title, out / f"{name}.png", words[name]) for name, title in titles.items()]
 
 
@@ -199,16 +203,16 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
     return {
         "Seed": str(seed),
         "Rates": (
-            f"wrist sensor {rates.sensor_hz:g} Hz, hand and channel {rates.hand_hz:g} Hz, joint "
-            f"control {rates.joint_control_hz:g} Hz, load estimator {rates.estimator_hz:g} Hz"
+            f"wrist sensor {rates.sensor_hz:g} Hz, hand and channel {rates.hand_hz:g} Hz, joint"
+            f" control {rates.joint_control_hz:g} Hz, load estimator {rates.estimator_hz:g} Hz"
         ),
         "Plant": (
-            f"continuous, {scenario.simulation.integrator}, no step longer than a period of the "
-            "joint control; the sensor samples inside the steps"
+            f"continuous, {scenario.simulation.integrator}, no step longer than a period of the"
+            " joint control; the sensor samples inside the steps"
         ),
         "Excitation": (
-            f"one period of {load.trajectory.period:g} s, {load.trajectory.rho.shape[1]} "
-            f"harmonics, condition number {load.kappa_w10:.1f}"
+            f"one period of {load.trajectory.period:g} s, {load.trajectory.rho.shape[1]}"
+            f" harmonics, condition number {load.kappa_w10:.1f}"
         ),
         "Force scale": f"1/{1 / scale:g}, slave to master",
     }
@@ -217,8 +221,8 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
 def _markdown(rows: list[Comparison]) -> str:
     lines = ["| What | Paper | This run | | Accepted | Verdict |", "|---|---|---|---|---|---|"]
     lines += [
-        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} "
-        f"| {row.accepted or '–'} | {row.verdict} |"
+        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} |"
+        f" {row.accepted or '–'} | {row.verdict} |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"

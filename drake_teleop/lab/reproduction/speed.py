@@ -54,7 +54,7 @@ def cpu_seconds(
     repetitions: int = 11,
     progress: UpdateProgress = lambda done: None,
 ) -> dict[str, float]:
-    """Return the CPU time per simulated second of each simulator: minimum of interleaved runs."""
+    """Return the least CPU time per simulated second of each simulator."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
     for k in range(repetitions):
         for name, simulator in simulators.items():

@@ -1,7 +1,6 @@
 """Choice of the next points of an adaptive design by expected improvement (Jones 1998).
 
-In a batch, the predicted mean replaces a chosen point's value ("kriging believer", Ginsbourger
-2010).
+A batch uses the "kriging believer" (Ginsbourger 2010).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from drake_teleop.common.numeric import Array
 _LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e-6), np.log(1.0))
 
 
-def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
+def propose_points(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
     """Return the indices of the `count` candidates with the largest expected improvement.
 
     `places` (n, d) and `candidates` (m, d) have coordinates from 0 to 1; `objective` (n,) is
@@ -31,7 +30,7 @@ def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) 
         return list(range(count))
     y = np.where(np.isfinite(y), y, np.nanmax(np.where(np.isfinite(y), y, np.nan)))
     y = (y - y.mean()) / (y.std() or 1.0)
-    lengths, noise = _fit(places, y)
+    lengths, noise = _fit_kernel(places, y)
     places, candidates = places / lengths, candidates / lengths
     chosen: list[int] = []
     for _ in range(count):
@@ -47,7 +46,7 @@ def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) 
     return chosen
 
 
-def _fit(places: Array, y: Array) -> tuple[Array, float]:
+def _fit_kernel(places: Array, y: Array) -> tuple[Array, float]:
     def misfit(x: Array) -> float:
         K = _kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
         K[np.diag_indices_from(K)] += np.exp(x[-1])

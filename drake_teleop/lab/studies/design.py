@@ -1,4 +1,4 @@
-"""Content of a study file, and its design points: the sets of factor values to simulate."""
+"""Content of a study file, and its design points."""
 
 import itertools
 import math
@@ -40,17 +40,17 @@ class Factor:
     high: float | None = plain(None, "end of the range")
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
-    def listed(self) -> Sequence[Value]:
-        """Return the values of a factorial design: the list, or `levels` numbers of the range."""
+    def listed_values(self) -> Sequence[Value]:
+        """Return the list, or `levels` numbers of the range."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
 
-    def at(self, share: float) -> Value:
+    def value_at_share(self, share: float) -> Value:
         """Return the value at a share (0 to 1) of the range or the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
-        listed = self.listed()
+        listed = self.listed_values()
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: Value) -> list[float]:
@@ -60,7 +60,7 @@ class Factor:
         elif self.values:
             low, high = min(self.values), max(self.values)
         else:
-            return [float(value == other) for other in self.listed()]
+            return [float(value == other) for other in self.listed_values()]
         assert isinstance(value, (int, float))
         return [(value - low) / (high - low) if high > low else 0.0]
 
@@ -87,7 +87,7 @@ class Factor:
                 where=f"{where}.high",
                 remedy="raise high or lower low",
             )
-        listed = self.listed()
+        listed = self.listed_values()
         if any(value in listed[:index] for index, value in enumerate(listed)):
             raise DrakeTeleopError(
                 "a value is repeated", where=where, remedy="list each value once"
@@ -161,7 +161,7 @@ class Study:
 
     def size(self) -> int:
         if self.design == "factorial":
-            return math.prod(len(factor.listed()) for factor in self.factors)
+            return math.prod(len(factor.listed_values()) for factor in self.factors)
         return self.samples
 
     def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
@@ -181,7 +181,7 @@ class Study:
         """Return all points (field -> value); of an adaptive design, the first ones."""
         if self.design == "factorial":
             names = [factor.field for factor in self.factors]
-            combinations = itertools.product(*(factor.listed() for factor in self.factors))
+            combinations = itertools.product(*(factor.listed_values() for factor in self.factors))
             return [dict(zip(names, values, strict=True)) for values in combinations]
         if self.design == "sobol":
             return self._sobol(self.samples, self.seed)
@@ -194,7 +194,7 @@ class Study:
         count = min(self.batch, self.samples - len(points))
         if self.design != "adaptive" or count <= 0:
             return []
-        from drake_teleop.lab.studies.adaptive import propose
+        from drake_teleop.lab.studies.adaptive import propose_points
 
         # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
@@ -204,11 +204,13 @@ class Study:
         )
         if len(candidates) <= count:
             return candidates
-        chosen = propose(self._coordinates(points), objective, self._coordinates(candidates), count)
+        chosen = propose_points(
+            self._coordinates(points), objective, self._coordinates(candidates), count
+        )
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """Return one table row, still without measures, for each run of the points."""
+        """Return one table row without measures for each run."""
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
             {"run": run, "point": point, "repeat": repeat, "seed": self.seed + 2 * repeat} | values
@@ -222,7 +224,10 @@ class Study:
         sobol = qmc.Sobol(len(self.factors), seed=np.random.default_rng(seed))
         shares = sobol.random_base2(count.bit_length() - 1)
         return [
-            {factor.field: factor.at(u) for factor, u in zip(self.factors, point, strict=True)}
+            {
+                factor.field: factor.value_at_share(u)
+                for factor, u in zip(self.factors, point, strict=True)
+            }
             for point in shares.tolist()
         ]
 

@@ -22,10 +22,10 @@ from drake_teleop.lab.studies.level_model import (
     TOO_FEW,
     Flags,
     LevelModel,
-    comparable,
+    largest_complete_block,
     level_model,
     levels_of,
-    reasons,
+    missing_value_reasons,
 )
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class Factorial:
     counts: list[int]
     seen: Flags
 
-    def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
+    def comparable_levels(self, *shown: int) -> tuple[Flags, Flags, Array]:
         """Return booleans of comparable levels (or cells of two factors) and of used combinations.
 
         The matrix (kept rows, n) maps point values to means.
@@ -58,19 +58,19 @@ class Factorial:
         )
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
-        is_compared, combinations = comparable(point >= 0)
+        is_compared, combinations = largest_complete_block(point >= 0)
         weights = np.zeros((int(is_compared.sum()), len(row)))
         points = point[is_compared][:, combinations]
         np.put_along_axis(weights, points, 1.0 / combinations.sum(), axis=1)
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        means = [self.compared(factor)[2] for factor in range(len(self.counts))]
+        means = [self.comparable_levels(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        mean, half = interval(weights @ table)
+        mean, half = seed_interval(weights @ table)
         return mean, np.hypot(half, self._missing_seed_widths(table, weights))
 
     def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
@@ -114,7 +114,7 @@ def fill_missing(values: Array) -> Array:
     return np.where(known, values, of_point[:, None] + of_seed)
 
 
-def interval(table: Array) -> tuple[Array, Array]:
+def seed_interval(table: Array) -> tuple[Array, Array]:
     """Return means (n,) over the seeds of a table (n, seeds), and half widths; nan is ignored."""
     count = np.isfinite(table).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -188,10 +188,10 @@ class PairMeans:
     fitted: bool
 
 
-def estimated(
+def estimate_means(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """Return the means of values (N,) at each of `count` levels; nan is ignored."""
+    """Return the means of values (N,) at `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -199,14 +199,14 @@ def estimated(
     np.add.at(runs, (levels[known], seed[known]), 1.0)
     with np.errstate(invalid="ignore"):
         table = sums / runs
-    mean, half = interval(table)
+    mean, half = seed_interval(table)
     # Seeds without some level are excluded: they would shift all other levels.
-    _, effect_half = interval(table - table.mean(axis=0))
+    _, effect_half = seed_interval(table - table.mean(axis=0))
     return Estimate(mean, half, effect_half)
 
 
-def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects on all measures: one row per measure, factor and level."""
+def effects_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the main effects by measure, factor and level."""
     import polars as pl
 
     table = [
@@ -240,7 +240,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, Ma
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
     data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
-    return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
+    return [] if data.is_empty else [found for pair in pairs if (found := data.pair_means(*pair))]
 
 
 class _MeasureData:
@@ -273,35 +273,35 @@ class _MeasureData:
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW] * count, 0
         if self.model is not None:
-            is_compared, combinations, weights = self.model.compared(factor)
+            is_compared, combinations, weights = self.model.comparable_levels(factor)
             if is_compared.sum() > 1:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
                 figures[:, is_compared] = found
-                compared = self._combinations(combinations, factor)
-            why = self._reasons(is_compared & (is_compared.sum() > 1), levels.index)
+                compared = self._count_combinations(combinations, factor)
+            why = self._missing_value_reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
-        left_out = self._combinations(np.ones(1), factor) - compared
+        left_out = self._count_combinations(np.ones(1), factor) - compared
         return MainEffect(
             levels.names, runs, mean, half, effect, effect_half, why, compared, left_out,
             self.fitted,
         )  # fmt: skip
 
-    def pair(self, first: int, second: int) -> PairMeans | None:
+    def pair_means(self, first: int, second: int) -> PairMeans | None:
         if self.model is None or (isinstance(self.model, LevelModel) and not self.model.products):
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        is_compared, combinations, weights = self.model.compared(first, second)
+        is_compared, combinations, weights = self.model.comparable_levels(first, second)
         mean = np.full(len(is_compared), np.nan)
         mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
         cell = a.index * shape[1] + b.index
         is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
         mean[~is_compared] = np.nan
-        why = np.array(self._reasons(is_compared, cell)).reshape(shape)
-        compared = self._combinations(combinations, first, second)
-        left_out = self._combinations(np.ones(1), first, second) - compared
+        why = np.array(self._missing_value_reasons(is_compared, cell)).reshape(shape)
+        compared = self._count_combinations(combinations, first, second)
+        left_out = self._count_combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
         names = a.names, b.names
         return PairMeans(fields, names, mean.reshape(shape), why, compared, left_out, self.fitted)
@@ -310,13 +310,13 @@ class _MeasureData:
     def fitted(self) -> bool:
         return not isinstance(self.model, Factorial)
 
-    def _combinations(self, combinations: NDArray[Any], *shown: int) -> int:
+    def _count_combinations(self, combinations: NDArray[Any], *shown: int) -> int:
         others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
         return round(np.mean(combinations) * math.prod(others))
 
-    def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
+    def _missing_value_reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
         runs = np.bincount(cell, minlength=len(compared))
-        return reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
+        return missing_value_reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
 
 def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
@@ -324,12 +324,12 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
     table = np.full((points.height, len(seeds)), np.nan)
-    table[point, seed] = numbers(rows, measure)
+    table[point, seed] = measure_values(rows, measure)
     return points, table
 
 
-def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return all points with their means of the `PARETO` measures; None if the study lacks one."""
+def pareto_table(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
+    """Return all points with their means of `PARETO`; None if one is missing."""
     import polars as pl
 
     if not set(PARETO) <= set(study.measures) or rows.is_empty():
@@ -340,20 +340,21 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
     seeds, complete = rows["seed"].to_numpy(), np.ones(len(order), dtype=bool)
     means = []
     for name in PARETO:
-        values = numbers(rows, name)
+        values = measure_values(rows, name)
         complete &= np.bincount(index, ~np.isfinite(values), len(order)) == 0
-        found = estimated(values, index, seeds, len(order))
+        found = estimate_means(values, index, seeds, len(order))
         points = points.with_columns(
             pl.Series(name, found.mean), pl.Series(f"{name}_half", found.half)
         )
         means.append(found.mean)
     return points.with_columns(
-        pl.Series("complete", complete), pl.Series("front", front(np.column_stack(means), complete))
+        pl.Series("complete", complete),
+        pl.Series("front", is_on_pareto_front(np.column_stack(means), complete)),
     )
 
 
-def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return True at complete points that no other dominates; columns of `values` are minimised."""
+def is_on_pareto_front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return complete points that no other dominates; columns are minimised."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]
@@ -363,10 +364,10 @@ def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def varied_factors(study: Study) -> list[Factor]:
-    return [factor for factor in study.factors if len(factor.listed()) > 1]
+    return [factor for factor in study.factors if len(factor.listed_values()) > 1]
 
 
-def numbers(rows: pl.DataFrame, measure: str) -> Array:
+def measure_values(rows: pl.DataFrame, measure: str) -> Array:
     """Return the values (N,) of a measure in all rows; nan where missing."""
     import polars as pl
 

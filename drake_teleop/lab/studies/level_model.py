@@ -26,11 +26,10 @@ NOT_COMPARABLE = "not comparable with the others"
 TOO_FEW = "too few points"
 
 
-def comparable(there: Flags) -> tuple[Flags, Flags]:
-    """Return the rows and columns of the largest complete block of a table with missing values.
+def largest_complete_block(there: Flags) -> tuple[Flags, Flags]:
+    """Return rows and columns of the largest complete block.
 
-    `there` (rows, columns) is True where a level (row) has a value at a combination of the other
-    factors (column).
+    `there` is True where a level (row) has a value at a combination (column).
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
@@ -39,7 +38,9 @@ def comparable(there: Flags) -> tuple[Flags, Flags]:
     return rows, columns
 
 
-def reasons(compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]) -> list[str]:
+def missing_value_reasons(
+    compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]
+) -> list[str]:
     """Return for each level or cell why it has no value; "" where `compared` is True."""
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
@@ -75,7 +76,7 @@ class Levels:
 
 def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
     """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
-    listed = factor.listed()
+    listed = factor.listed_values()
     places = np.array([factor.coordinates(value) for value in column])
     if factor.low is not None and factor.high is not None and any(v not in listed for v in column):
         share = places[:, 0]
@@ -113,8 +114,8 @@ class LevelModel:
     X: Array
     solve: Array
 
-    def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the same as `Factorial.compared`, with a matrix from coefficients to means."""
+    def comparable_levels(self, *shown: int) -> tuple[Flags, Flags, Array]:
+        """Return the same as in `Factorial`, with a matrix from coefficients to means."""
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
         shape = [len(self.factors[factor].names) for factor in factors]
@@ -123,22 +124,28 @@ class LevelModel:
         for (i, j), failed in self.failed.items():
             there &= ~failed[at[i], at[j]]
         count = math.prod(shape[: len(shown)])
-        rows, columns = comparable(there.reshape(count, -1))
-        terms = self._terms(at).reshape(count, -1, self.X.shape[1])
+        rows, columns = largest_complete_block(there.reshape(count, -1))
+        terms = self._regression_terms(at).reshape(count, -1, self.X.shape[1])
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
         """Return per factor the effects and half widths, which hold together (Bonferroni)."""
-        means = [self.compared(factor)[2] for factor in range(len(self.factors))]
+        means = [self.comparable_levels(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
         num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
-        coefficients, design = self.solve @ table.mean(axis=1), self._design(table, num_effects)
+        coefficients, design = (
+            self.solve @ table.mean(axis=1),
+            self._half_width_over_points(table, num_effects),
+        )
         effects, halves = [], []
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
             effects.append(terms @ coefficients)
             halves.append(
-                np.hypot(design * self._spread(terms), self._half_width_over_seeds(table, terms))
+                np.hypot(
+                    design * self._relative_deviations(terms),
+                    self._half_width_over_seeds(table, terms),
+                )
             )
         return effects, halves
 
@@ -147,10 +154,12 @@ class LevelModel:
         each = terms @ self.solve @ table
         if seeds == 1:
             return each[:, 0], np.full(len(each), np.nan)
-        over_seeds = _quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
-        return each.mean(axis=1), np.hypot(self._design(table, 1) * self._spread(terms), over_seeds)
+        over_seeds = _student_quantile(1, seeds - 1) * each.std(axis=1, ddof=1) / np.sqrt(seeds)
+        return each.mean(axis=1), np.hypot(
+            self._half_width_over_points(table, 1) * self._relative_deviations(terms), over_seeds
+        )
 
-    def _terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
+    def _regression_terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
         count = len(next(iter(at.values())))
         terms, first = np.zeros((count, self.X.shape[1])), 1
         terms[:, 0] = 1.0
@@ -161,25 +170,25 @@ class LevelModel:
         for (i, j), columns in self.products.items():
             if i in at and j in at:
                 a, b = self.factors[i].middles[at[i]], self.factors[j].middles[at[j]]
-                terms[:, columns] = _products(a, b)
+                terms[:, columns] = _column_products(a, b)
         return terms
 
     @property
-    def _freedom(self) -> int:
+    def _degrees_of_freedom(self) -> int:
         return self.X.shape[0] - self.X.shape[1]
 
     def _residual_variance(self, table: Array, columns: int) -> float:
         residuals = table - self.X @ (self.solve @ table)
         # Lower bound by rounding errors for exact fits.
         least = (1e-10 * np.abs(table).max()) ** 2
-        return max(float(np.sum(residuals**2)) / (columns * self._freedom), least)
+        return max(float(np.sum(residuals**2)) / (columns * self._degrees_of_freedom), least)
 
-    def _spread(self, terms: Array) -> Array:
+    def _relative_deviations(self, terms: Array) -> Array:
         return np.linalg.norm(terms @ self.solve, axis=1)
 
-    def _design(self, table: Array, together: int) -> float:
+    def _half_width_over_points(self, table: Array, together: int) -> float:
         variance = self._residual_variance(table.mean(axis=1, keepdims=True), 1)
-        return _quantile(together, self._freedom) * float(np.sqrt(variance))
+        return _student_quantile(together, self._degrees_of_freedom) * float(np.sqrt(variance))
 
     def _half_width_over_seeds(self, table: Array, terms: Array) -> float:
         seeds = table.shape[1]
@@ -187,9 +196,11 @@ class LevelModel:
             return 0.0
         apart = table - table.mean(axis=1, keepdims=True)
         moved = np.sum((terms @ self.solve @ apart) ** 2) / (seeds - 1)
-        noise = self._residual_variance(apart, seeds - 1) * np.sum(self._spread(terms) ** 2)
+        noise = self._residual_variance(apart, seeds - 1) * np.sum(
+            self._relative_deviations(terms) ** 2
+        )
         deviation = np.sqrt(max(moved - noise, 0.0) / len(terms) / seeds)
-        return _quantile(len(self.factors), seeds - 1) * float(deviation)
+        return _student_quantile(len(self.factors), seeds - 1) * float(deviation)
 
 
 def level_model(
@@ -201,13 +212,13 @@ def level_model(
 ) -> LevelModel | None:
     """Return a regression model that the points determine, or None.
 
-    `known` (n,) is True where the measure has a value; `by_chance` is True if combinations of
-    levels without points are missing by chance.
+    `known` (n,): the measure has a value; `by_chance`: combinations without points are missing by
+    chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:
         levels = [levels_of(f, c, parts) for f, c in zip(factors, columns, strict=True)]
-        model = _model(levels, products, known, by_chance)
+        model = _build_model(levels, products, known, by_chance)
         if model is not None:
             found = model
             if model.X.shape[1] <= len(model.X) / 2:
@@ -215,18 +226,18 @@ def level_model(
     return found
 
 
-def _model(
+def _build_model(
     factors: list[Levels], products: bool, known: Flags, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
     failed = _failed_cells(factors, known, by_chance)
-    codes = [_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
+    codes = [_effect_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
     columns = [np.ones((points, 1))]
     columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
     columns += [f.within[known, None] for f in factors if f.within is not None]
     places, first = {}, sum(column.shape[1] for column in columns)
     for i, j in itertools.combinations(range(len(factors)), 2) if products else ():
-        pair = _products(factors[i].centred[known], factors[j].centred[known])
+        pair = _column_products(factors[i].centred[known], factors[j].centred[known])
         places[i, j] = slice(first, first := first + pair.shape[1])
         columns.append(pair)
     X = np.hstack(columns)
@@ -259,17 +270,17 @@ def _failed_cells(
     return found
 
 
-def _products(a: Array, b: Array) -> Array:
+def _column_products(a: Array, b: Array) -> Array:
     return np.einsum("ni,nj->nij", a, b).reshape(len(a), -1)
 
 
-def _codes(count: int, present: NDArray[np.int64]) -> Array:
+def _effect_codes(count: int, present: NDArray[np.int64]) -> Array:
     codes = np.zeros((count, len(present) - 1))
     codes[present[:-1]], codes[present[-1]] = np.eye(len(present) - 1), -1.0
     return codes
 
 
-def _quantile(together: int, freedom: int) -> float:
+def _student_quantile(together: int, freedom: int) -> float:
     return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2 / together))
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drake_teleop.station.scenario import Scenario
 
 
-def _peak(forces: Array) -> float:
+def _peak_force(forces: Array) -> float:
     return float(np.linalg.norm(forces, axis=1).max(initial=0.0))
 
 
@@ -26,7 +26,7 @@ def _force_to_master(result: SimulationResult) -> Array:
 def _peak_contact_force(result: SimulationResult, threshold: float) -> float:
     if "true_contact_wrench_W" not in result:
         return 0.0
-    return _peak(result["true_contact_wrench_W"][:, :3])
+    return _peak_force(result["true_contact_wrench_W"][:, :3])
 
 
 def _hand_work(result: SimulationResult, threshold: float) -> float:
@@ -40,9 +40,9 @@ def _time_above(result: SimulationResult, threshold: float) -> float:
 
 
 #: Measures of every run, from its signals and the study's `force_threshold` [N].
-_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
+_MEASURES_OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
     # Largest displayed force.
-    "peak_force_to_master_N": lambda result, _: _peak(_force_to_master(result)),
+    "peak_force_to_master_N": lambda result, _: _peak_force(_force_to_master(result)),
     "rms_force_to_master_N": lambda result, _: float(
         np.sqrt(np.mean(np.sum(_force_to_master(result) ** 2, axis=1)))
     ),
@@ -56,20 +56,20 @@ _OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
 
 
 #: Names of all measures; for those of tasks see `task_measures.py`.
-MEASURES = (*_OF_EVERY_RUN, *TASK_MEASURES)
+MEASURES = (*_MEASURES_OF_EVERY_RUN, *TASK_MEASURES)
 
 
 def default_measures() -> list[str]:
     """Return the names of the measures of every scenario, with or without a task."""
-    return list(_OF_EVERY_RUN)
+    return list(_MEASURES_OF_EVERY_RUN)
 
 
-def measured(
+def evaluate_measures(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
     """Return the measures `names` of one run; `force_threshold` in N."""
-    own = [name for name in names if name in _OF_EVERY_RUN]
-    found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}
+    own = [name for name in names if name in _MEASURES_OF_EVERY_RUN]
+    found = {name: _MEASURES_OF_EVERY_RUN[name](result, force_threshold) for name in own}
     if len(own) < len(names):
         from drake_teleop.station.task_measures import task_measures
 

@@ -16,7 +16,13 @@ from drake_teleop.common.files import write_picture
 from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.studies import effects
 from drake_teleop.lab.studies.design import Study
-from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied_factors
+from drake_teleop.lab.studies.effects import (
+    PARETO,
+    measure_values,
+    pair_means,
+    pareto_table,
+    varied_factors,
+)
 from drake_teleop.lab.studies.level_model import (
     CONFIDENCE,
     NO_RUN,
@@ -38,13 +44,13 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
     """Write the pictures that apply to a study into `out`; delete all other PNG files there."""
     for old in out.glob("*.png"):
         old.unlink()
-    measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]
+    measures = [name for name in study.measures if np.isfinite(measure_values(rows, name)).any()]
     pictures: dict[str, Figure | None] = {}
     if measures and varied_factors(study):
-        pictures["main_effects"] = main_effects(study, rows, measures)
+        pictures["main_effects"] = draw_main_effects(study, rows, measures)
         if len(varied_factors(study)) > 1:
-            pictures |= {f"interactions_{m}": interactions(study, rows, m) for m in measures}
-    pictures["pareto"] = pareto_front(study, rows)
+            pictures |= {f"interactions_{m}": draw_interactions(study, rows, m) for m in measures}
+    pictures["pareto"] = draw_pareto_front(study, rows)
     written = []
     for name, picture in pictures.items():
         if picture is not None:
@@ -53,7 +59,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
     return written
 
 
-def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
+def draw_main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
     factors, fitted, reasons = varied_factors(study), False, set[str]()
     with plot_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
@@ -70,7 +76,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
         for axes, factor in zip(grid[-1], factors, strict=True):
             axes.set_xlabel(factor.field)
         figure.suptitle(f"Main effects{_effects_caption(study, fitted)}", x=0.01, ha="left")
-        _legend(figure, reasons)
+        _draw_reason_legend(figure, reasons)
     return figure
 
 
@@ -81,7 +87,7 @@ def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
     _label_levels(axes, found.names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
-        bar = _hatched(found.why[level], (level - 0.5, 0.0))
+        bar = _hatched_cell(found.why[level], (level - 0.5, 0.0))
         bar.set_transform(axes.get_xaxis_transform())
         axes.add_patch(bar)
     if np.isnan(found.mean).all():
@@ -105,18 +111,18 @@ def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str
     return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
 
 
-def _hatched(why: str, corner: tuple[float, float]) -> Rectangle:
+def _hatched_cell(why: str, corner: tuple[float, float]) -> Rectangle:
     return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
 
 
-def _legend(figure: Figure, reasons: Iterable[str]) -> None:
+def _draw_reason_legend(figure: Figure, reasons: Iterable[str]) -> None:
     names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
     if names:
-        patches = [_hatched(why, (0.0, 0.0)) for why in names]
+        patches = [_hatched_cell(why, (0.0, 0.0)) for why in names]
         figure.legend(patches, names, loc="outside lower left", ncols=len(names))
 
 
-def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
+def draw_interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
     maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None
@@ -129,7 +135,7 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
         for axes, found in zip(grid.ravel(), maps, strict=False):
             drawn = axes.imshow(found.mean, origin="lower", aspect="auto", vmin=low, vmax=high)
             for row, column in np.argwhere(np.isnan(found.mean)):
-                axes.add_patch(_hatched(found.why[row, column], (column - 0.5, row - 0.5)))
+                axes.add_patch(_hatched_cell(found.why[row, column], (column - 0.5, row - 0.5)))
             axes.grid(False)
             _label_levels(axes, found.names[1])
             axes.set_yticks(range(len(found.names[0])), found.names[0])
@@ -141,13 +147,13 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
         figure.colorbar(drawn, ax=grid, label=measure)
         words = ", fitted: levels of each, and products" if maps[0].fitted else ""
         figure.suptitle(f"Interactions: mean of {measure}{words}", x=0.01, ha="left")
-        _legend(figure, set().union(*(found.why.ravel() for found in maps)))
+        _draw_reason_legend(figure, set().union(*(found.why.ravel() for found in maps)))
     return figure
 
 
-def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
+def draw_pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     """Draw effort over time and over force overshoot; return None without complete points."""
-    points = pareto(study, rows)
+    points = pareto_table(study, rows)
     if points is None or not points["complete"].any():
         return None
     points = points.filter("complete")

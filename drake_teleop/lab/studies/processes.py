@@ -1,7 +1,7 @@
 """Execution of a study's runs by processes of this machine, Dask workers or a custom executor.
 
-If a run ends its process, the rows of its chunk are run one by one; a row that ends its process
-again gets an error. With one job, this ends the study.
+If a run ends its process, its chunk runs row by row; a row that ends it again gets an error. With
+one job, this ends the study.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Run: TypeAlias = Callable[[Chunk], Chunk]
 
 
 @dataclass(frozen=True)
-class Processes:
+class RunExecutor:
     """Executor of runs; `rows_of` yields finished chunks (groups of rows) with results."""
 
     count: int
@@ -38,9 +38,9 @@ _PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 
 
 @contextmanager
-def processes(
+def open_executor(
     store: Store, jobs: int, cluster: str | None, executor: Executor | None
-) -> Iterator[Processes]:
+) -> Iterator[RunExecutor]:
     """Start `jobs` processes, a Dask cluster or a custom executor for the context.
 
     `cluster` is the address of a Dask scheduler, or "local"; `executor` remains open.
@@ -52,7 +52,7 @@ def processes(
                 where="executor",
                 remedy="pass a ProcessPoolExecutor, for instance",
             )
-        yield Processes(
+        yield RunExecutor(
             getattr(executor, "_max_workers", max(jobs, 1)),
             lambda run, chunks: _run_by_executor(run, chunks, executor),
         )
@@ -60,14 +60,14 @@ def processes(
     if cluster is None:
         from joblib import effective_n_jobs
 
-        yield Processes(
+        yield RunExecutor(
             effective_n_jobs(jobs), lambda run, chunks: _run_locally(run, chunks, store, jobs)
         )
         return
-    with _client(cluster, jobs) as client:
+    with _open_dask_client(cluster, jobs) as client:
         _check_versions(client)
         workers = sum(client.nthreads().values())
-        yield Processes(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
+        yield RunExecutor(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
 
 def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
@@ -75,26 +75,26 @@ def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> 
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
     while left:
-        marked = store.marked(suspicious)
+        marked = store.chunks_started_at_least(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
                 yield _run_alone(run, chunk, store)
         left = [chunk for chunk in left if chunk[0]["run"] not in marked]
         done: set[int] = set()
         try:
-            for found in _parallel(jobs)(_task(run, chunk, store) for chunk in left):
+            for found in _joblib_pool(jobs)(_delayed_task(run, chunk, store) for chunk in left):
                 done.add(found[0]["run"])
                 yield found
         except BrokenExecutor as error:
             suspicious = 1
-            if not store.marked(suspicious):
+            if not store.chunks_started_at_least(suspicious):
                 raise DrakeTeleopError(
                     f"processes ended before their first run ({error})"
                 ) from error
         left = [chunk for chunk in left if chunk[0]["run"] not in done]
 
 
-def _parallel(jobs: int) -> Any:
+def _joblib_pool(jobs: int) -> Any:
     from joblib import Parallel
 
     # joblib also warns when it replaces processes that use much memory; a crash raises an error.
@@ -105,15 +105,15 @@ def _parallel(jobs: int) -> Any:
         return_as="generator_unordered",
         # Batches of chunks would leave processes idle at the end.
         batch_size=1,
-        initializer=_end_with_parent,
+        initializer=_exit_when_parent_ends,
         initargs=(os.getpid(),),
     )
 
 
-def _task(run: Run, chunk: Chunk, store: Store) -> Any:
+def _delayed_task(run: Run, chunk: Chunk, store: Store) -> Any:
     from joblib import delayed
 
-    return delayed(_run_marked)(run, chunk, store)
+    return delayed(_run_and_count_start)(run, chunk, store)
 
 
 def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
@@ -121,32 +121,32 @@ def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
     for row in chunk:
         try:
             # With one job joblib would run it in this process.
-            found += next(_parallel(2)([_task(run, [row], store)]))
+            found += next(_joblib_pool(2)([_delayed_task(run, [row], store)]))
         except BrokenExecutor:
             found.append(row | {"error": PROCESS_ENDED})
-    store.unmark(chunk[0]["run"])
+    store.clear_starts(chunk[0]["run"])
     return found
 
 
-def _run_marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
-    store.mark(chunk[0]["run"])
+def _run_and_count_start(run: Run, chunk: Chunk, store: Store) -> Chunk:
+    store.count_start(chunk[0]["run"])
     try:
         return run(chunk)
     finally:
-        store.unmark(chunk[0]["run"])
+        store.clear_starts(chunk[0]["run"])
 
 
-def _end_with_parent(parent: int) -> None:
-    def watch() -> None:
+def _exit_when_parent_ends(parent: int) -> None:
+    def wait_for_parent() -> None:
         while os.getppid() == parent:
             time.sleep(_PARENT_CHECK_S)
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=wait_for_parent, daemon=True).start()
 
 
 @contextmanager
-def _client(address: str, jobs: int) -> Iterator[Any]:
+def _open_dask_client(address: str, jobs: int) -> Iterator[Any]:
     try:
         import dask
         from distributed import Client
@@ -195,22 +195,22 @@ def _run_by_executor(run: Run, chunks: Sequence[Chunk], executor: Executor) -> I
 
 
 def _check_versions(client: Any) -> None:
-    for worker, found in client.run(_version_reader(), on_error="return").items():
+    for worker, found in client.run(_make_version_reader(), on_error="return").items():
         if found != __version__:
-            raise _wrong_version(worker, found, __version__)
+            raise _version_error(worker, found, __version__)
 
 
-def _version_reader() -> Callable[[], str]:
+def _make_version_reader() -> Callable[[], str]:
     # Dask sends a nested function as code, so that a worker of any version can execute it.
-    def version() -> str:
+    def read_version() -> str:
         from drake_teleop.common.version import __version__ as found
 
         return found
 
-    return version
+    return read_version
 
 
-def _wrong_version(worker: str, found: Any, expected: str) -> DrakeTeleopError:
+def _version_error(worker: str, found: Any, expected: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         f"worker {worker} has drake_teleop {found}, this process has {expected}",
         where="--cluster",
@@ -218,15 +218,15 @@ def _wrong_version(worker: str, found: Any, expected: str) -> DrakeTeleopError:
     )
 
 
-def _on_same_version(run: Run) -> Run:
+def _check_version_before_run(run: Run) -> Run:
     """Return `run` with a check of the version, for workers that join later."""
-    version, expected = _version_reader(), __version__
+    version, expected = _make_version_reader(), __version__
 
     def run_on_same_version(chunk: Chunk) -> Chunk:
         from distributed import get_worker
 
         if (found := version()) != expected:
-            raise _wrong_version(get_worker().address, found, expected)
+            raise _version_error(get_worker().address, found, expected)
         return run(chunk)
 
     return run_on_same_version
@@ -235,14 +235,14 @@ def _on_same_version(run: Run) -> Run:
 def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
     from distributed import as_completed
 
-    run = _on_same_version(run)
+    run = _check_version_before_run(run)
     futures = client.map(run, chunks, pure=False)
     chunk_of = dict(zip(futures, chunks, strict=True))
     for future in as_completed(futures):
-        yield _rows_of(future, chunk_of.pop(future), run, client)
+        yield _rows_of_future(future, chunk_of.pop(future), run, client)
 
 
-def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
+def _rows_of_future(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
     from distributed import KilledWorker
 
     try:
@@ -251,5 +251,5 @@ def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
         if len(chunk) == 1:
             return [chunk[0] | {"error": PROCESS_ENDED}]
         alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
-        found = [row for part, rows in alone for row in _rows_of(part, rows, run, client)]
+        found = [row for part, rows in alone for row in _rows_of_future(part, rows, run, client)]
     return found

@@ -21,7 +21,7 @@ from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.design import Study, Values
-from drake_teleop.lab.studies.processes import Chunk, processes
+from drake_teleop.lab.studies.processes import Chunk, open_executor
 from drake_teleop.lab.studies.shards import merge_shards, parse_shard
 from drake_teleop.lab.studies.store import Store, open_store
 
@@ -73,9 +73,13 @@ def run_study(
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
     identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
-    schema = _schema(study, first_rows[0])
+    schema = _table_schema(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
-    chunks = _chunks(first_rows) if part is None else part.chunks(_chunks(first_rows))
+    chunks = (
+        _group_into_chunks(first_rows)
+        if part is None
+        else part.chunks(_group_into_chunks(first_rows))
+    )
     total = sum(map(len, chunks)) if part else study.size() * study.repeats
     with open_store(part.folder(out) if part else out, identity) as store:
         if merge:
@@ -84,19 +88,19 @@ def run_study(
         try:
             with (
                 show_progress(progress) as stage,
-                processes(store, jobs, cluster, executor) as workers,
+                open_executor(store, jobs, cluster, executor) as workers,
             ):
                 counter.start(stage("Study"), workers.count)
                 new = points
                 while new:
-                    finished = store.finished()
+                    finished = store.finished_chunks()
                     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
                     counter.add_earlier_runs(sum(map(len, chunks)) - sum(map(len, left)))
                     for found in workers.rows_of(run, left):
                         _store_rows(store, found, schema)
                         counter.add_finished_runs(found)
-                    new = study.next_points(points, _objective(study, store, len(points)))
-                    chunks = _chunks(study.rows(new, len(points)))
+                    new = study.next_points(points, _objective_of_points(study, store, len(points)))
+                    chunks = _group_into_chunks(study.rows(new, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
             remedy = f"{out} keeps {counter.done} of {counter.total} runs; repeat the command"
@@ -106,14 +110,14 @@ def run_study(
         return store.read()
 
 
-def _chunks(rows: Chunk) -> list[Chunk]:
+def _group_into_chunks(rows: Chunk) -> list[Chunk]:
     size = min(max(len(rows) // _NUM_CHUNKS, 1), _LARGEST_CHUNK)
     chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
     chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
     return chunks
 
 
-def _objective(study: Study, store: Store, points: int) -> Array:
+def _objective_of_points(study: Study, store: Store, points: int) -> Array:
     if not study.objective:
         return np.empty(0)
     import polars as pl
@@ -139,7 +143,7 @@ class StudyProgress:
         self._report()
 
     def add_finished_runs(self, rows: Chunk) -> None:
-        """Count finished runs and their times, for the first ones without `ONE_TIME_COST`."""
+        """Count finished runs and their times."""
         self.done += len(rows)
         for row in rows:
             if _SECONDS in row:  # missing if the run ended its process
@@ -152,11 +156,13 @@ class StudyProgress:
         left, words = self.total - self.done, "the first runs begin"
         if self._recent:
             at_once = min(self._processes, left) or 1
-            words = f"about {_duration(float(np.median(self._recent)) * left / at_once)} left"
+            words = (
+                f"about {_format_duration(float(np.median(self._recent)) * left / at_once)} left"
+            )
         self._progress(self.done / self.total, f"{self.done}/{self.total}, {words}")
 
 
-def _duration(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
@@ -187,7 +193,7 @@ def _store_rows(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]
     store.write(pl.DataFrame(columns, schema=schema))
 
 
-def _schema(study: Study, row: dict[str, Any]) -> dict[str, Any]:
+def _table_schema(study: Study, row: dict[str, Any]) -> dict[str, Any]:
     import polars as pl
 
     vector = pl.List(pl.Float64)

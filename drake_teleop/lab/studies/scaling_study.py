@@ -25,7 +25,7 @@ from drake_teleop.common.files import (
 )
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import COLOURS, Picture, plot_style
-from drake_teleop.lab.studies.effects import estimated, numbers
+from drake_teleop.lab.studies.effects import estimate_means, measure_values
 from drake_teleop.lab.studies.store import Store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 
@@ -45,7 +45,7 @@ _MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class ScaleRating:
     """Result for one selection of criteria: arrays (s, g) over s values of sigma and g of gamma.
 
     Attributes:
@@ -81,29 +81,29 @@ def scaling_study_command(
             progress=progress, yes=yes,
         )  # fmt: skip
         rows[name] = Store(out / name / "runs.parquet").read()
-    tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
-    sigmas, gammas = _axes()
+    tables = {task: _measure_tables(rows[f"scaling_{task}"], task) for task in TASKS}
+    sigmas, gammas = _scale_axes()
     answers = {
         selection: rate_scales(tables, criteria) for selection, criteria in SELECTIONS.items()
     }
     summary = {
         "runs": sum(table.height for table in rows.values()),
         "choice": {
-            selection: _choice(found, sigmas, gammas) for selection, found in answers.items()
+            selection: _best_scales(found, sigmas, gammas) for selection, found in answers.items()
         },
         "eta": _eta_effects(rows[_OBJECT_STUDY]),
     }
     with output_folder(out, "answer.json"):
         write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
-        write_picture(out / "answer.png", criteria_picture(rows, sigmas, gammas))
-        write_picture(out / "choice.png", choice_picture(answers, sigmas, gammas))
+        write_picture(out / "answer.png", draw_criteria(rows, sigmas, gammas))
+        write_picture(out / "choice.png", draw_best_scales(answers, sigmas, gammas))
         write_json(out / "answer.json", summary)
     if not quiet:
         _print(summary, out)
     return summary
 
 
-def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
+def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> ScaleRating:
     """Return merits, bootstrap intervals and failures for a selection of criteria."""
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
@@ -124,11 +124,11 @@ def rate_scales(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) 
     drawn, best = merits[1:][known[1:]], np.zeros(usable.size)
     if not (usable.any() and known[0] and len(drawn)):
         nothing = np.full(usable.shape, np.nan)
-        return Answer(nothing, nothing, nothing, best.reshape(usable.shape), failures)
+        return ScaleRating(nothing, nothing, nothing, best.reshape(usable.shape), failures)
     flat = np.where(usable, drawn, np.inf).reshape(len(drawn), -1)
     best = np.bincount(flat.argmin(axis=1), minlength=usable.size) / len(drawn)
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
-    return Answer(merits[0], low, high, best.reshape(usable.shape), failures)
+    return ScaleRating(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
 def _relative_means(table: Array, weights: Array) -> Array:
@@ -136,26 +136,26 @@ def _relative_means(table: Array, weights: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
         means = sums / np.einsum("sgk,dk->dsg", known.astype(float), weights)
-    return means / means[:, -1, _reference(), None, None]
+    return means / means[:, -1, _index_of_gamma_1(), None, None]
 
 
-def _axes() -> tuple[list[float], list[float]]:
+def _scale_axes() -> tuple[list[float], list[float]]:
     factors = {factor.field: factor.values for factor in LoadStudy("scaling_touch").factors}
     return factors[_SIGMA], factors[_GAMMA]
 
 
-def _reference() -> int:
-    return _axes()[1].index(1.0)
+def _index_of_gamma_1() -> int:
+    return _scale_axes()[1].index(1.0)
 
 
-def _tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
-    sigmas, gammas = _axes()
+def _measure_tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
+    sigmas, gammas = _scale_axes()
     seeds = rows["seed"].n_unique()
     count = len(gammas) if _GAMMA in rows.columns else 1
     measures = {"success": "success"} | {name: CRITERIA[name] for name in TASKS[task]}
     tables = {}
     for name, measure in measures.items():
-        values = numbers(rows, measure)
+        values = measure_values(rows, measure)
         if name == "success":
             values = np.nan_to_num(values)
         shaped = values.reshape(len(sigmas), count, seeds)
@@ -163,7 +163,9 @@ def _tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _choice(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str, Any] | None:
+def _best_scales(
+    found: ScaleRating, sigmas: list[float], gammas: list[float]
+) -> dict[str, Any] | None:
     if not np.isfinite(found.merit).any():
         return None
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
@@ -183,7 +185,7 @@ def _choice(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str
 
 
 def _merit_table(
-    answers: dict[str, Answer], sigmas: list[float], gammas: list[float]
+    answers: dict[str, ScaleRating], sigmas: list[float], gammas: list[float]
 ) -> pl.DataFrame:
     import polars as pl
 
@@ -211,7 +213,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     seeds = rows["seed"].to_numpy()
     table: list[dict[str, Any]] = [{"eta": eta} for eta in etas]
     for measure in ("success", *CRITERIA.values(), "detection_time_s"):
-        found = estimated(numbers(rows, measure), levels, seeds, len(etas))
+        found = estimate_means(measure_values(rows, measure), levels, seeds, len(etas))
         for index, row in enumerate(table):
             figures = (found.mean[index], found.half[index], found.effect_half[index])
             names = (measure, f"{measure}_half", f"{measure}_effect_half")
@@ -219,7 +221,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     return table
 
 
-def criteria_picture(
+def draw_criteria(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
     tasks = [task for task in TASKS if "force" in TASKS[task]]
@@ -230,7 +232,9 @@ def criteria_picture(
             table = rows[f"scaling_{task}"]
             levels, seeds = table["point"].to_numpy(), table["seed"].to_numpy()
             for axes, measure in zip(line, CRITERIA.values(), strict=True):
-                found = estimated(numbers(table, measure), levels, seeds, levels.max() + 1)
+                found = estimate_means(
+                    measure_values(table, measure), levels, seeds, levels.max() + 1
+                )
                 means, bars = (a.reshape(-1, len(gammas)) for a in (found.mean, found.effect_half))
                 for j, gamma in enumerate(gammas):
                     axes.errorbar(
@@ -245,7 +249,9 @@ def criteria_picture(
     return figure
 
 
-def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> Figure:
+def draw_best_scales(
+    answers: dict[str, ScaleRating], sigmas: list[float], gammas: list[float]
+) -> Figure:
     known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])
     farthest = np.abs(np.log2(known)).max(initial=0.01)
     # The colour scale is symmetric about 1 in ratios; excluded points are grey.
@@ -278,7 +284,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
     return figure
 
 
-def _cell_text(found: Answer, i: int, j: int) -> str:
+def _cell_text(found: ScaleRating, i: int, j: int) -> str:
     if not np.isfinite(found.merit[i, j]):
         return f"{found.failures[i, j]:.0%} fail"
     best = f"\nbest: {found.best[i, j]:.0%}" if found.best[i, j] >= 0.005 else ""

@@ -51,7 +51,7 @@ def parse_shard(text: str) -> Shard:
 
 
 def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list[Chunk]) -> None:
-    """Link the parts of all shards in `out` into its table, which then has the bytes of one run."""
+    """Link the parts of all shards in `out` into its table."""
     names = [_FOLDER.fullmatch(path.name) for path in (out / "shards").glob("*")]
     shards = [Shard(int(name[1]), int(name[2])) for name in names if name]
     if not shards:
@@ -60,9 +60,9 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         folder = shard.folder(out)
         check_identity(folder, identity)
         for part in Store(folder / "runs.parquet").parts():
-            _link(part, store.folder / part.name, store.folder)
+            _link_file(part, store.folder / part.name, store.folder)
     store.remove_damaged_parts()
-    finished = store.finished()
+    finished = store.finished_chunks()
     missing = [k for k, chunk in enumerate(chunks) if chunk[0]["run"] not in finished]
     if missing:
         count = max(shard.total for shard in shards)
@@ -77,7 +77,7 @@ def merge_shards(out: Path, store: Store, identity: dict[str, Any], chunks: list
         )
 
 
-def _link(part: Path, path: Path, aside: Path) -> None:
+def _link_file(part: Path, path: Path, aside: Path) -> None:
     if path.exists():
         return
     with whole_file(path, aside=aside) as temporary:

@@ -30,7 +30,7 @@ class Store:
 
     folder: Path
 
-    def finished(self) -> set[int]:
+    def finished_chunks(self) -> set[int]:
         """Return the first run of each stored chunk."""
         return set(map(_first_run, self.parts()))
 
@@ -48,24 +48,24 @@ class Store:
     def write(self, rows: pl.DataFrame) -> None:
         write_table(self.folder / _PART.format(rows["run"][0]), rows, aside=self.folder)
 
-    def mark(self, run: int) -> None:
+    def count_start(self, run: int) -> None:
         """Count one more start of the chunk whose first run is `run`."""
-        path = self._marks / str(run)
+        path = self._start_counts_folder / str(run)
         with wrap_write_errors(path):
-            self._marks.mkdir(exist_ok=True)
+            self._start_counts_folder.mkdir(exist_ok=True)
             with path.open("ab") as mark:
                 mark.write(b".")
 
-    def unmark(self, run: int) -> None:
-        (self._marks / str(run)).unlink(missing_ok=True)
+    def clear_starts(self, run: int) -> None:
+        (self._start_counts_folder / str(run)).unlink(missing_ok=True)
 
-    def marked(self, times: int) -> set[int]:
+    def chunks_started_at_least(self, times: int) -> set[int]:
         """Return the first runs of unfinished chunks with at least `times` starts."""
-        marks = (mark for mark in self._marks.glob("*") if mark.name.isdecimal())
+        marks = (mark for mark in self._start_counts_folder.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
     @property
-    def _marks(self) -> Path:
+    def _start_counts_folder(self) -> Path:
         return self.folder.with_name("running")
 
     def read(self) -> pl.DataFrame:
@@ -104,15 +104,15 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
     """
     store = Store(out / "runs.parquet")
     make_folder(store.folder)
-    with claimed(out, identity):
+    with locked_folder(out, identity):
         store.remove_damaged_parts()
         yield store
         with suppress(OSError):  # missing, or with marks
-            store._marks.rmdir()
+            store._start_counts_folder.rmdir()
 
 
 @contextmanager
-def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
+def locked_folder(out: Path, identity: dict[str, Any]) -> Iterator[None]:
     """Lock the existing folder `out`; raise an error if its content is from other inputs."""
     handle = os.open(out, os.O_RDONLY)
     try:

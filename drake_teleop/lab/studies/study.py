@@ -16,8 +16,8 @@ from drake_teleop.common.files import output_folder, studies_dir, write_json, wr
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.studies.design import Factor, Study, Values
-from drake_teleop.lab.studies.effects import effects
-from drake_teleop.lab.studies.measures import measured
+from drake_teleop.lab.studies.effects import effects_table
+from drake_teleop.lab.studies.measures import evaluate_measures
 from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
 from drake_teleop.lab.studies.shards import parse_shard
 from drake_teleop.station.scenario import (
@@ -51,15 +51,14 @@ class StationWork:
 
     def scenario(self, values: Values, seed: int) -> Scenario:
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(_with_changes(self.data, changes), self.where)
+        return ScenarioFromData(_apply_changes(self.data, changes), self.where)
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return the measures of one run, and `ONE_TIME_COST` [s]."""
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
         one_time_s = time.monotonic() - start - simulated / run.real_time_factor
-        found = measured(run.result, scenario, self.measures, self.threshold)
+        found = evaluate_measures(run.result, scenario, self.measures, self.threshold)
         return found | {ONE_TIME_COST: max(one_time_s, 0.0)}
 
 
@@ -112,7 +111,7 @@ def study_command(
         if not shard:
             from drake_teleop.lab.studies.pictures import write_pictures
 
-            write_table(out / "effects.csv", effects(study, rows))
+            write_table(out / "effects.csv", effects_table(study, rows))
             write_pictures(study, rows, out)
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -135,12 +134,12 @@ def _scenario_path(study: Study, path: Path) -> str | Path:
 
 def _check_values(factor: Factor, where: str) -> None:
     ranged = factor.low is not None and factor.high is not None
-    for value in (factor.low, factor.high) if ranged else factor.listed():
-        data = _with_changes({}, {factor.field: value})
+    for value in (factor.low, factor.high) if ranged else factor.listed_values():
+        data = _apply_changes({}, {factor.field: value})
         check_ranges(settings_from_data(Scenario, data, where), where)
 
 
-def _with_changes(data: Any, changes: dict[str, Any]) -> Any:
+def _apply_changes(data: Any, changes: dict[str, Any]) -> Any:
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")

@@ -1,4 +1,4 @@
-"""Trials of settings, in the whole station or one axis: a hand swings, presses and holds."""
+"""Trials of settings: a hand swings, presses and holds."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from scipy.optimize import bisect
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.analysis.analyze import sampling_of
-from drake_teleop.lab.analysis.cut_loop import cut_loop, unstable_multipliers
-from drake_teleop.lab.analysis.figures import with_grip
+from drake_teleop.lab.analysis.analyze import sampling_of_scenario
+from drake_teleop.lab.analysis.cut_loop import count_unstable_multipliers, cut_loop
+from drake_teleop.lab.analysis.figures import axis_with_grip
 from drake_teleop.lab.analysis.one_axis import Axis
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario
 from drake_teleop.lab.comparison.delayed_contact import delayed_contact, station_figures
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,
-    figures,
-    operators_intent,
+    figures_of_run,
+    operator_intent,
     run_one_dof,
 )
 from drake_teleop.lab.studies.design import Values
@@ -50,7 +50,7 @@ _SLIP_SPEED_M_S = 1e-3  # m/s, of the leaf; Drake's default
 _LOW_PASS_DELAY = 0.416  # delay of the 4th-order Butterworth filter times its bandwidth
 _MIN_GAMMA, _RESOLUTION = 0.05, 0.03  # smallest gamma; resolution of its logarithm
 _LINEAR_GAMMAS = np.geomspace(_MIN_GAMMA, 200.0, 160)
-AS_GIVEN = "as given"
+KEEP_GAMMA = "as given"
 """Name in place of a method: passivity and scales of the user's scenario."""
 
 
@@ -109,7 +109,7 @@ class StationTrial:
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
         grip, wall = str(values["hand"]), float(values["wall"])  # type: ignore[arg-type]
         scenario = self.given
-        if values["method"] != AS_GIVEN:
+        if values["method"] != KEEP_GAMMA:
             scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base.channel
@@ -156,7 +156,7 @@ class StationTrial:
 
 @dataclass(frozen=True)
 class GammaSearch:
-    """Work of a study: the largest gamma that is stable in one axis at all corners of the set.
+    """Work of a study: the largest stable gamma in one axis at all corners.
 
     `caps`: largest gamma by low-pass [Hz].
     """
@@ -175,7 +175,7 @@ class GammaSearch:
             cap = min(cap, linear)
         shares: dict[float, float] = {}
 
-        def stable(log_gamma: float) -> float:
+        def stability_sign(log_gamma: float) -> float:
             gamma = float(np.exp(log_gamma))
             found = [
                 self.share_in_one_axis(axis, settings, gamma, *c, seed) for c in self.stated.corners
@@ -185,29 +185,32 @@ class GammaSearch:
 
         low, high = np.log(_MIN_GAMMA), np.log(max(cap, _MIN_GAMMA))
         limit = high
-        if stable(high) < 0:
-            limit = bisect(stable, low, high, xtol=_RESOLUTION) if stable(low) > 0 else -np.inf
+        if stability_sign(high) < 0:
+            limit = (
+                bisect(stability_sign, low, high, xtol=_RESOLUTION)
+                if stability_sign(low) > 0
+                else -np.inf
+            )
         accepted = [gamma for gamma, share in shares.items() if share >= MIN_SHARE]
         gamma = max((g for g in accepted if g <= np.exp(limit) * 1.001), default=0.0)
         share = shares.get(gamma, 0.0)
         return {"gamma_limit": gamma, "linear_limit": linear, "share": share}
 
     def _linear_limit(self, axis: Any, settings: Settings) -> float:
-        """Return the largest gamma without a method, from the sampled one-axis loop."""
-        sampling = sampling_of(self.base)
+        sampling = sampling_of_scenario(self.base)
         if sampling.low_pass_hz is not None:
             sampling = dataclasses.replace(sampling, low_pass_hz=settings.low_pass_hz)
         stable = np.ones(len(_LINEAR_GAMMAS), dtype=bool)
         for grip, wall in [*self.stated.corners, (self.stated.hands[0], 0.0)]:
             grid: dict[str, Any] = {"wall_stiffness": wall, "gamma": _LINEAR_GAMMAS}
-            held = dataclasses.replace(with_grip(axis, grip), **grid)
-            stable &= unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
+            held = dataclasses.replace(axis_with_grip(axis, grip), **grid)
+            stable &= count_unstable_multipliers(cut_loop(held, sampling), axis.delay) == 0
         return float(_LINEAR_GAMMAS[: int(np.argmin([*stable, False]))].max(initial=0.0))
 
     def share_in_one_axis(
         self, axis: Axis, settings: Settings, gamma: float, grip: str, wall: float, seed: int
     ) -> float:
-        """Return the rendered share of the contact force; 0 if the axis does not come to rest."""
+        """Return the rendered share of the contact force; 0: unstable."""
         forward, backward = self.base.channel.networks_of_directions()
         hand = GRIP_IMPEDANCES[grip]
         shown = {entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(Axis)}
@@ -223,16 +226,16 @@ class GammaSearch:
             forward,
             dataclasses.replace(backward, delay=backward.delay + added),
             seed=seed,
-            intent=operators_intent(task),
+            intent=operator_intent(task),
         )
-        found = figures(run, model, task)
+        found = figures_of_run(run, model, task)
         hold = (run.t >= task.release - task.judged) & (run.t < task.release)
         quiet = rms_above(run.felt[hold], run.t[1] - run.t[0], REST_BAND_HZ) <= MAX_REST_FORCE_N
         return max(1.0 + found.force_error, 0.0) if found.stable and quiet else 0.0
 
 
 def short_task(round_trip: float) -> Task:
-    """Return the times of a swing, a rest and a press that is held, for a round trip [s]."""
+    """Return the times of swing, rest and held press for a round trip [s]."""
     pressed = 1.8 + 2 * round_trip
     release = pressed + _REST_S + _JUDGED_S + 2 * round_trip
     return Task(

@@ -18,7 +18,7 @@ from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.lab.studies.design import Factor, Study, Value
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
-    AS_GIVEN,
+    KEEP_GAMMA,
     MAX_REST_FORCE_N,
     MIN_SHARE,
     SEARCH_MEASURES,
@@ -45,7 +45,7 @@ Execute = Callable[[str, Study, Any], list[Row]]
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """Result of the search.
 
     Attributes:
@@ -62,17 +62,21 @@ class Found:
     limits: list[Row]
 
 
-def search_settings(trial: StationTrial, execute: Execute) -> Found:
+def search_settings(trial: StationTrial, execute: Execute) -> SearchResult:
     """Return the stable settings with the smallest detection threshold."""
     base, stated = trial.base, trial.stated
     own = base.wrist_sensor.bandwidth_hz
     ends = list(dict.fromkeys((stated.hands[0], stated.hands[-1])))
     stiffest = stated.walls[1]
     given = execute(
-        "as_given", _study([AS_GIVEN], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES), trial
+        "as_given",
+        _study_of_lists([KEEP_GAMMA], 1.0, 0.0, own, ends, [stiffest], TRIAL_MEASURES),
+        trial,
     )
     quiet = execute(
-        "noise", _study(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES), trial
+        "noise",
+        _study_of_lists(["ledger"], 1.0, 0.0, own, ends[-1:], [stiffest], TRIAL_MEASURES),
+        trial,
     )
     noise = max(quiet[0]["rest_force_N"], 1e-9)  # N at gamma = 1
     low_passes = [own]
@@ -109,8 +113,8 @@ def search_settings(trial: StationTrial, execute: Execute) -> Found:
         )
     _, chosen, inside = found[0]
     walls = [stiffest, *(factor * stiffest for factor in WALL_FACTORS)]
-    limits = execute("limits", _study_of(dataclasses.asdict(chosen), ends, walls), trial)
-    return Found(chosen, search, given, inside, limits)
+    limits = execute("limits", _study_of_settings(dataclasses.asdict(chosen), ends, walls), trial)
+    return SearchResult(chosen, search, given, inside, limits)
 
 
 def _best_of_each_method(search: list[Row]) -> list[Row]:
@@ -124,19 +128,18 @@ def _best_of_each_method(search: list[Row]) -> list[Row]:
 def _station_limit(
     settings: Settings, trial: StationTrial, execute: Execute
 ) -> tuple[float, list[Row]]:
-    """Return the largest gamma that is stable in the station with the margin, and its rows."""
     margin, ends = trial.stated.requirements.margin, [c[0] for c in trial.stated.corners]
     hands = list(dict.fromkeys(ends))
     tries = 0
 
-    def rows_at(gamma: float) -> list[Row]:
+    def run_at_gamma(gamma: float) -> list[Row]:
         nonlocal tries
         tried = dataclasses.asdict(settings) | {"gamma": margin * gamma}
         rows: list[Row] = []
         # The stiffest wall first: it fails more often.
         for wall in dict.fromkeys(trial.stated.walls[::-1]):
             name = f"station_{settings.method}_{tries}_{wall:.0f}"
-            rows += execute(name, _study_of(tried, hands, [wall]), trial)
+            rows += execute(name, _study_of_settings(tried, hands, [wall]), trial)
             if not all(meets_requirements(row, margin) for row in rows):
                 rows = []
                 break
@@ -145,7 +148,7 @@ def _station_limit(
 
     gamma, failed, inside = settings.gamma, 0.0, []
     for _ in range(1 + _HALVINGS):
-        inside = rows_at(gamma)
+        inside = run_at_gamma(gamma)
         if inside:
             break
         gamma, failed = gamma / 2, gamma
@@ -153,7 +156,7 @@ def _station_limit(
         return gamma, []
     while failed > _BISECTION_RATIO * gamma:
         middle = float(np.sqrt(gamma * failed))
-        if rows := rows_at(middle):
+        if rows := run_at_gamma(middle):
             gamma, inside = middle, rows
         else:
             failed = middle
@@ -161,21 +164,21 @@ def _station_limit(
 
 
 def meets_requirements(row: Mapping[str, Any], margin: float = 1.0) -> bool:
-    """Return True if the station comes to rest, is quiet, and renders the contact force."""
+    """Return whether a run comes to rest, is quiet and renders the contact force."""
     quiet = row["rest_force_N"] <= margin * MAX_REST_FORCE_N
     return bool(row["rests"] and quiet and row["share"] >= MIN_SHARE)
 
 
-def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
-    """Return a function that runs or continues a named study in a folder of `out`."""
+def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> Execute:
+    """Return a function that runs a named study in a folder of `out`."""
 
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:
 
-            def named(_: str) -> UpdateProgress:
+            def name_progress(_: str) -> UpdateProgress:
                 return stage(f"Trials {name}")
 
-            found = run_study(study, out / name, work, basis, jobs=jobs, progress=named)
+            found = run_study(study, out / name, work, basis, jobs=jobs, progress=name_progress)
         for row in found.rows(named=True):
             if row["error"]:
                 raise DrakeTeleopError(str(row["error"]), where=f"tune:{name}")
@@ -185,7 +188,6 @@ def studies_in(out: Path, basis: dict[str, Any], jobs: int, progress: bool) -> E
 
 
 def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -> Row:
-    """Return the row with gamma, reduced by the margin, and the predicted detection threshold."""
     gamma = row["gamma_limit"] / trial.stated.requirements.margin
     human, scale = trial.base.operator.perception, trial.base.force_scaling.force_scale
     masked = row["sigma_inertia"] * scale * _load_force(trial)
@@ -197,17 +199,18 @@ def _with_threshold(row: Row, trial: StationTrial, noises: dict[float, float]) -
 
 
 def _load_force(trial: StationTrial) -> float:
-    """Return the rms of the load's inertial force in the swing of the trial [N]."""
     amplitude, frequency = 0.02, 2 * np.pi * 1.5  # as `delayed_contact`
     return float(trial.estimate[6] * amplitude * frequency**2 / np.sqrt(2))
 
 
-def _study_of(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
+def _study_of_settings(settings: dict[str, Any], hands: list[str], walls: list[float]) -> Study:
     gamma, sigma, low_pass = (settings[key] for key in ("gamma", "sigma_inertia", "low_pass_hz"))
-    return _study([settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES)
+    return _study_of_lists(
+        [settings["method"]], gamma, sigma, low_pass, hands, walls, TRIAL_MEASURES
+    )
 
 
-def _study(
+def _study_of_lists(
     methods: list[str],
     gamma: float,
     sigma: float,

@@ -22,7 +22,12 @@ from drake_teleop.common.progress import show_progress
 from drake_teleop.common.style import BLACK, COLOURS, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.lab.tuning.press_trial import Settings, StationTrial
-from drake_teleop.lab.tuning.search import Found, meets_requirements, search_settings, studies_in
+from drake_teleop.lab.tuning.search import (
+    SearchResult,
+    make_study_executor,
+    meets_requirements,
+    search_settings,
+)
 from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
@@ -74,7 +79,7 @@ def tune(
         "stated": dataclasses.asdict(stated),
         "estimate": load.estimate.tolist(),
     }
-    found = search_settings(trial, studies_in(out, basis, jobs, shown))
+    found = search_settings(trial, make_study_executor(out, basis, jobs, shown))
     tuned = dataclasses.replace(
         replace(found.settings.apply(base, stated), simulation=given.simulation),
         operator=given.operator,
@@ -102,7 +107,7 @@ def tune(
 
 
 def _summary(
-    found: Found, tuned: Scenario, stated: StatedSet, network: str | None
+    found: SearchResult, tuned: Scenario, stated: StatedSet, network: str | None
 ) -> dict[str, Any]:
     at_edge = [row for row in found.limits if row["wall"] <= stated.walls[1]]
     scale = tuned.force_scaling.force_scale
@@ -130,13 +135,13 @@ def _summary(
         "settings": settings,
         "stated": about,
         "figures": figures,
-        "sentences": _sentences(found.settings, figures, about, scale),
+        "sentences": _result_sentences(found.settings, figures, about, scale),
         "search": found.search,
         "trials": [*found.given, *found.inside, *found.limits],
     }
 
 
-def _sentences(
+def _result_sentences(
     chosen: Settings, figures: dict[str, Any], about: dict[str, Any], scale: float
 ) -> list[str]:
     low, high = (1e-3 * wall for wall in about["walls"])
@@ -165,7 +170,7 @@ def _sentences(
     return [*lines, last]
 
 
-def draw_trade_off(found: Found, summary: dict[str, Any]) -> Figure:
+def draw_trade_off(found: SearchResult, summary: dict[str, Any]) -> Figure:
     """Draw the detection threshold against the margin of gamma for each method."""
     with plot_style():
         figure = Picture(figsize=(6.4, 4.0))

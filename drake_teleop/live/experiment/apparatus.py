@@ -17,8 +17,8 @@ from drake_teleop.live.experiment.design import (
     Task,
 )
 from drake_teleop.live.experiment.procedure import IntervalResult
-from drake_teleop.live.inputs import OWN, RANGES, Inputs
-from drake_teleop.live.scenarios import adapted_estimate, chosen_scenario, live_scenario
+from drake_teleop.live.inputs import AS_IN_SCENARIO, RANGES, Inputs
+from drake_teleop.live.scenarios import adapt_estimate, chosen_scenario, live_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -49,7 +49,7 @@ class Apparatus:
     load: IdentifiedLoad | None
     mass: float
 
-    def inputs(self, level: float, pressed: float) -> dict[str, int]:
+    def stimulus_inputs(self, level: float, pressed: float) -> dict[str, int]:
         """Return a stimulus's scales [%]: sigma and sigma_object of the load, gamma of contact.
 
         `level` is a force [N] or mass [kg], `pressed` the expected contact force [N].
@@ -66,9 +66,11 @@ class Apparatus:
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
         return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
 
-    def result(self, shown: float, inputs: dict[str, int], rows: IntervalLog) -> IntervalResult:
+    def interval_result(
+        self, shown: float, inputs: dict[str, int], rows: IntervalLog
+    ) -> IntervalResult:
         """Return the result of an interval; `shown` is the intended level, 0 without stimulus."""
-        force = rows.force()
+        force = rows.largest_force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
                 force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time
@@ -88,15 +90,17 @@ def make_apparatus(
     changes: dict[str, object] = {}
     if condition.delay is not None:
         changes["channel"] = Channel(delay=condition.delay)
-    elif condition.network != OWN:
+    elif condition.network != AS_IN_SCENARIO:
         changes["channel"] = Channel(network=condition.network)
-    if condition.method != OWN:
+    if condition.method != AS_IN_SCENARIO:
         changes["passivity__method"] = condition.method
     setup = replace(setup, contact_detection=None, **changes)
     empty = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
-        with_object = chosen_scenario(setup, load, Inputs.of(setup).changed({"object": 1}))
-        estimate = adapted_estimate(setup, load, with_object)
+        with_object = chosen_scenario(
+            setup, load, Inputs.from_scenario(setup).with_changes({"object": 1})
+        )
+        estimate = adapt_estimate(setup, load, with_object)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
             load = dataclasses.replace(load, identification=known)
@@ -145,19 +149,19 @@ class IntervalLog:
         elif self.time - self._on_floor >= _FLOOR_TIME_S:
             self.done_at = self._on_floor
 
-    def force(self) -> float:
+    def largest_force(self) -> float:
         """Return the largest 20 ms mean of the contact force [N]."""
-        return _largest_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
+        return _largest_moving_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
-    def change(self, after: float) -> float:
+    def largest_force_change(self, after: float) -> float:
         """Return the largest 20 ms mean of the rendered force's change [N] since `after` [s]."""
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)
         rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)
-        return _largest_mean(np.linalg.norm(rendered[start:] - rest, axis=1), self._dt)
+        return _largest_moving_mean(np.linalg.norm(rendered[start:] - rest, axis=1), self._dt)
 
 
-def _largest_mean(values: Array, dt: float) -> float:
+def _largest_moving_mean(values: Array, dt: float) -> float:
     n = max(1, round(_AVERAGING_S / dt))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     means = (sums[n:] - sums[:-n]) / n

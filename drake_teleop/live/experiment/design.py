@@ -13,7 +13,7 @@ from drake_teleop.common.config import (
 )
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.live.inputs import NETWORKS, OWN
+from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import (
@@ -39,12 +39,12 @@ class Condition:
         None, "1", 0.0, 1.0, "rendered share of a held object, with sigma = 0"
     )
     network: str = choice(
-        OWN,
+        AS_IN_SCENARIO,
         tuple(name for name in NETWORKS if name != "custom"),
         "network between master and slave",
     )
     delay: float | None = quantity(None, "s", 0.0, 2.0, "delay of one way, in place of a network")
-    method: str = choice(OWN, (OWN,), "passivity method", METHODS)
+    method: str = choice(AS_IN_SCENARIO, (AS_IN_SCENARIO,), "passivity method", METHODS)
 
 
 @dataclass
@@ -157,7 +157,7 @@ class Experiment:
                 raise DrakeTeleopError(
                     "cannot be combined with sigma", where=f"{place}.eta", remedy="set sigma: 0"
                 )
-            if condition.delay is not None and condition.network != OWN:
+            if condition.delay is not None and condition.network != AS_IN_SCENARIO:
                 raise DrakeTeleopError(
                     "cannot be combined with network",
                     where=f"{place}.delay",
@@ -170,10 +170,12 @@ def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     path = shipped_file("experiment", path, _FOLDER)
     experiment = settings_from_data(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))
-    return experiment, [_scenario(task, path, index) for index, task in enumerate(experiment.tasks)]
+    return experiment, [
+        _load_task_scenario(task, path, index) for index, task in enumerate(experiment.tasks)
+    ]
 
 
-def _scenario(task: Task, path: Path, index: int) -> Scenario:
+def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
     known = task.scenario in ScenarioNames()
     scenario = LoadScenario(task.scenario if known else path.parent / task.scenario)
     place = f"{path}:tasks[{index}].scenario"

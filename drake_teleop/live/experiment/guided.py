@@ -18,7 +18,7 @@ from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
 from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.live import FRAME_PERIOD_S, Live, Show, parse_message
+from drake_teleop.live.live import FRAME_PERIOD_S, Live, ShowScene, parse_message
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
@@ -35,12 +35,12 @@ HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the rows of a log with zero wrenches, so that the 3D scene shows no arrows."""
+    """Return a log's rows with zero wrenches."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
 
 
-class Guided:
+class GuidedExperiment:
     """Event handler of an experiment, with the interface of `Live`; times `now` in s.
 
     Each interval is a recorded live session; the page receives only the rendered force.
@@ -52,7 +52,7 @@ class Guided:
         stations: dict[tuple[int, int], Apparatus],
         scenarios: list[Scenario],
         store: Store,
-        shows: Sequence[Show],
+        shows: Sequence[ShowScene],
         now: float,
         link: DeviceLink | None = None,
     ) -> None:
@@ -62,9 +62,9 @@ class Guided:
         self._driver: int | None = None
         self._write_error = ""
         self._intervals, self._since, self._frame_due = 0, now, now
-        self._prepare(now)
+        self._prepare_interval(now)
 
-    def _prepare(self, now: float) -> None:
+    def _prepare_interval(self, now: float) -> None:
         procedure = self._procedure
         trial, self._prepared = procedure.trial, procedure.prepared_intervals
         self._apparatus = self._stations[trial.task, trial.condition]
@@ -72,8 +72,10 @@ class Guided:
         insert = self._scenarios[trial.task].operator.task
         insert = insert if isinstance(insert, Insert) else None
         self._rows = IntervalLog(self._apparatus.scenario, insert)
-        self._stimulus = self._apparatus.inputs(procedure.present_level, procedure.expected_force)
-        name = f"{procedure.number:04}-{procedure.interval}"
+        self._stimulus = self._apparatus.stimulus_inputs(
+            procedure.current_level, procedure.expected_force
+        )
+        name = f"{procedure.trial_number:04}-{procedure.interval}"
         self._live = Live(
             with_interval_seed(self._apparatus.scenario, procedure),
             self._apparatus.load,
@@ -121,13 +123,13 @@ class Guided:
         self._prepare_if_changed(now)
 
     def _prepare_if_changed(self, now: float) -> None:
-        with self._keep_write_error():
+        with self._store_write_error():
             if self._procedure.prepared_intervals != self._prepared:
                 self._live.end()
-                self._prepare(now)
+                self._prepare_interval(now)
 
     @contextmanager
-    def _keep_write_error(self) -> Iterator[None]:
+    def _store_write_error(self) -> Iterator[None]:
         try:
             yield
         except CannotWrite as error:
@@ -146,21 +148,23 @@ class Guided:
         if procedure.phase == INTERVAL:
             moves = {kind: message[kind] for kind in message.keys() & {"set", "rates"}}
             self._live.handle_message(client, json.dumps(moves), now)
-        before = procedure.phase, procedure.number
+        before = procedure.phase, procedure.trial_number
         if "answer" in message:
-            with self._keep_write_error():
-                procedure.answer(message["answer"], now - self._since)
+            with self._store_write_error():
+                procedure.store_answer(message["answer"], now - self._since)
         elif "go" in message:
-            procedure.go()
-        if (procedure.phase, procedure.number) == before:
+            procedure.advance_phase()
+        if (procedure.phase, procedure.trial_number) == before:
             return
         self._prepare_if_changed(now)
         self._since = now
         if procedure.phase == INTERVAL:
-            self._live.pace.start(now)
+            self._live.pace.restart(now)
 
     def wait(self, now: float) -> float:
-        return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
+        return (
+            self._live.wait(now) if self._is_interval_running else max(0.0, self._frame_due - now)
+        )
 
     @property
     def stopped(self) -> str:
@@ -173,7 +177,7 @@ class Guided:
         return self._live.ms
 
     @property
-    def _runs(self) -> bool:
+    def _is_interval_running(self) -> bool:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
@@ -182,8 +186,8 @@ class Guided:
         now = clock()
         if self._procedure.phase == GAP and now - self._since >= _GAP_S:
             self._procedure.start_second_interval()
-            self._live.pace.start(now)
-        if self._runs:
+            self._live.pace.restart(now)
+        if self._is_interval_running:
             frame_is_due = self._live.tick(clock) is not None
             self._end_interval_if_over(clock())
             return self.frame() if frame_is_due else None
@@ -199,7 +203,9 @@ class Guided:
         if live.ms < 1e3 * length and not (slot and self._rows.done_at):
             return
         live.frame()
-        result = self._apparatus.result(self._procedure.present_level, self._stimulus, self._rows)
+        result = self._apparatus.interval_result(
+            self._procedure.current_level, self._stimulus, self._rows
+        )
         result = dataclasses.replace(result, lost_s=live.pace.given_up)
         self._procedure.finish_interval(result)
         self._since = self._frame_due = now
@@ -207,10 +213,10 @@ class Guided:
 
     def frame(self) -> dict[str, Any]:
         inner = self._live.frame()
-        rendered = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
+        rendered = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._is_interval_running else [0.0, 0.0]
         task = self._procedure.task
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
-        left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._runs else 0.0
+        left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
         plain = Inputs()
         inputs = {name: getattr(plain, name) for name in RANGES}
         inputs |= {name: inner["inputs"][name] for name in HAND}
@@ -224,7 +230,7 @@ class Guided:
             "drive": self._intervals,
             "inputs": inputs,
             "scale": scaling.translation_scale,
-            "study": self._procedure.view() | {"left": round(left, 3)},
+            "study": self._procedure.page_state() | {"left": round(left, 3)},
         }
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_teleop.live.experiment.design import ContactDetection, Experiment, PegInSlot, Task
 from drake_teleop.live.experiment.psychometrics import Psi
-from drake_teleop.live.experiment.store import Row, Store
+from drake_teleop.live.experiment.store import Store, TrialRow
 
 #: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
 CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
@@ -78,7 +78,7 @@ class Procedure:
     def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
         self.experiment, self.participant, self._store = experiment, participant, store
         self.trials = plan_trials(experiment, participant)
-        self._rows = store.rows(participant)
+        self._rows = store.read_rows(participant)
         self._psi = {
             (t, c): Psi(task.low, task.high)
             for t, task in enumerate(experiment.tasks)
@@ -93,19 +93,19 @@ class Procedure:
         self._new_trial()
 
     @property
-    def number(self) -> int:
+    def trial_number(self) -> int:
         return len(self._rows)
 
     @property
     def trial(self) -> Trial:
-        return self.trials[min(self.number, len(self.trials) - 1)]
+        return self.trials[min(self.trial_number, len(self.trials) - 1)]
 
     @property
     def task(self) -> Task:
         return self.experiment.tasks[self.trial.task]
 
     @property
-    def present_level(self) -> float:
+    def current_level(self) -> float:
         """Stimulus level of the present interval [N or kg]; 0 without stimulus."""
         return self.level if self.trial.signal == self.interval else 0.0
 
@@ -125,9 +125,9 @@ class Procedure:
             psi = self._psi[trial.task, trial.condition]
             self.level = task.high if trial.practice else psi.next_level()
 
-    def go(self) -> None:
+    def advance_phase(self) -> None:
         if self.phase == CONSENT:
-            self.phase = END if self.number >= len(self.trials) else TASK
+            self.phase = END if self.trial_number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):
             self.phase = READY
         elif self.phase == READY:
@@ -157,15 +157,15 @@ class Procedure:
             self._new_trial()
             self.phase = READY
 
-    def answer(self, interval: int, time_s: float) -> None:
+    def store_answer(self, interval: int, time_s: float) -> None:
         """Store the answer (interval 1 or 2, after `time_s`), if one is due."""
         if self.phase == ANSWER:
             self._finish_trial(interval, interval == self.trial.signal, time_s)
 
     def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
         trial, results = self.trial, self._results
-        row = Row(
-            trial=self.number,
+        row = TrialRow(
+            trial=self.trial_number,
             task=type(self.task).__name__,
             condition=self.experiment.conditions[trial.condition].name,
             practice=int(trial.practice),
@@ -177,7 +177,7 @@ class Procedure:
             force_N=max(f.force_N for f in results),
             lost_s=sum(f.lost_s for f in results),
         )
-        self._store.write(self.participant, [*self._rows, row])
+        self._store.write_rows(self.participant, [*self._rows, row])
         self._rows.append(row)
         self._update_estimates(trial, row)
         self.said = bool(correct)
@@ -186,7 +186,7 @@ class Procedure:
         else:
             self._next_trial()
 
-    def _update_estimates(self, trial: Trial, row: Row) -> None:
+    def _update_estimates(self, trial: Trial, row: TrialRow) -> None:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
@@ -195,21 +195,23 @@ class Procedure:
             self._psi[trial.task, trial.condition].update(row.level, bool(row.correct))
 
     def _next_trial(self) -> None:
-        before = self.trials[self.number - 1]
-        if self.number == len(self.trials):
+        before = self.trials[self.trial_number - 1]
+        if self.trial_number == len(self.trials):
             self.phase = END
             return
         self._new_trial()
         practised = before.practice and not self.trial.practice
         if self.trial.task != before.task:
             self.phase = TASK
-        elif practised or self.number % self.experiment.break_after == 0:
+        elif practised or self.trial_number % self.experiment.break_after == 0:
             self.phase = BREAK
         else:
             self.phase = READY
 
-    def view(self) -> dict[str, Any]:
-        number = self.number - (self.phase == FEEDBACK)  # FEEDBACK belongs to the finished trial
+    def page_state(self) -> dict[str, Any]:
+        number = self.trial_number - (
+            self.phase == FEEDBACK
+        )  # FEEDBACK belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,

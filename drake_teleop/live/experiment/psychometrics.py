@@ -51,10 +51,12 @@ class Psi:
         shape = (_THRESHOLDS, len(_SLOPES), len(_LAPSES))
         self._posterior = np.full(shape, 1.0 / math.prod(shape))
         # P(correct) as (levels, thresholds, slopes and lapses).
-        self._p_correct = np.stack([self._probability(x).reshape(shape) for x in self.levels])
+        self._p_correct = np.stack(
+            [self._correct_probability(x).reshape(shape) for x in self.levels]
+        )
         self._p_correct = self._p_correct.reshape(_LEVELS, _THRESHOLDS, -1)
 
-    def _probability(self, level: float) -> Array:
+    def _correct_probability(self, level: float) -> Array:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
@@ -70,7 +72,7 @@ class Psi:
         return float(self.levels[np.argmin(lost)])
 
     def update(self, level: float, correct: bool) -> None:
-        p = self._probability(level)
+        p = self._correct_probability(level)
         self._posterior = self._posterior * (p if correct else 1.0 - p)
         self._posterior /= self._posterior.sum()
 

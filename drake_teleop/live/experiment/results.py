@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from drake_teleop.common.files import write_picture, write_table
 from drake_teleop.live.experiment.design import ApparentMass, Experiment, PegInSlot, Task
 from drake_teleop.live.experiment.psychometrics import Estimate, Psi
-from drake_teleop.live.experiment.store import Row, Store
+from drake_teleop.live.experiment.store import Store, TrialRow
 
 if TYPE_CHECKING:
     import polars as pl
@@ -26,7 +26,7 @@ _PICTURED_QUANTITIES = (
     "time to the floor [s]",
     "largest contact force [N]",
 )
-_SHARE = "share of trials done"
+_DONE_SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
@@ -42,9 +42,11 @@ class Result(NamedTuple):
     high: float
 
 
-def results(experiment: Experiment, store: Store) -> list[Result]:
+def compute_results(experiment: Experiment, store: Store) -> list[Result]:
     found = []
-    known = {n: [row for row in store.rows(n) if not row.practice] for n in store.participants()}
+    known = {
+        n: [row for row in store.read_rows(n) if not row.practice] for n in store.participants()
+    }
     for task in experiment.tasks:
         kind = type(task).__name__
         for condition in experiment.conditions:
@@ -57,18 +59,20 @@ def results(experiment: Experiment, store: Store) -> list[Result]:
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    over = _mean_with_interval([r.value for r in one], share=quantity == _SHARE)
+                    over = _mean_with_interval(
+                        [r.value for r in one], share=quantity == _DONE_SHARE
+                    )
                     trials = sum(r.trials for r in one)
                     found.append(Result(kind, condition.name, 0, trials, quantity, *over))
     return found
 
 
-def _participant_estimates(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
+def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Estimate]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
-        found = {_SHARE: _wilson_interval(len(done), len(rows))}
+        found = {_DONE_SHARE: _wilson_interval(len(done), len(rows))}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -104,7 +108,7 @@ def _wilson_interval(successes: int, n: int) -> Estimate:
 def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
     import polars as pl
 
-    found = results(experiment, store)
+    found = compute_results(experiment, store)
     schema: dict[str, type[pl.DataType]] = {
         name: pl.String for name in ("task", "condition", "quantity")
     }
@@ -114,7 +118,7 @@ def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
     table = pl.DataFrame(found, schema=schema, orient="row").with_columns(
         pl.col("value", "low", "high").fill_nan(None)
     )
-    write_table(store.folder / "trials.csv", store.table())
+    write_table(store.folder / "trials.csv", store.results_table())
     write_table(store.folder / "results.csv", table)
     _write_picture(store.folder / "results.png", experiment, found)
     return table
@@ -133,7 +137,7 @@ def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> N
         figure = Picture(figsize=(2.9 * len(shown), 0.9 + 0.62 * len(names)))
         grid = figure.subplots(1, len(shown), squeeze=False, sharey=True)
         for axes, quantity in zip(grid[0], shown, strict=True):
-            _draw(axes, names, [r for r in found if r.quantity == quantity])
+            _draw_results(axes, names, [r for r in found if r.quantity == quantity])
             axes.set_xlabel(quantity)
         grid[0][0].set_yticks(range(len(names)), names)
         grid[0][0].set_ylim(len(names) - 0.5, -0.5)
@@ -143,7 +147,7 @@ def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> N
     write_picture(path, figure, bbox_inches="tight")
 
 
-def _draw(axes: Axes, names: list[str], found: list[Result]) -> None:
+def _draw_results(axes: Axes, names: list[str], found: list[Result]) -> None:
     from matplotlib.ticker import LogLocator
 
     from drake_teleop.common.style import BLUE, VERMILION

@@ -10,12 +10,12 @@ from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment
-from drake_teleop.live.experiment.guided import Guided
+from drake_teleop.live.experiment.guided import GuidedExperiment
 from drake_teleop.live.experiment.procedure import Procedure
-from drake_teleop.live.experiment.simulated import all_apparatus
+from drake_teleop.live.experiment.simulated import make_all_apparatus
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.scenarios import with_device
+from drake_teleop.live.scenarios import with_task_space_device
 from drake_teleop.live.server import LiveDrive, start_condition, warm_up
 from drake_teleop.station.scenario import Scenario
 
@@ -33,8 +33,8 @@ class ExperimentDrive(LiveDrive):
         device: str | None = None,
     ) -> None:
         if device is not None:
-            scenarios = [with_device(scenario) for scenario in scenarios]
-        self._stations = all_apparatus(experiment, scenarios)
+            scenarios = [with_task_space_device(scenario) for scenario in scenarios]
+        self._stations = make_all_apparatus(experiment, scenarios)
         self._procedure = Procedure(experiment, participant, store)
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)
@@ -50,11 +50,11 @@ class ExperimentDrive(LiveDrive):
         link = None if self._device is None else self._device.link
         shows = [view.show for view in self._views.values()]
         setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
-        return Guided(*setup, time.perf_counter(), link)
+        return GuidedExperiment(*setup, time.perf_counter(), link)
 
-    def done(self) -> tuple[int, int]:
+    def count_done_trials(self) -> tuple[int, int]:
         """Return the numbers of finished trials and of all trials."""
-        return self._procedure.number, len(self._procedure.trials)
+        return self._procedure.trial_number, len(self._procedure.trials)
 
     def _page(self) -> str:
         panel = (
@@ -81,7 +81,7 @@ def serve_experiment(
         f"participant {participant} at {live.url}\n{start_condition(device)}; Ctrl-C ends it",
         flush=True,
     )
-    reason, (done, trials) = live.until_signal(), live.done()
+    reason, (done, trials) = live.wait_for_signal(), live.count_done_trials()
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
         raise DrakeTeleopError(

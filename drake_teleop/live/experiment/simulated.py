@@ -1,4 +1,4 @@
-"""Simulated participants: an observer with noise compares rendered forces of a scripted hand."""
+"""Simulated participants: a noisy observer with a scripted hand."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from drake_teleop.live.experiment.procedure import (
     Procedure,
 )
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.inputs import LENGTH, SLICE_MS
+from drake_teleop.live.inputs import LENGTH_UNIT_M, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -41,7 +41,7 @@ _MOTION_START_S = 0.4
 _ROWS_PERIOD_MS = 200
 
 
-def all_apparatus(
+def make_all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}
@@ -54,12 +54,12 @@ def all_apparatus(
 
 def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
     """Return the scenario with a seed for the present interval."""
-    number = 2 * procedure.number + procedure.interval
+    number = 2 * procedure.trial_number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
 
 
-def take_part(
+def simulate_participant(
     experiment: Experiment,
     scenarios: list[Scenario],
     stations: dict[tuple[int, int], Apparatus],
@@ -82,11 +82,11 @@ def take_part(
         elif procedure.phase == GAP:
             procedure.start_second_interval()
         elif procedure.phase == ANSWER:
-            rng = np.random.default_rng([experiment.seed, participant, procedure.number, 3])
-            procedure.answer(compare_responses(observer, responses, rng), 0.5)
-            progress(procedure.number, len(procedure.trials))
+            rng = np.random.default_rng([experiment.seed, participant, procedure.trial_number, 3])
+            procedure.store_answer(compare_responses(observer, responses, rng), 0.5)
+            progress(procedure.trial_number, len(procedure.trials))
         else:
-            procedure.go()
+            procedure.advance_phase()
 
 
 def compare_responses(
@@ -106,7 +106,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(with_interval_seed(apparatus.scenario, procedure), apparatus.load)
-    stimulus = apparatus.inputs(procedure.present_level, procedure.expected_force)
+    stimulus = apparatus.stimulus_inputs(procedure.current_level, procedure.expected_force)
     rows = IntervalLog(apparatus.scenario, None)
     moves_sideways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
     while session.ms < 1e3 * task.interval:
@@ -117,14 +117,16 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
         else:
             share = 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))
             displacement = {"z": -observer.reach * share}
-        hand = {name: value / LENGTH for name, value in displacement.items()}
-        session.apply(session.inputs.changed(stimulus | hand))
+        hand = {name: value / LENGTH_UNIT_M for name, value in displacement.items()}
+        session.apply_inputs(session.inputs.with_changes(stimulus | hand))
         session.advance(SLICE_MS)
         if session.ms % _ROWS_PERIOD_MS == 0:
             rows.add(session.new_rows())
     rows.add(session.new_rows())
     session.close()
-    return apparatus.result(procedure.present_level, stimulus, rows), rows.change(_MOTION_START_S)
+    return apparatus.interval_result(
+        procedure.current_level, stimulus, rows
+    ), rows.largest_force_change(_MOTION_START_S)
 
 
 def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:

@@ -1,4 +1,4 @@
-"""Trials of an experiment on disk: `participants/03.csv`, complete after each trial."""
+"""Trials on disk: `participants/03.csv`, complete after each trial."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import polars as pl
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, write_table
 from drake_teleop.common.version import __version__
-from drake_teleop.lab.studies.store import claimed
+from drake_teleop.lab.studies.store import locked_folder
 from drake_teleop.live.experiment.design import Experiment
 
 #: Largest valid participant number.
@@ -21,7 +21,7 @@ MAX_PARTICIPANT = 9999
 
 
 @dataclass(frozen=True)
-class Row:
+class TrialRow:
     """Finished trial.
 
     Attributes:
@@ -48,7 +48,7 @@ class Row:
 
 _SCHEMA: dict[str, type[pl.DataType]] = {
     field.name: {"int": pl.Int64, "float": pl.Float64, "str": pl.String}[str(field.type)]
-    for field in dataclasses.fields(Row)
+    for field in dataclasses.fields(TrialRow)
 }
 
 
@@ -58,7 +58,7 @@ class Store:
 
     folder: Path
 
-    def path(self, participant: int) -> Path:
+    def participant_file(self, participant: int) -> Path:
         return self.folder / "participants" / f"{participant:02}.csv"
 
     def participants(self) -> list[int]:
@@ -66,14 +66,14 @@ class Store:
         stems = (path.stem for path in self.folder.glob("participants/*.csv"))
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
-    def rows(self, participant: int) -> list[Row]:
-        path = self.path(participant)
+    def read_rows(self, participant: int) -> list[TrialRow]:
+        path = self.participant_file(participant)
         if not path.exists():
             return []
         remedy = "remove it; the participant then starts again"
         with wrap_read_errors(path, remedy):
             table = pl.read_csv(path, schema=_SCHEMA)
-        rows = [Row(**row) for row in table.iter_rows(named=True)]
+        rows = [TrialRow(**row) for row in table.iter_rows(named=True)]
         if (
             any(row.trial != index for index, row in enumerate(rows))
             or table.null_count().sum_horizontal()[0]
@@ -81,16 +81,16 @@ class Store:
             raise DrakeTeleopError("lacks trials", where=str(path), remedy=remedy)
         return rows
 
-    def write(self, participant: int, rows: list[Row]) -> None:
-        make_folder(self.path(participant).parent)
+    def write_rows(self, participant: int, rows: list[TrialRow]) -> None:
+        make_folder(self.participant_file(participant).parent)
         table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_SCHEMA)
-        write_table(self.path(participant), table)
+        write_table(self.participant_file(participant), table)
 
-    def table(self) -> pl.DataFrame:
+    def results_table(self) -> pl.DataFrame:
         rows = [
             {"participant": n} | dataclasses.asdict(row)
             for n in self.participants()
-            for row in self.rows(n)
+            for row in self.read_rows(n)
         ]
         return pl.DataFrame(rows, schema={"participant": pl.Int64, **_SCHEMA})
 
@@ -100,5 +100,5 @@ def open_results(folder: Path, experiment: Experiment) -> Iterator[Store]:
     """Yield the results in a folder, locked for this process."""
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}
-    with claimed(folder, identity):
+    with locked_folder(folder, identity):
         yield Store(folder)

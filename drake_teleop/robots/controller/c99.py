@@ -1,4 +1,4 @@
-"""Files of the C99 kernel for an identified load, with a test vector from Python."""
+"""C99 kernel for an identified load, with a test vector from Python."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ Files = Mapping[str, str | bytes]
 
 
 @cache
-def kernel() -> str:
+def c_kernel_text() -> str:
     c = Translator()
     row, out = (VALUES + 6,), (12,)
-    c.add(step.value_problem, values=(VALUES,), largest=(VALUES,), limits=(6,))
-    c.add(
+    c.translate_function(step.value_problem, values=(VALUES,), largest=(VALUES,), limits=(6,))
+    c.translate_function(
         step.scales_into, sigma_weight="double", sigma_inertia="double", gamma="double", scales=(4,)
     )
-    c.add(
+    c.translate_function(
         step.eliminate_into,
         values=(VALUES,),
         gravity=(3,),
@@ -58,15 +58,19 @@ def kernel() -> str:
         at="int",
         out=out,
     )
-    c.add(step.clip, wrenches=out, limits=(6,))
-    c.add(step.add_to_statistics, row=row, count="double", mean=row, squares=row)
-    c.add(step.tare_into, count="double", mean=row, squares=row, noise_limits=(6,), offsets=(6,))
-    c.add(design_low_pass, dt="double", tangent="double", ahead_s="double", low_pass=(7,))
-    return rendered("wrench_compensator.c", kernel=c.text, helpers=HELPERS)
+    c.translate_function(step.clip, wrenches=out, limits=(6,))
+    c.translate_function(step.add_to_statistics, row=row, count="double", mean=row, squares=row)
+    c.translate_function(
+        step.tare_into, count="double", mean=row, squares=row, noise_limits=(6,), offsets=(6,)
+    )
+    c.translate_function(
+        design_low_pass, dt="double", tangent="double", ahead_s="double", low_pass=(7,)
+    )
+    return render_template("wrench_compensator.c", kernel=c.text, helpers=HELPERS)
 
 
-def header() -> str:
-    return template("wrench_compensator.h")
+def c_header_text() -> str:
+    return read_template("wrench_compensator.h")
 
 
 class Target(NamedTuple):
@@ -85,9 +89,9 @@ class Target(NamedTuple):
     sign: int
     notes: list[str]
 
-    def settings(self, largest: Array | None = None, **scales: Any) -> str:
+    def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
         """Return a C initializer of `wrench_compensator_settings`."""
-        loop = self.loop(largest, **scales)
+        loop = self.make_compensator(largest, **scales)
         values = {
             "sigma_weight": 0.0,
             "sigma_inertia": 0.0,
@@ -97,7 +101,7 @@ class Target(NamedTuple):
         }
         return "".join(f"    {_literal(values[name])}, /* {name} */\n" for name in _SETTINGS)
 
-    def loop(self, largest: Array | None = None, **scales: Any) -> Compensator:
+    def make_compensator(self, largest: Array | None = None, **scales: Any) -> Compensator:
         largest = self.largest if largest is None else largest
         return Compensator(self.found, self.dt, cutoff_hz=self.cutoff_hz, largest=largest, **scales)
 
@@ -106,9 +110,9 @@ def c99_files(target: Target) -> Files:
     return {
         **kernel_files(target),
         "test_vector.h": _test_vector(target),
-        "test_wrench_compensator.c": template("test_wrench_compensator.c"),
-        "CMakeLists.txt": template("CMakeLists.txt"),
-        "README.md": rendered(
+        "test_wrench_compensator.c": read_template("test_wrench_compensator.c"),
+        "CMakeLists.txt": read_template("CMakeLists.txt"),
+        "README.md": render_template(
             "README.c99.md",
             rate=f"{1.0 / target.dt:g}",
             period=f"{target.dt:g}",
@@ -119,15 +123,17 @@ def c99_files(target: Target) -> Files:
 
 
 def kernel_files(target: Target) -> Files:
-    load = rendered("load.h", dt=repr(target.dt), settings=target.settings(), notes=target.notes)
-    return dict(zip((*KERNEL, "load.h"), (header(), kernel(), load), strict=True))
+    load = render_template(
+        "load.h", dt=repr(target.dt), settings=target.settings_initializer(), notes=target.notes
+    )
+    return dict(zip((*KERNEL, "load.h"), (c_header_text(), c_kernel_text(), load), strict=True))
 
 
-def template(name: str) -> str:
+def read_template(name: str) -> str:
     return resources.files(PACKAGE).joinpath(f"templates/{name}").read_text(encoding="utf-8")
 
 
-def rendered(name: str, **values: Any) -> str:
+def render_template(name: str, **values: Any) -> str:
     """Return a shipped template with its values; nothing is escaped."""
 
     def plain(value: Any) -> Any:
@@ -141,14 +147,14 @@ def rendered(name: str, **values: Any) -> str:
 
 def _test_vector(target: Target) -> str:
     inputs, largest = _simulated_readings(target)
-    python = target.loop(largest, **_VECTOR_SCALES)
+    python = target.make_compensator(largest, **_VECTOR_SCALES)
     outputs = [
         python.step(Reading(k, t, row[:VALUES], gravity=row[VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
-    return rendered(
+    return render_template(
         "test_vector.h",
-        settings=target.settings(largest, **_VECTOR_SCALES),
+        settings=target.settings_initializer(largest, **_VECTOR_SCALES),
         inputs=[_literal(row) for row in inputs],
         outputs=[_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
         flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",

@@ -1,4 +1,4 @@
-"""Export of an identified load with the compensation itself, as a folder of files."""
+"""Export of an identified load with the compensation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.controller.c99 import Files, Target, c99_files
 from drake_teleop.robots.controller.fmu import fmu_files
 from drake_teleop.robots.controller.ros2_filter import ros2_filter_files
-from drake_teleop.robots.export import in_sensor_frame, refuse_removed_weight
+from drake_teleop.robots.export import refuse_removed_weight, sensor_frame_error
 
 FORMATS: dict[str, Callable[[Target], Files]] = {
     "c99": c99_files,
@@ -44,7 +44,7 @@ def export_controller(
             f"is required by {to}", where="rate", remedy="give the rate of the readings in Hz"
         )
     if sensor_pose is not None:
-        raise in_sensor_frame(to)
+        raise sensor_frame_error(to)
     refuse_removed_weight(found, to)
     notes = [
         f"{name} is that of a point mass: it is not identified" for name in usable_phi(found)[1]

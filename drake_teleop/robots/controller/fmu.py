@@ -13,7 +13,7 @@ from uuid import NAMESPACE_URL, uuid5
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from drake_teleop.common.version import __version__
-from drake_teleop.robots.controller.c99 import CFLAGS, Files, Target, kernel_files, template
+from drake_teleop.robots.controller.c99 import CFLAGS, Files, Target, kernel_files, read_template
 
 _NAME = "wrench_compensator"
 _WRENCH = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
@@ -31,7 +31,7 @@ _PLATFORMS = {"2.0": "linux64", "3.0": "x86_64-linux"}
 
 
 def fmu_files(target: Target) -> Files:
-    """Return two FMUs by name: sources, and binaries for Linux if there is a C compiler."""
+    """Return two FMUs: sources, and Linux binaries if there is a C compiler."""
     compiler = shutil.which("cc")
     if platform.system() != "Linux" or platform.machine() != "x86_64":
         compiler = None
@@ -40,7 +40,7 @@ def fmu_files(target: Target) -> Files:
     kernel = dict(kernel_files(target))
     token = str(uuid5(NAMESPACE_URL, "".join(map(str, kernel.values()))))
     kernel["token.h"] = f'#define TOKEN "{token}"\n'
-    kernel["fmu.h"] = template("fmu.h")
+    kernel["fmu.h"] = read_template("fmu.h")
     return {
         f"{_NAME}_fmi{version[0]}.fmu": _fmu(target, kernel, version, token, compiler)
         for version in ("2.0", "3.0")
@@ -48,17 +48,17 @@ def fmu_files(target: Target) -> Files:
 
 
 def _fmu(target: Target, kernel: Files, version: str, token: str, compiler: str | None) -> bytes:
-    sources = {**kernel, f"fmi{version[0]}.c": template(f"fmi{version[0]}.c")}
+    sources = {**kernel, f"fmi{version[0]}.c": read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
     compiled = [name for name in sources if name.endswith(".c")]
-    files["modelDescription.xml"] = _description(target, version, token, compiled)
+    files["modelDescription.xml"] = _model_description(target, version, token, compiled)
     if version == "3.0":
         build = Element("fmiBuildDescription", fmiVersion="3.0")
         configuration = SubElement(build, "BuildConfiguration", modelIdentifier=_NAME)
         group = SubElement(configuration, "SourceFileSet", language="C99")
         for name in compiled:
             SubElement(group, "SourceFile", name=name)
-        files["sources/buildDescription.xml"] = _xml(build)
+        files["sources/buildDescription.xml"] = _xml_text(build)
     if compiler is not None:
         binary = f"binaries/{_PLATFORMS[version]}/{_NAME}.so"
         files[binary] = _shared_library(compiler, sources, compiled)
@@ -80,7 +80,7 @@ def _shared_library(compiler: str, sources: Files, compiled: list[str]) -> bytes
         return (folder / "library.so").read_bytes()
 
 
-def _description(target: Target, version: str, token: str, compiled: list[str]) -> str:
+def _model_description(target: Target, version: str, token: str, compiled: list[str]) -> str:
     new = version == "3.0"
     root = Element(
         "fmiModelDescription",
@@ -104,7 +104,7 @@ def _description(target: Target, version: str, token: str, compiled: list[str]) 
         SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", base)
     SubElement(root, "DefaultExperiment", stepSize=repr(target.dt))
     variables = SubElement(root, "ModelVariables")
-    listed = _variables(target)
+    listed = _model_variables(target)
     for reference, (name, causality, unit, start) in enumerate(listed):
         common = {"name": name, "valueReference": str(reference), "causality": causality}
         common["variability"] = "tunable" if causality == "parameter" else "discrete"
@@ -121,7 +121,7 @@ def _description(target: Target, version: str, token: str, compiled: list[str]) 
     outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
     structure = SubElement(root, "ModelStructure")
     _list_unknowns(structure, outputs, new)
-    return _xml(root)
+    return _xml_text(root)
 
 
 def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
@@ -134,11 +134,11 @@ def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
                 SubElement(group, "Unknown", index=str(k + 1))
 
 
-def _variables(target: Target) -> list[tuple[str, str, str, float | None]]:
+def _model_variables(target: Target) -> list[tuple[str, str, str, float | None]]:
     wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
-    found = target.loop().settings
+    found = target.make_compensator().settings
     phi_units = ["kg", *["kg.m"] * 3, *["kg.m2"] * 6]
     phi_names = ("m", "mc_x", "mc_y", "mc_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
     phi = zip(phi_names, phi_units, found["phi"], strict=True)
@@ -156,6 +156,6 @@ def _variables(target: Target) -> list[tuple[str, str, str, float | None]]:
     ]
 
 
-def _xml(root: Element) -> str:
+def _xml_text(root: Element) -> str:
     indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"

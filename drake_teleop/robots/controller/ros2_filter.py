@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from drake_teleop.robots.controller.c99 import Files, Target, kernel_files, rendered, template
+from drake_teleop.robots.controller.c99 import (
+    Files,
+    Target,
+    kernel_files,
+    read_template,
+    render_template,
+)
 
 _NAME = "wrench_compensator_filter"
 _FOLDER = "ros2_filter"
@@ -20,7 +26,7 @@ def ros2_filter_files(target: Target) -> Files:
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
     return {
-        **{name: template(f"{_FOLDER}/{file}") for name, file in shipped.items()},
+        **{name: read_template(f"{_FOLDER}/{file}") for name, file in shipped.items()},
         **{f"src/{name}": text for name, text in kernel.items()},
-        "README.md": rendered(f"{_FOLDER}/README.md", **values),
+        "README.md": render_template(f"{_FOLDER}/README.md", **values),
     }

@@ -69,7 +69,9 @@ class Translator:
     def text(self) -> str:
         return "\n".join(function.text for function in self._functions.values())
 
-    def add(self, function: Any, **parameters: str | tuple[int | str, ...]) -> _Function:
+    def translate_function(
+        self, function: Any, **parameters: str | tuple[int | str, ...]
+    ) -> _Function:
         """Translate a function of `njit`.
 
         `parameters` are, in order, "double", "int" or the shape of an array, which may begin with
@@ -93,7 +95,7 @@ class _Function:
         self._locals: dict[str, str] = {}
         self._lines: list[str] = []
         self._indent, self._temporaries, self._expanding = 1, 0, False
-        tree, self._globals = _parsed(function)
+        tree, self._globals = _parse_source(function)
         names = [argument.arg for argument in tree.args.args]
         if names != list(parameters):
             raise TypeError(f"{name}: give the types of {names}, not of {list(parameters)}")
@@ -103,17 +105,17 @@ class _Function:
             else _Array(each, kind, each)
             for each, kind in parameters.items()
         }
-        self._block(tree.body)
+        self._translate_block(tree.body)
         head = f"static {self.kind} {name}({', '.join(self._parameters(parameters))}) {{"
         comment = (ast.get_docstring(tree) or "").split("\n")[0].replace("`", "")
         body, self._lines = self._lines, [f"/* {comment} */"]
-        self._line(head, 0)
+        self._write_line(head, 0)
         for kind in ("int", "double"):
             if names := [each for each, of in self._locals.items() if of == kind]:
-                self._line(f"{kind} {', '.join(names)};")
+                self._write_line(f"{kind} {', '.join(names)};")
         for kind in parameters.values():
             if not isinstance(kind, str) and isinstance(kind[0], str):
-                self._line(f"(void){kind[0]};")  # it may be unused
+                self._write_line(f"(void){kind[0]};")  # it may be unused
         self.text = "\n".join([*self._lines, *body, "}\n"])
 
     def _parameters(self, parameters: dict[str, Any]) -> list[str]:
@@ -130,99 +132,110 @@ class _Function:
             listed += [f"int\xa0{size}" for size in kind if isinstance(size, str)]
         return listed
 
-    def _line(self, text: str, indent: int | None = None) -> None:
+    def _write_line(self, text: str, indent: int | None = None) -> None:
         pad = "  " * (self._indent if indent is None else indent)
         lines = textwrap.wrap(text, 98, initial_indent=pad, subsequent_indent=pad + "    ")
         self._lines += [line.replace("\xa0", " ") for line in lines]
 
-    def _block(self, body: list[ast.stmt], head: str = "") -> None:
+    def _translate_block(self, body: list[ast.stmt], head: str = "") -> None:
         if head:
-            self._line(head + " {")
+            self._write_line(head + " {")
             self._indent += 1
         for node in body:
-            self._statement(node)
+            self._translate_statement(node)
         if head:
             self._indent -= 1
-            self._line("}")
+            self._write_line("}")
 
-    def _statement(self, node: ast.stmt) -> None:
+    def _translate_statement(self, node: ast.stmt) -> None:
         if isinstance(node, ast.Expr):
-            called = self._value(node.value)
+            called = self._translate_expression(node.value)
             if isinstance(called, _Scalar):  # neither a docstring nor expanded
-                self._line(f"{called.text};")
+                self._write_line(f"{called.text};")
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
-            self._assign(node.targets[0], self._value(node.value))
+            self._translate_assignment(node.targets[0], self._translate_expression(node.value))
         elif isinstance(node, ast.AugAssign):
-            self._assign(node.target, self._operation(node, node.op, node.target, node.value))
+            self._translate_assignment(
+                node.target, self._translate_operation(node, node.op, node.target, node.value)
+            )
         elif self._expanding:
-            raise self._unsupported(node, "in a function that is expanded at its call")
+            raise self._unsupported_error(node, "in a function that is expanded at its call")
         elif isinstance(node, ast.Return) and node.value is not None:
-            value = self._value(node.value)
-            self.kind = _kind(value)
-            self._line(f"return {_bare(_text(value))};")
+            value = self._translate_expression(node.value)
+            self.kind = _c_type(value)
+            self._write_line(f"return {_remove_outer_parentheses(_c_expression(value))};")
         elif isinstance(node, ast.If):
-            test = self._value(node.test)
+            test = self._translate_expression(node.test)
             if isinstance(test, _Scalar):
-                self._block(node.body, f"if ({_bare(test.text)})")
+                self._translate_block(node.body, f"if ({_remove_outer_parentheses(test.text)})")
                 if node.orelse:
-                    self._block(node.orelse, "else")
+                    self._translate_block(node.orelse, "else")
             else:
-                self._block(node.body if test else node.orelse)
+                self._translate_block(node.body if test else node.orelse)
         elif isinstance(node, ast.For) and isinstance(node.target, ast.Name) and not node.orelse:
-            self._loop(node, node.target.id)
+            self._translate_loop(node, node.target.id)
         else:
-            raise self._unsupported(node)
+            raise self._unsupported_error(node)
 
-    def _loop(self, node: ast.For, name: str) -> None:
+    def _translate_loop(self, node: ast.For, name: str) -> None:
         call = node.iter
-        if not (isinstance(call, ast.Call) and self._value(call.func) is range) or call.args[2:]:
-            raise self._unsupported(call, "as the range of a loop")
-        *start, stop = [_text(self._value(argument)) for argument in call.args]
+        if (
+            not (isinstance(call, ast.Call) and self._translate_expression(call.func) is range)
+            or call.args[2:]
+        ):
+            raise self._unsupported_error(call, "as the range of a loop")
+        *start, stop = [
+            _c_expression(self._translate_expression(argument)) for argument in call.args
+        ]
         self._locals[name] = "int"
         self._values[name] = _Scalar(name, "int")
         first = start[0] if start else "0"
-        self._block(node.body, f"for ({name} = {first}; {name} < {stop}; ++{name})")
+        self._translate_block(node.body, f"for ({name} = {first}; {name} < {stop}; ++{name})")
 
-    def _assign(self, target: ast.expr, value: Any) -> None:
+    def _translate_assignment(self, target: ast.expr, value: Any) -> None:
         if isinstance(target, ast.Tuple):
-            value = self._stored(value)  # all are calculated before the first is written
+            value = self._store_in_variables(
+                value
+            )  # all are calculated before the first is written
             for each, part in zip(target.elts, value, strict=True):
-                self._assign(each, part)
+                self._translate_assignment(each, part)
         elif isinstance(target, ast.Subscript):
-            self._write(self._value(target), value)
+            self._write_element(self._translate_expression(target), value)
         elif not isinstance(target, ast.Name):
-            raise self._unsupported(target)
+            raise self._unsupported_error(target)
         elif self._expanding:
-            self._values[target.id] = self._stored(value)
+            self._values[target.id] = self._store_in_variables(value)
         elif isinstance(value, (tuple, _Array)):
             if self._indent > 1:
-                raise self._unsupported(target, "in a branch or loop as a tuple or array")
-            self._values[target.id] = self._stored(value)
+                raise self._unsupported_error(target, "in a branch or loop as a tuple or array")
+            self._values[target.id] = self._store_in_variables(value)
         else:
             if isinstance(self._values.get(target.id), _Scalar) and target.id not in self._locals:
-                raise self._unsupported(target, "as a parameter with a new value")
-            if self._locals.setdefault(target.id, _kind(value)) != _kind(value):
-                raise self._unsupported(target, "with two types")
-            self._values[target.id] = _Scalar(target.id, _kind(value))
-            self._line(f"{target.id} = {_bare(_text(value))};")
+                raise self._unsupported_error(target, "as a parameter with a new value")
+            if self._locals.setdefault(target.id, _c_type(value)) != _c_type(value):
+                raise self._unsupported_error(target, "with two types")
+            self._values[target.id] = _Scalar(target.id, _c_type(value))
+            self._write_line(f"{target.id} = {_remove_outer_parentheses(_c_expression(value))};")
 
-    def _write(self, place: Any, value: Any) -> None:
+    def _write_element(self, place: Any, value: Any) -> None:
         self.written.add(place.array)
         if isinstance(place, _Scalar):
-            self._line(f"{place.text} = {_bare(_text(value))};")
+            self._write_line(f"{place.text} = {_remove_outer_parentheses(_c_expression(value))};")
             return
         k = self._new_local("int")
-        source = f"{value.text}[{k}]" if isinstance(value, _Array) else _text(value)
-        self._line(f"for ({k} = 0; {k} < {place.shape[0]}; ++{k}) {place.text}[{k}] = {source};")
+        source = f"{value.text}[{k}]" if isinstance(value, _Array) else _c_expression(value)
+        self._write_line(
+            f"for ({k} = 0; {k} < {place.shape[0]}; ++{k}) {place.text}[{k}] = {source};"
+        )
 
-    def _stored(self, value: Any) -> Any:
+    def _store_in_variables(self, value: Any) -> Any:
         """Return a value that no later write changes: its expressions are stored in variables."""
         if isinstance(value, tuple):
-            return tuple(map(self._stored, value))
+            return tuple(map(self._store_in_variables, value))
         if not isinstance(value, _Scalar) or value.constant:
             return value
         name = self._new_local(value.kind)
-        self._line(f"{name} = {_bare(value.text)};")
+        self._write_line(f"{name} = {_remove_outer_parentheses(value.text)};")
         return _Scalar(name, value.kind, constant=True)
 
     def _new_local(self, kind: str) -> str:
@@ -231,143 +244,151 @@ class _Function:
         self._locals[name] = kind
         return name
 
-    def _value(self, node: ast.expr) -> Any:
+    def _translate_expression(self, node: ast.expr) -> Any:
         if isinstance(node, ast.Constant):
             return node.value
         if isinstance(node, ast.Name):
             return self._values[node.id] if node.id in self._values else self._globals[node.id]
         if isinstance(node, ast.Attribute):
-            return getattr(self._value(node.value), node.attr)
+            return getattr(self._translate_expression(node.value), node.attr)
         if isinstance(node, ast.Tuple):
-            return tuple(map(self._value, node.elts))
+            return tuple(map(self._translate_expression, node.elts))
         if isinstance(node, ast.Subscript):
-            return self._subscript(self._value(node.value), node.slice)
+            return self._translate_subscript(self._translate_expression(node.value), node.slice)
         if isinstance(node, ast.Call) and not node.keywords:
-            return self._call(self._value(node.func), [self._value(each) for each in node.args])
+            return self._translate_call(
+                self._translate_expression(node.func),
+                [self._translate_expression(each) for each in node.args],
+            )
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.Not)):
-            value, negative = self._value(node.operand), isinstance(node.op, ast.USub)
+            value, negative = (
+                self._translate_expression(node.operand),
+                isinstance(node.op, ast.USub),
+            )
             if not isinstance(value, _Scalar):
                 return -value if negative else not value
             kind = value.kind if negative else "int"
             return _Scalar(f"({'-' if negative else '!'}{value.text})", kind)
         if isinstance(node, ast.BinOp):
-            return self._operation(node, node.op, node.left, node.right)
+            return self._translate_operation(node, node.op, node.left, node.right)
         if isinstance(node, ast.Compare) and len(node.ops) == 1:
-            return self._operation(node, node.ops[0], node.left, node.comparators[0])
+            return self._translate_operation(node, node.ops[0], node.left, node.comparators[0])
         if isinstance(node, ast.BoolOp):
             sign = " && " if isinstance(node.op, ast.And) else " || "
-            parts = [_text(self._value(each)) for each in node.values]
+            parts = [_c_expression(self._translate_expression(each)) for each in node.values]
             return _Scalar(f"({sign.join(parts)})", "int")
-        raise self._unsupported(node)
+        raise self._unsupported_error(node)
 
-    def _operation(self, node: ast.AST, op: ast.AST, left: ast.expr, right: ast.expr) -> Any:
-        a, b = self._value(left), self._value(right)
+    def _translate_operation(
+        self, node: ast.AST, op: ast.AST, left: ast.expr, right: ast.expr
+    ) -> Any:
+        a, b = self._translate_expression(left), self._translate_expression(right)
         if type(op) not in _OPERATORS:
-            raise self._unsupported(node)
+            raise self._unsupported_error(node)
         sign, calculate = _OPERATORS[type(op)]
         if not isinstance(a, _Scalar) and not isinstance(b, _Scalar):
             return calculate(a, b)
-        kinds = {_kind(a), _kind(b)}
+        kinds = {_c_type(a), _c_type(b)}
         needed = {"%": {"int"}, "/": {"double"}}.get(sign, kinds)
         if kinds != needed:
-            raise self._unsupported(node, f"with {' and '.join(sorted(kinds))}")
+            raise self._unsupported_error(node, f"with {' and '.join(sorted(kinds))}")
         kind = "int" if isinstance(op, ast.cmpop) or kinds == {"int"} else "double"
-        return _Scalar(f"({_text(a)} {sign} {_text(b)})", kind)
+        return _Scalar(f"({_c_expression(a)} {sign} {_c_expression(b)})", kind)
 
-    def _subscript(self, value: Any, node: ast.expr) -> Any:
+    def _translate_subscript(self, value: Any, node: ast.expr) -> Any:
         if isinstance(node, ast.Tuple):
             for each in node.elts:
-                value = self._subscript(value, each)
+                value = self._translate_subscript(value, each)
             return value
         if isinstance(node, ast.Slice):
-            start = 0 if node.lower is None else self._value(node.lower)
-            stop = value.shape[0] if node.upper is None else self._value(node.upper)
+            start = 0 if node.lower is None else self._translate_expression(node.lower)
+            stop = value.shape[0] if node.upper is None else self._translate_expression(node.upper)
             if node.step is not None or not isinstance(start, int) or not isinstance(stop, int):
-                raise self._unsupported(node)
+                raise self._unsupported_error(node)
             text = f"({value.text} + {start})" if start else value.text
             return _Array(text, (stop - start, *value.shape[1:]), value.array)
-        index = self._value(node)
+        index = self._translate_expression(node)
         if not isinstance(value, _Array):
             return value[index]
-        text = f"{value.text}[{_bare(_text(index))}]"
+        text = f"{value.text}[{_remove_outer_parentheses(_c_expression(index))}]"
         if value.shape[1:]:
             return _Array(text, value.shape[1:], value.array)
         return _Scalar(text, "double", value.array)
 
-    def _call(self, function: Any, values: list[Any]) -> Any:
+    def _translate_call(self, function: Any, values: list[Any]) -> Any:
         if function is len and isinstance(values[0], _Array):
             size = values[0].shape[0]
             return size if isinstance(size, int) else _Scalar(size, "int", constant=True)
         if function in _HELPERS:
             name, kind = _HELPERS[function]
-            return _Scalar(f"{name}({', '.join(map(_text, values))})", kind)
+            return _Scalar(f"{name}({', '.join(map(_c_expression, values))})", kind)
         if hasattr(function, "py_func"):
-            return self._call_of_c(function, values)
+            return self._translate_c_call(function, values)
         if inspect.isfunction(function):
-            return self._expanded(function, values)
+            return self._expand_call(function, values)
         raise ValueError(f"{self.name}: a call of {function!r} cannot be translated to C")
 
-    def _call_of_c(self, function: Any, values: list[Any]) -> _Scalar:
+    def _translate_c_call(self, function: Any, values: list[Any]) -> _Scalar:
         given = dict(zip(inspect.signature(function.py_func).parameters, values, strict=True))
         kinds = {
-            name: value.shape if isinstance(value, _Array) else _kind(value)
+            name: value.shape if isinstance(value, _Array) else _c_type(value)
             for name, value in given.items()
         }
-        called = self._translator.add(function, **kinds)
+        called = self._translator.translate_function(function, **kinds)
         passed = []
         for name, value in given.items():
-            passed.append(_bare(_text(value)))
+            passed.append(_remove_outer_parentheses(_c_expression(value)))
             if isinstance(value, _Array):
                 passed += [size for size in value.shape if isinstance(size, str)]
                 if name in called.written:
                     self.written.add(value.array)
         return _Scalar(f"{called.name}({', '.join(passed)})", called.kind)
 
-    def _expanded(self, function: Any, values: list[Any]) -> Any:
-        tree, scope = _parsed(function)
+    def _expand_call(self, function: Any, values: list[Any]) -> Any:
+        tree, scope = _parse_source(function)
         outer = self._values, self._globals, self._expanding
         # An element may be read later, because the expanded function writes only at its end.
         values = [
-            value if isinstance(value, _Scalar) and value.array else self._stored(value)
+            value if isinstance(value, _Scalar) and value.array else self._store_in_variables(value)
             for value in values
         ]
         names = [argument.arg for argument in tree.args.args]
         self._values, self._globals = dict(zip(names, values, strict=True)), scope
         self._expanding, result = True, None
         *body, last = tree.body
-        self._block(body)
+        self._translate_block(body)
         if isinstance(last, ast.Return) and last.value is not None:
-            result = self._value(last.value)
+            result = self._translate_expression(last.value)
         else:
-            self._block([last])
+            self._translate_block([last])
         self._values, self._globals, self._expanding = outer
         return result
 
-    def _unsupported(self, node: ast.AST, why: str = "") -> ValueError:
+    def _unsupported_error(self, node: ast.AST, why: str = "") -> ValueError:
         what = f"{self.name}: {ast.unparse(node)!r} {why}".rstrip()
         return ValueError(f"{what} cannot be translated to C")
 
 
-def _parsed(function: Any) -> tuple[ast.FunctionDef, dict[str, Any]]:
+def _parse_source(function: Any) -> tuple[ast.FunctionDef, dict[str, Any]]:
     tree = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
     assert isinstance(tree, ast.FunctionDef)
     return tree, vars(builtins) | function.__globals__
 
 
-def _kind(value: Any) -> str:
+def _c_type(value: Any) -> str:
     if isinstance(value, _Scalar):
         return value.kind
     return "double" if isinstance(value, float) else "int"
 
 
-def _text(value: Any) -> str:
+def _c_expression(value: Any) -> str:
     if isinstance(value, (_Scalar, _Array)):
         return value.text
     text = repr(float(value)) if isinstance(value, float) else str(int(value))
     return f"({text})" if value < 0 else text
 
 
-def _bare(text: str) -> str:
+def _remove_outer_parentheses(text: str) -> str:
     depth = 0
     for k, letter in enumerate(text):
         depth += (letter == "(") - (letter == ")")
