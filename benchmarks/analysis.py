@@ -48,7 +48,7 @@ from drake_teleop.lab.analysis.period_map import (
     delay_steps,
     sampled_two_port,
 )
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
@@ -194,7 +194,7 @@ def simulated_margin(axis: OneAxis, sampling: Sampling, longest: float = LONGEST
 
 def held(grip: str, **fields: float) -> OneAxis:
     """The station's axis in this hand."""
-    hand = GRIPS[grip]
+    hand = GRIP_IMPEDANCES[grip]
     axis = OneAxis(hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness)
     return replace(axis, **fields)
 

@@ -44,8 +44,8 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.lab import new_station
 from drake_teleop.lab.run import run_command
 from drake_teleop.station.scenario import LoadScenario
-from drake_teleop.station.slave.arm import PHI, SLIDES, ArmModel, pose_into
-from drake_teleop.station.slave.plant import ParseSlave, finalize
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, PHI_COLUMN, ArmModel, pose_into
+from drake_teleop.station.slave.plant import ParseSlave, finalize_plant
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
 
@@ -244,7 +244,7 @@ def _append(found: Path, values: dict[str, Any]) -> None:
 def _read_package(file: ArmFile) -> tuple[ArmModel, list[str]]:
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, Slave(model=str(file.path), sensor_frame=file.frame, tool=_TOOL))
-    finalize(plant)
+    finalize_plant(plant)
     arm, assumed = parsed.arm()
     pose_into(arm.table, np.zeros(arm.num_joints), np.empty(7))
     return arm, [*parsed.assumptions, *assumed]
@@ -287,7 +287,7 @@ def compare(arm: ArmModel, reference: Reference, name: str) -> dict[str, Any]:
         "position_m": max(float(np.linalg.norm(X[:3, 3])) for X in off),
         "rotation_rad": max(float(np.linalg.norm(X[:3, :3] - np.eye(3))) for X in off) / 2**0.5,
         "mass_beyond_kg": float(arm.phi_load[0]) - _TOOL.mass - reference.mass_beyond,
-        "mass_moved_kg": float(arm.table[:, PHI].sum()) - _TOOL.mass - reference.mass_moved,
+        "mass_moved_kg": float(arm.table[:, PHI_COLUMN].sum()) - _TOOL.mass - reference.mass_moved,
     }
     differs = [
         f"{key} {figures[key]:.3g}"
@@ -297,7 +297,7 @@ def compare(arm: ArmModel, reference: Reference, name: str) -> dict[str, Any]:
         if not abs(figures[key]) <= most
     ]  # fmt: skip
     for k, joint in enumerate(joints):
-        slides = arm.table[k, SLIDES] != 0.0
+        slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
         stated = joint.lower < joint.upper and not (slides and np.isinf(joint.upper))
         for what, mine, other, counts in (
             ("lower", arm.lower[k], joint.lower, stated),

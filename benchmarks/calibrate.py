@@ -31,7 +31,12 @@ from scipy.signal import lfilter
 
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
+from drake_teleop.load.tolerance import (
+    Tolerance,
+    read_tolerance,
+    tolerances_in_units,
+    values_of_required,
+)
 from drake_teleop.robots.calibration import Evaluation, calibrate
 from drake_teleop.robots.recording import ReadingRecorder
 from drake_teleop.robots.streams import Reading
@@ -145,9 +150,9 @@ def judged(at: Evaluation, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
     """Errors over tolerances, and which intervals hold, at a look."""
     assert at.found is not None
     found = at.found.identification.phi
-    error = np.abs(values_of(tolerance, found) - values_of(tolerance, phi)) / sizes_of(
-        tolerance, phi
-    )
+    error = np.abs(
+        values_of_required(tolerance, found) - values_of_required(tolerance, phi)
+    ) / tolerances_in_units(tolerance, phi)
     return {"t": at.t, "error": error.tolist(), "held": (error <= at.half).tolist()}
 
 

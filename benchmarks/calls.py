@@ -26,7 +26,7 @@ from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
 from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.load.contact.detection import SIZE, detection_update
+from drake_teleop.load.contact.detection import MEMORY_SIZE, update_statistics
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -34,10 +34,10 @@ from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_SIZE,
     WristSensorConfig,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
 )
-from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.station import MakeTeleopStation
 
 PERIOD = 1 / 8000  # [s] of the sensor
@@ -66,23 +66,23 @@ def seconds(call: Callable[[], Any], rounds: int) -> float:
 @njit
 def _read_often(constants, memory, noise, truth, reading, count):  # type: ignore[no-untyped-def]
     for _ in range(count):
-        read_into(constants, memory, noise, truth, reading)
+        read_sensor_into(constants, memory, noise, truth, reading)
 
 
 def reading(config: WristSensorConfig) -> tuple[float, float]:
     """One sample of six joints through the chain, and the same interpreted [s]."""
     rng = np.random.default_rng(0)
-    constants, memory = sensor_chain(config, 6, PERIOD)
+    constants, memory = sensor_chain_constants(config, 6, PERIOD)
     noise = rng.standard_normal(NOISE_SIZE)
     rest = constants, memory, noise, rng.normal(size=21), np.empty(19)
     ours = seconds(lambda: _read_often(*rest, 2000), 5) / 2000
-    return ours, seconds(lambda: read_into.py_func(*rest), 20)
+    return ours, seconds(lambda: read_sensor_into.py_func(*rest), 20)
 
 
 @njit
 def _detect_often(memory, wrenches, motion, parameters):  # type: ignore[no-untyped-def]
     for i in range(len(wrenches)):
-        detection_update(memory, wrenches[i], *motion, parameters, 1.0, 0.0, 0.0)
+        update_statistics(memory, wrenches[i], *motion, parameters, 1.0, 0.0, 0.0)
 
 
 def detection() -> tuple[float, float]:
@@ -92,9 +92,9 @@ def detection() -> tuple[float, float]:
     floor = NoiseFloor(noise, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.full(6, 0.5))
     wrenches = np.random.default_rng(0).normal(size=(20_000, 6)) * noise
     motion = (np.array([0.0, 0.0, 9.81]), still, still, still)
-    memory, parameters = np.zeros(SIZE), tuple(floor.parameters)
+    memory, parameters = np.zeros(MEMORY_SIZE), tuple(floor.compiled_parameters)
     ours = seconds(lambda: _detect_often(memory, wrenches, motion, parameters), 3) / len(wrenches)
-    update = detection_update.py_func
+    update = update_statistics.py_func
     slow = seconds(lambda: update(memory, wrenches[0], *motion, parameters, 1.0, 0.0, 0.0), 20)
     return ours, slow
 
@@ -141,7 +141,12 @@ def linearisation() -> tuple[float, float]:
     pressing = (0.0, 0.0, -0.04)
     ours = seconds(lambda: linearize(scenario, load_estimate=estimate, displacement=pressing), 1)
     station = MakeTeleopStation(scenario, load_estimate=estimate)
-    return ours, seconds(lambda: advance(MakeSimulator(station, scenario.simulation), 1.0), 1)
+    return ours, seconds(
+        lambda: advance_without_garbage_collection(
+            MakeSimulator(station, scenario.simulation), 1.0
+        ),
+        1,
+    )
 
 
 def measure() -> dict[str, dict[str, float]]:

@@ -39,8 +39,8 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import fit_noise_floor, statistics
-from drake_teleop.load.contact.noise_floor import STATISTICS, NoiseFloor, finite_covariance
+from drake_teleop.load.contact.detection import fit_noise_floor, statistics_of_log
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, NoiseFloor, limit_covariance
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 
@@ -132,7 +132,7 @@ def windows(floor: NoiseFloor, rows: tuple[Array, ...]) -> Array:
     length = WARM + WINDOW
     return np.stack(
         [
-            statistics(floor, *(x[k : k + length] for x in rows))[WARM:]
+            statistics_of_log(floor, *(x[k : k + length] for x in rows))[WARM:]
             for k in range(0, len(rows[0]) - length + 1, length)
         ]
     )
@@ -170,7 +170,7 @@ def measure() -> dict[str, Any]:
             calm, elsewhere, untouched, touched = (
                 (rows[0] - mean, *rows[1:]) for rows in (calm, elsewhere, untouched, touched)
             )
-        P = finite_covariance(phi, result.covariance)
+        P = limit_covariance(phi, result.covariance)
         if fixed or kind == "raw":
             P = np.zeros((16, 16))
         if fixed:
@@ -179,7 +179,7 @@ def measure() -> dict[str, Any]:
         else:
             floor = fit_noise_floor(*calm, P)
         other, free, found = (windows(floor, rows) for rows in (elsewhere, untouched, touched))
-        for i, name in enumerate(STATISTICS):
+        for i, name in enumerate(STATISTIC_NAMES):
             peaks = free[:, :, i].max(axis=1)
             threshold = free_threshold(peaks, 0.01)
             alarms = found[:, :, i] >= threshold
@@ -198,7 +198,7 @@ def measure() -> dict[str, Any]:
                 }
             table.append(row)
     start = time.thread_time()
-    statistics(floor, *calm)
+    statistics_of_log(floor, *calm)
     return {"table": table, "us_a_sample": 1e6 * (time.thread_time() - start) / len(calm[0])}
 
 
@@ -210,7 +210,7 @@ CHUNK, SECOND, EACH, BEFORE = 300_000, 1000, 300, 500
 
 def compared(floor: NoiseFloor, rows: tuple[Array, ...]) -> Array:
     """(N, 4) level, glr, and the cumulative sum with each slack."""
-    found = [statistics(floor, *rows, slack=slack) for slack in SLACKS]
+    found = [statistics_of_log(floor, *rows, slack=slack) for slack in SLACKS]
     return np.column_stack([found[0][:, 0], found[0][:, 2], *(x[:, 1] for x in found)])
 
 
@@ -223,7 +223,7 @@ def at_equal_rate(gains: Array, lag: int, hours: float) -> dict[str, Any]:
     def rows(samples: int, seed: int, push: Array | None = None) -> tuple[Array, ...]:
         return Record(samples, seed, push, gains, lag).rows("eliminated", phi, offsets)
 
-    floor = fit_noise_floor(*rows(120_000, 2), finite_covariance(phi, result.covariance))
+    floor = fit_noise_floor(*rows(120_000, 2), limit_covariance(phi, result.covariance))
     chunks = round(hours * 3600 * SECOND / CHUNK)
     peaks = [
         compared(floor, rows(CHUNK, 100 + k)).reshape(-1, SECOND, 2 + len(SLACKS)).max(axis=1)

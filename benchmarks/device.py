@@ -37,7 +37,7 @@ from drake_teleop.live.scenarios import live_scenario, with_task_space_device
 from drake_teleop.live.session import Session
 from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.station.environment.solids import Wall
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.scenario import LoadScenario, replace
 
 LEAF, WALL = 5100 / 17.5, 6000.0  # N/m at the hand
@@ -144,8 +144,8 @@ def passive(measured: np.ndarray) -> dict[str, float]:
     delays = {f"{n}_late": np.array([n]) for n in (0, 1, 2, 5)} | {"as_measured": measured}
     for observe, word in ((True, "observed"), (False, "bare")):
         for name, late in delays.items():
-            at_leaf = [pressed(LEAF, grip, late, observe=observe) for grip in GRIPS]
-            at_wall = {grip: pressed(WALL, grip, late, observe=observe) for grip in GRIPS}
+            at_leaf = [pressed(LEAF, grip, late, observe=observe) for grip in GRIP_IMPEDANCES]
+            at_wall = {grip: pressed(WALL, grip, late, observe=observe) for grip in GRIP_IMPEDANCES}
             figures[f"leaf_{name}_{word}_least_energy_j"] = min(energy for energy, _ in at_leaf)
             for grip, (_, moved) in at_wall.items():
                 figures[f"wall_{name}_{word}_{grip}_moves_m"] = moved
@@ -255,7 +255,7 @@ def main() -> None:
     with without_garbage_collection():  # as in the server
         figures, late = linked(options.seconds)
     figures |= silent() | passive(late) | fuzzed()
-    for grip in GRIPS:
+    for grip in GRIP_IMPEDANCES:
         for observe, word in ((True, "observed"), (False, "bare")):
             least, moved = in_station(grip, observe=observe)
             figures[f"station_wall_{word}_{grip}_least_energy_j"] = least

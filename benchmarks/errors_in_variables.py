@@ -24,9 +24,9 @@ import numpy as np
 from instrumental import RecursiveInstrumentalVariables
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.identification import PARAMETERS
+from drake_teleop.load.identification import PARAMETER_NAMES
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
@@ -125,7 +125,7 @@ def study(
     """Errors (seeds, 16) of each estimator after 1.5 s; the records are those from `first` on."""
     errors: dict[str, list[np.ndarray]] = {}
     wrench_std, (s, omega, alpha) = LEVELS[level]
-    noise = Noise(np.repeat(wrench_std, 3), s, omega, alpha)
+    noise = NoiseStd(np.repeat(wrench_std, 3), s, omega, alpha)
     for seed in range(first, first + seeds):
         F, measured, commanded = record(level, seed)
         for name, estimator in estimators(level).items():
@@ -147,7 +147,9 @@ def summary(level: str, errors: dict[str, np.ndarray]) -> dict[str, Any]:
     standard = {n: rows.std(axis=0, ddof=1) / len(rows) ** 0.5 for n, rows in errors.items()}
     biased = np.abs(means["RLS"]) > 3.0 * standard["RLS"]
     com = PHI[1:4] / PHI[0]
-    figures: dict[str, Any] = {"biased": [n for n, b in zip(PARAMETERS, biased, strict=True) if b]}
+    figures: dict[str, Any] = {
+        "biased": [n for n, b in zip(PARAMETER_NAMES, biased, strict=True) if b]
+    }
     # A fifth of the bias of RLS in standard errors of the best unbiased estimator's mean.
     of_best = 0.2 * np.abs(means["RLS"]) / least * len(errors["RLS"]) ** 0.5
     figures["a_fifth_over_least_standard_error"] = of_best[biased].tolist()
@@ -214,7 +216,7 @@ def main() -> None:
         print(f"{'':8s}" + "".join(f"{name:>16s}" for name in names) + "  a fifth / least s.e.")
         deviation = errors["RLS"].std(axis=0)
         fifth = iter(figures["a_fifth_over_least_standard_error"])
-        for i, parameter in enumerate(PARAMETERS):
+        for i, parameter in enumerate(PARAMETER_NAMES):
             if parameter in figures["biased"]:
                 row = "".join(f"{errors[n][:, i].mean() / deviation[i]:16.3f}" for n in names)
                 print(f"{parameter:8s}{row}{next(fifth):10.2f}")

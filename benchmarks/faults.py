@@ -36,7 +36,7 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import true_load
-from drake_teleop.load.regressor import TIME
+from drake_teleop.load.regressor import SAMPLE_TIME_INDEX
 from drake_teleop.station import master_side as master
 from drake_teleop.station import slave_side as slave
 from drake_teleop.station import station as station_module
@@ -44,10 +44,14 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.master.phantom import FORCE_LIMIT
 from drake_teleop.station.operator.operator import MinimumJerk, Sine
 from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.passivity.safe_state import STOP_TIME
+from drake_teleop.station.passivity.safe_state import STOP_TIME_S
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+)
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
@@ -252,7 +256,7 @@ def change_of(fault: Fault, station: Diagram) -> Change:
             held.append(x.copy())
             x[:] = held[0]
         elif fault.kind == "clock":
-            x[TIME] += fault.size
+            x[SAMPLE_TIME_INDEX] += fault.size
         else:
             x[fault.index] = fault.size
 
@@ -281,7 +285,7 @@ class Running:
         self.station, self.taps = tapped_station(self.scenario)
         simulator = MakeSimulator(self.station, self.scenario.simulation)
         simulator.Initialize()
-        advance(simulator, BEFORE)
+        advance_without_garbage_collection(simulator, BEFORE)
         self._context = simulator.get_context().Clone()
 
     def run(self, fault: Fault) -> SimulationResult:
@@ -294,7 +298,7 @@ class Running:
         for tap in self.taps.get(fault.place, []):
             tap.change = change
         try:
-            advance(simulator, fault.start)
+            advance_without_garbage_collection(simulator, fault.start)
             if fault.kind == "scales":
                 block = GetBlock(self.station, "force_scaling")
                 block.SetScales(
@@ -304,12 +308,12 @@ class Running:
                     gamma=1.0 - 0.5 * fault.size,
                     force_scale=self.scenario.force_scaling.force_scale * (1.0 + fault.size),
                 )
-            advance(simulator, END)
+            advance_without_garbage_collection(simulator, END)
         finally:
             for tap in self.taps.get(fault.place, []):
                 tap.change = None
             GetBlock(self.station, "wrist_sensor").offset[:] = offset
-        return read_log(simulator, 0.0)
+        return read_recorded_signals(simulator, 0.0)
 
 
 def over_the_network(name: str, fault: Fault) -> SimulationResult:
@@ -319,8 +323,8 @@ def over_the_network(name: str, fault: Fault) -> SimulationResult:
         station, _ = tapped_station(scenario)
         simulator = MakeSimulator(station, scenario.simulation)
         simulator.Initialize()
-        advance(simulator, END)
-        return read_log(simulator, 0.0)
+        advance_without_garbage_collection(simulator, END)
+        return read_recorded_signals(simulator, 0.0)
 
 
 @dataclass
@@ -354,7 +358,7 @@ class Count:
         largest = float(felt[later].max())
         step = float(np.linalg.norm(np.diff(force, axis=0), axis=1)[later[1:]].max())
         # The sample is too old after half of the timeout; what was sent before is on its way.
-        blind = (t > fault.start + TIMEOUT + STOP_TIME + LATE) & (t < fault.end - 1e-3)
+        blind = (t > fault.start + TIMEOUT + STOP_TIME_S + LATE) & (t < fault.end - 1e-3)
         left = float(felt[blind].max(initial=0.0)) if fault.blinds else 0.0
         self.not_finite += not np.isfinite(force).all()
         self.too_large += not largest <= FORCE_LIMIT * (1 + 1e-12)

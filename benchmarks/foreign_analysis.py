@@ -46,7 +46,7 @@ from drake_teleop.lab.analysis.two_port import absorb_impedances
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
-from drake_teleop.station.operator.operator import GRIPS, MinimumJerk
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES, MinimumJerk
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
@@ -86,7 +86,7 @@ def station_of(arm: str, models: Path | None) -> Scenario:
     if file:
         slave = dataclasses.replace(slave, model=str(models / file) if models else "")
     scenario, master = LoadScenario("free_motion_force"), Master(model=DEVICES[arm])
-    own_period = master.own_period(scenario.rates.hand_hz)
+    own_period = master.sampling_period(scenario.rates.hand_hz)
     rate = scenario.rates.hand_hz if own_period is None else 1 / own_period
     return replace(
         scenario,
@@ -147,7 +147,7 @@ def pressed(scenario: Scenario, grip: str, stiffness: float, share: float) -> fl
     )
     scale, deep = share * scenario.force_scaling.force_scale, min(_DEEPEST, _PRESS / stiffness)
     reach = deep / scenario.kinematic_scaling.translation_scale
-    push = scale * stiffness * deep / GRIPS[grip].stiffness
+    push = scale * stiffness * deep / GRIP_IMPEDANCES[grip].stiffness
     press = MinimumJerk(t_start=0.1, duration=1.0, translation=[0.0, 0.0, -reach - push])
     held = replace(
         scenario,

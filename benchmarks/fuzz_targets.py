@@ -32,7 +32,7 @@ from drake_teleop.cli import main as cli
 from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 from drake_teleop.common.files import models_dir, scenarios_dir, studies_dir
 from drake_teleop.common.parquet_sizes import check_parquet_content
-from drake_teleop.common.texts import read_json, yaml_data
+from drake_teleop.common.texts import parse_yaml, read_json
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
 from drake_teleop.live.inputs import RANGES, Inputs, csv_header, range_of, read_inputs
@@ -44,7 +44,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.read.bags import read_topic, topics_of
+from drake_teleop.logs.read.bags import list_topics, read_topic
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots import udp
 from drake_teleop.robots.compensator import Compensator
@@ -54,7 +54,7 @@ from drake_teleop.station.channel import network
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, ScenarioFromData
-from drake_teleop.station.scenario_reference import commented
+from drake_teleop.station.scenario_reference import to_commented_yaml
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
@@ -97,8 +97,8 @@ def _scenario(path: Path) -> None:
     scenario = LoadScenario(path)
     if path.stat().st_size % 4:  # the rest takes longer
         return
-    text = commented(scenario)
-    if ScenarioFromData(yaml_data(text, "printed", tagged=True), "printed") != scenario:
+    text = to_commented_yaml(scenario)
+    if ScenarioFromData(parse_yaml(text, "printed", tagged=True), "printed") != scenario:
         raise AssertionError("what `drake-teleop scenario` prints is another scenario")
 
 
@@ -313,7 +313,7 @@ def _messages(types: Any, old: bool) -> Any:
 
 
 def _bag(path: Path) -> None:
-    topics = topics_of(path)
+    topics = list_topics(path)
     for topic in topics[:5]:
         read_topic(path, topic.name)
 
@@ -450,7 +450,7 @@ def _traces(suffix: str) -> Callable[[Path], list[bytes]]:
 
 def _trace(path: Path) -> None:
     config = network.NetworkConfig(trace=str(path))
-    network.parameters(config, 0, network.FORWARD, 1e-3)
+    network.network_parameters(config, 0, network.FORWARD, 1e-3)
     if not network.mean_delay(config) <= network.longest_delay(config) + 1e-9:
         raise AssertionError("the mean delay is longer than the longest")
 
@@ -480,14 +480,14 @@ def _exchange(path: Path) -> None:
     known = data if isinstance(data, dict) else {}
     scenario = ScenarioFromData({"channel": known.get("channel", {})}, str(path))
     numbers = _floats(known.get("packets"))
-    for direction, config in enumerate(scenario.channel.lines()):
-        p = network.parameters(config, 1, direction, 1e-3)
+    for direction, config in enumerate(scenario.channel.networks_of_directions()):
+        p = network.network_parameters(config, 1, direction, 1e-3)
         neutral, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
-        state = network.initial_state(p, neutral)
+        state = network.initial_network_state(p, neutral)
         sent = [np.resize(np.roll(numbers, k), PACKET_SIZE) for k in range(60)]
         for k, each in enumerate(sent):
-            network.send(p, state, k, each)
-            newest, fresh = network.receive(p, state, k, packet)
+            network.send_packet(p, state, k, each)
+            newest, fresh = network.receive_packet(p, state, k, packet)
             expected = sent[newest] if newest >= 0 else neutral
             if newest > k or (fresh and packet.tobytes() != expected.tobytes()):
                 raise AssertionError(f"packet {newest} came changed, or before it was sent")

@@ -18,7 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.station.operator.perception import NOTICED, Perception, perceive
+from drake_teleop.station.operator.perception import (
+    CONTACT_NOTICED_INDEX,
+    Perception,
+    perceive_contact,
+)
 
 Array = NDArray[np.float64]
 
@@ -41,7 +45,7 @@ def noticed(t: Array, v: Array, free: Array, contact: float) -> bool:
     way = v[np.searchsorted(t, _TOUCH)]
     rise = np.clip((t - _TOUCH) / _RISE, 0.0, 1.0)[:, None]
     force = free + _SCALE * contact * rise * way / np.linalg.norm(way)
-    seen = perceive(t, force, v, Perception(), 0.0)[:, NOTICED]
+    seen = perceive_contact(t, force, v, Perception(), 0.0)[:, CONTACT_NOTICED_INDEX]
     return bool(seen[(t >= _TOUCH) & (t < _TOUCH + _WITHIN)].any())
 
 

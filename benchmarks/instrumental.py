@@ -23,18 +23,18 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
     add_outer_product,
-    eliminate,
-    forget,
-    invert,
+    allocate_scratch,
+    eliminate_rows,
+    forget_samples,
+    invert_matrix,
+    nonzero_regressor_terms,
     residual_products,
-    scratch,
-    solve,
-    terms,
+    solve_linear_system,
     weighted_gram,
     weighted_right,
-    write_z,
+    write_products_vector,
 )
-from drake_teleop.load.regressor import MOTION, WRENCH
+from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
 INSTRUMENTS = slice(15, 24)  # motion from a second source, after the sample
 
@@ -65,7 +65,7 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
         S[c, c] += _NOISE_SAMPLES * noise_std[c] ** 2 + _ROUNDING_SQUARE * measured[13 + c, 13 + c]
         for d in range(6):
             S[c, d] /= measured[0, 0] + _NOISE_SAMPLES
-    invert(S, inverse, W)
+    invert_matrix(S, inverse, W)
     weighted_gram(instruments, W, index, factors, E, MRg, 0)
     weighted_gram(mixed, W, index, factors, E, MRg, 16)
     weighted_right(mixed[:, 13:].T, W, index, factors, g)
@@ -76,7 +76,7 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
             A[i, j] = 0.0
         A[i, i] = information[i]
         A[i, 16] = memory[57, i]
-    eliminate(MRg)
+    eliminate_rows(MRg)
     for k in range(16):
         pivot = 1.0 / MRg[k, k]
         for i in range(16):
@@ -95,19 +95,19 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
         samples: (N, 24) [wrench, s, omega, alpha, instruments (s, omega, alpha)].
         forgetting: factor per sample on the weight of the past.
     """
-    space, MRg, A = scratch(), np.empty((16, 33)), np.empty((16, 17))
+    space, MRg, A = allocate_scratch(), np.empty((16, 33)), np.empty((16, 17))
     y, z = np.empty(19), np.empty(19)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            forget(memory, theta, information, forgetting)
-        wrench = samples[n, WRENCH]
-        write_z(wrench, samples[n, MOTION], z)
-        write_z(wrench, samples[n, INSTRUMENTS], y)
+            forget_samples(memory, theta, information, forgetting)
+        wrench = samples[n, SAMPLE_WRENCH]
+        write_products_vector(wrench, samples[n, SAMPLE_MOTION], z)
+        write_products_vector(wrench, samples[n, INSTRUMENTS], y)
         add_outer_product(z, z, memory[:19])
         add_outer_product(y, z, memory[19:38])
         add_outer_product(y, y, memory[38:57])
         riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A)
-        solve(A)
+        solve_linear_system(A)
         copy_into(theta, 0, A[:, 16], 0, 16)
 
 
@@ -125,9 +125,9 @@ class RecursiveInstrumentalVariables(MomentEstimator):
     def covariance_of(self, theta: Array, memory: Array) -> Array:
         """Return the covariance (16, 16), (R^T M^-1 R + prior)^-1."""
         A, MRg = np.empty((16, 17)), np.empty((16, 33))
-        options = (self._noise_std, 1.0 / self._prior, *terms())
-        riv_normal_equations(memory, theta, *options, scratch(), MRg, A)
-        return self._within_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
+        options = (self._noise_std, 1.0 / self._prior, *nonzero_regressor_terms())
+        riv_normal_equations(memory, theta, *options, allocate_scratch(), MRg, A)
+        return self._limit_to_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
 
     def learn(
         self,
@@ -144,5 +144,5 @@ class RecursiveInstrumentalVariables(MomentEstimator):
         self._samples += len(rows[0])
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
-        options = (self._noise_std, self._forgetting, 1.0 / self._prior, *terms())
+        options = (self._noise_std, self._forgetting, 1.0 / self._prior, *nonzero_regressor_terms())
         riv_update(theta, memory, samples, *options)

@@ -2,9 +2,9 @@
 
 `python benchmarks/intervals.py [--json FILE] [--seeds N]` identifies the same load N times (500)
 from the same motion with new noise of six colours, counts for each of the 16 parameters how often
-the interval of `uncertainty.intervals` holds the truth, and prints the table. With 500 seeds the
-standard error of a count is 1 %. Then records that do not excite some parameters, in the same
-noise: how often each of these was called identified.
+the interval of `uncertainty.confidence_intervals` holds the truth, and prints the table. With 500
+seeds the standard error of a count is 1 %. Then records that do not excite some parameters, in the
+same noise: how often each of these was called identified.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, lfilter
 
-from drake_teleop.load.batch.uncertainty import intervals
-from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.batch.uncertainty import confidence_intervals
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
@@ -103,7 +103,7 @@ def coverage(colour: str, seeds: int, seconds: float = SECONDS) -> dict[str, Arr
         rng = np.random.default_rng([seed, list(COLOURS).index(colour)])
         noise = NOISE * coloured_noise(rng, len(s), colour)
         result = identify(ideal + noise, s, omega, alpha, noise=NOISE)
-        low, high = intervals(result)
+        low, high = confidence_intervals(result)
         held[seed] = (low <= TRUTH) & (high >= TRUTH)
         identified[seed] = result.identifiable
         error = np.concatenate([result.offsets, result.phi]) - TRUTH
@@ -119,7 +119,7 @@ def coverage(colour: str, seeds: int, seconds: float = SECONDS) -> dict[str, Arr
 
 def unexcited_records() -> dict[str, tuple[tuple[Array, Array, Array], tuple[str, ...]]]:
     """Name -> (motion, the parameters that it cannot tell)."""
-    inertia = PARAMETERS[10:]
+    inertia = PARAMETER_NAMES[10:]
     up = np.random.default_rng(1).normal(size=(24, 3))
     poses = 9.81 * up / np.linalg.norm(up, axis=1, keepdims=True)
     still = np.zeros((2400, 3))
@@ -133,7 +133,7 @@ def unexcited_records() -> dict[str, tuple[tuple[Array, Array, Array], tuple[str
         "24 poses": ((np.repeat(poses, 100, axis=0), still, still), inertia),
         "one axis": (one_axis, ("I_xx", "I_xz", "I_zz")),
         "one axis, slow": (slow, inertia),
-        "one pose": (one_pose, PARAMETERS[6:]),
+        "one pose": (one_pose, PARAMETER_NAMES[6:]),
     }
 
 
@@ -151,7 +151,7 @@ def false_verdicts(name: str, seeds: int) -> dict[str, int]:
         noise = NOISE * coloured_noise(rng, len(s), "AR(1) 0.9, 1 kHz")
         result: Identification = identify(ideal + noise, s, omega, alpha, noise=NOISE)
         for parameter in unknown:
-            counts[parameter] += bool(result.identifiable[PARAMETERS.index(parameter)])
+            counts[parameter] += bool(result.identifiable[PARAMETER_NAMES.index(parameter)])
     return counts
 
 
@@ -170,7 +170,7 @@ def main(arguments: list[str] | None = None) -> int:
         options.json.write_text(json.dumps(found, indent=2) + "\n")
     print(f"Coverage of nominal 95 % intervals [%], {options.seeds} seeds, {SECONDS:.0f} s")
     print("parameter " + "".join(f"{name:>24}" for name in COLOURS))
-    for i, name in enumerate(PARAMETERS):
+    for i, name in enumerate(PARAMETER_NAMES):
         print(f"{name:<10}" + "".join(f"{100.0 * share:24.1f}" for share in every[:, i]))
     print(f"smallest {100.0 * every.min():.1f}, largest {100.0 * every.max():.1f}")
     print(f"\nCalled identified without excitation, of {options.seeds} (AR(1) 0.9)")

@@ -38,10 +38,10 @@ from pydrake.multibody.tree import Frame
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.station.slave.arm import (
-    PHI,
-    ROTATION,
-    SLIDES,
-    TRANSLATION,
+    IS_PRISMATIC_COLUMN,
+    PHI_COLUMN,
+    ROTATION_COLUMN,
+    TRANSLATION_COLUMN,
     ArmModel,
     forward_kinematics,
     jacobian,
@@ -54,13 +54,13 @@ from drake_teleop.station.slave.inverse_kinematics import (
 )
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
-    SINGULAR,
-    STEPS,
+    MAX_STEPS,
+    MIN_SINGULAR_VALUE_M,
     find_posture,
     follow_pose,
     orientation_length,
 )
-from drake_teleop.station.slave.plant import ParseSlave, finalize
+from drake_teleop.station.slave.plant import ParseSlave, finalize_plant
 
 Array = Any
 PERIOD = 5e-4
@@ -117,7 +117,7 @@ def arms(models: Path | None) -> dict[str, tuple[ArmModel, MultibodyPlant, Frame
     found = {}
     plant = MultibodyPlant(0.0)
     instance = ParseSlave(plant).instance
-    finalize(plant)
+    finalize_plant(plant)
     found["rx90"] = ArmModelFromPlant(plant, instance), plant, plant.GetFrameByName("sensor")
     with tempfile.TemporaryDirectory() as folder:
         files = {}
@@ -136,7 +136,7 @@ def arms(models: Path | None) -> dict[str, tuple[ArmModel, MultibodyPlant, Frame
         for name, (path, frame) in files.items():
             plant = MultibodyPlant(0.0)
             model = ParseModel(plant, path, frame)
-            finalize(plant)
+            finalize_plant(plant)
             arm = ArmModelFromPlant(plant, model.instance, frame)
             found[name] = arm, plant, plant.GetFrameByName(frame, model.instance)
     return found
@@ -202,7 +202,7 @@ class Follower:
         q = np.empty(len(self.q))
         status: int = follow_pose(
             self.arm.table, self.L, pose, self.q, self.arm.lower, self.arm.upper, self.max_step,
-            self.posture, PERIOD, SINGULAR, STEPS, q,
+            self.posture, PERIOD, MIN_SINGULAR_VALUE_M, MAX_STEPS, q,
         )  # fmt: skip
         self.q = q
         return status
@@ -265,10 +265,10 @@ class PinocchiosFollower:
 
         self.pin, self.model, self.q, last = pin, pin.Model(), q.copy(), 0
         for row in range(arm.num_joints + 1):
-            R = arm.table[row, ROTATION:TRANSLATION].reshape(3, 3)
-            X = pin.SE3(R, arm.table[row, TRANSLATION:PHI])
+            R = arm.table[row, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)
+            X = pin.SE3(R, arm.table[row, TRANSLATION_COLUMN:PHI_COLUMN])
             if row < arm.num_joints:
-                slides = arm.table[row, SLIDES] != 0.0
+                slides = arm.table[row, IS_PRISMATIC_COLUMN] != 0.0
                 kind = pin.JointModelPZ() if slides else pin.JointModelRZ()
                 last = self.model.addJoint(last, kind, X, f"j{row}")
         self.frame = self.model.addFrame(pin.Frame("S", last, 0, X, pin.FrameType.OP_FRAME))
@@ -364,7 +364,7 @@ def against_the_closed_form(arm: ArmModel, poses: int) -> dict[str, Any]:
         J = np.empty((6, 6))
         jacobian(arm.table, reference, J)
         J[3:] *= L
-        if np.linalg.svd(J)[1][5] < 2 * SINGULAR:
+        if np.linalg.svd(J)[1][5] < 2 * MIN_SINGULAR_VALUE_M:
             continue
         numeric, closed = Follower(arm, reference), ClosedForm(arm, reference)
         numeric.max_step = np.full(6, np.inf)

@@ -42,14 +42,23 @@ from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
-from drake_teleop.station.master.data_sheets import Master, figures_of
+from drake_teleop.station.master.data_sheets import Master, data_sheet_of
 from drake_teleop.station.master.numbers import HAND_MASS
-from drake_teleop.station.operator.operator import GRIPS, MinimumJerk, OperatorConfig, Sine
-from drake_teleop.station.oscillation import fast_part
+from drake_teleop.station.operator.operator import (
+    GRIP_IMPEDANCES,
+    MinimumJerk,
+    OperatorConfig,
+    Sine,
+)
+from drake_teleop.station.oscillation import high_pass
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+)
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
@@ -106,9 +115,11 @@ def draw(seed: int, index: int) -> Drawn:
     action, sigma, gamma = choose(ACTIONS), choose((0.0, 0.5, 1.0)), 1.0 + 2.0 * rng.random()
     force, frequency = 20.0 ** rng.random(), 1.0 + rng.random()
     scale = gamma / 17.5
-    peak = Master(model=device, figures=figures_of({"model": device})).device(0.0, 0.0).peak_force
+    peak = (
+        Master(model=device, figures=data_sheet_of({"model": device})).device(0.0, 0.0).peak_force
+    )
     force = min(force, PEAK_SHARE * peak, scale * ARMS[arm][4], scale * stiffness * MAX_DEPTH)
-    grips = [name for name, hand in GRIPS.items() if force / hand.stiffness < 0.04]
+    grips = [name for name, hand in GRIP_IMPEDANCES.items() if force / hand.stiffness < 0.04]
     return Drawn(
         arm,
         device,
@@ -204,7 +215,7 @@ def times_of(drawn: Drawn, round_trip: float) -> Times:
 def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
     """Return the scenario of a cell without passivity method, and its times."""
     slave, channel = slave_of(drawn.arm), channel_of(drawn.network)
-    times = times_of(drawn, sum(mean_delay(line) for line in channel.lines()))
+    times = times_of(drawn, sum(mean_delay(line) for line in channel.networks_of_directions()))
     base = replace(station_base("contact_transition", seed), slave=slave, wrist_sensor__ideal=True)
     nominal = NominalSlave(slave)
     tip = nominal.start_tip - [0.0, 0.0, GAP]
@@ -225,7 +236,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
         thing = Box(position=centre.tolist(), size=size.tolist(), **surface(drawn))
     scale = drawn.gamma / 17.5
     depth = GAP + drawn.force * (
-        1 / GRIPS[drawn.grip].stiffness + 1 / min(scale * drawn.stiffness, 1000.0)
+        1 / GRIP_IMPEDANCES[drawn.grip].stiffness + 1 / min(scale * drawn.stiffness, 1000.0)
     )
     moves: list[MinimumJerk | Sine] = []
 
@@ -251,7 +262,7 @@ def scenario_of(drawn: Drawn, seed: int) -> tuple[Scenario, Times]:
         base,
         simulation=dataclasses.replace(base.simulation, settle=SETTLE, duration=times.end),
         operator=OperatorConfig(grip=drawn.grip, intent=moves),
-        master=Master(model=drawn.device, figures=figures_of({"model": drawn.device})),
+        master=Master(model=drawn.device, figures=data_sheet_of({"model": drawn.device})),
         channel=channel,
         environment=[thing],
         force_scaling__sigma=drawn.sigma,
@@ -265,12 +276,12 @@ def simulated(scenario: Scenario, times: Times) -> SimulationResult:
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
-    advance(simulator, 1e-3 * round(1e3 * (SETTLE + times.let_go)))
+    advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.let_go)))
     master = station.GetSubsystemByName("master_side")
     master.GetSubsystemByName("operator")._impedance[:] = 0.0
     master.GetSubsystemByName("master_device")._constants[0][HAND_MASS] = 0.0
-    advance(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
-    return read_log(simulator, SETTLE)
+    advance_without_garbage_collection(simulator, 1e-3 * round(1e3 * (SETTLE + times.end)))
+    return read_recorded_signals(simulator, SETTLE)
 
 
 def measured(result: SimulationResult, scenario: Scenario, times: Times) -> dict[str, Any]:
@@ -296,7 +307,7 @@ def measured(result: SimulationResult, scenario: Scenario, times: Times) -> dict
     out = before / max(float(np.linalg.norm(before)), 1e-9)
     free = (hand[at : at + 2000] - hand[at]) @ out
     away = int(np.searchsorted(t, times.left))
-    fast = fast_part(t[held], rendered[held])
+    fast = high_pass(t[held], rendered[held])
     return {
         "pressed_N": float(np.linalg.norm(pressed)),
         "energy_J": float(energy.min()),

@@ -26,17 +26,17 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.identification import Identification, identified_object
+from drake_teleop.load.identification import Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.online.change import (
-    OFFSET_DRIFT,
-    STATES,
-    change_memory,
-    change_parameters,
-    identified_load,
+    OFFSET_DRIFT_STD,
+    STATE_NAMES,
+    change_detector_parameters,
+    detector_states_of_log,
+    identified_or_known_load,
+    initial_change_memory,
     new_load_age,
-    watch_load,
 )
 from drake_teleop.load.online.recursive import RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
@@ -127,7 +127,7 @@ def record(sensor: str, seed: int, kind: str = "free", load: np.ndarray = TOOL) 
 def known(sensor: str, load: np.ndarray = TOOL, seed: int = 10**6) -> Identification:
     """The load from a record of its own."""
     wrench_std, (s, omega, alpha) = SENSORS[sensor]
-    noise = Noise(np.repeat(wrench_std, 3), s, omega, alpha)
+    noise = NoiseStd(np.repeat(wrench_std, 3), s, omega, alpha)
     rows = record(sensor, seed, load=load)
     return identify_batch(*rows, method="total", noise=noise).identification
 
@@ -142,23 +142,23 @@ class Monitor:
         motion_std: np.ndarray,
         period: float = PERIOD,
         *,
-        offset_drift: Any = OFFSET_DRIFT,
+        offset_drift: Any = OFFSET_DRIFT_STD,
         **options: float,
     ) -> None:
         self.known, self.period, self.samples = known, period, 0
-        self.parameters = change_parameters(wrench_std, motion_std, period, **options)
+        self.parameters = change_detector_parameters(wrench_std, motion_std, period, **options)
         theta = np.concatenate([known.offsets, known.phi])
-        self.memory = change_memory(theta, known.covariance, offset_drift)
+        self.memory = initial_change_memory(theta, known.covariance, offset_drift)
 
     def watch(self, *rows: np.ndarray) -> np.ndarray:
         """Return the states (N,) for wrench, s, omega and alpha of N samples."""
         self.samples += len(rows[0])
-        return watch_load(self.memory, self.parameters, *rows)
+        return detector_states_of_log(self.memory, self.parameters, *rows)
 
     @property
     def load(self) -> Identification:
         """Known load; the new one once it is identified."""
-        return identified_load(self.memory, self.known)
+        return identified_or_known_load(self.memory, self.known)
 
     @property
     def changed_at(self) -> float:
@@ -181,22 +181,22 @@ def study(sensor: str, kind: str, seeds: int) -> dict[str, Any]:
         states = watch.watch(*record(sensor, seed, kind, total))
         highest.append(int(states.max()))
         last.append(int(states[-1]))
-        changed.append(float((states == STATES.index("changed")).sum() * PERIOD))
+        changed.append(float((states == STATE_NAMES.index("changed")).sum() * PERIOD))
         if kind in ("grasp", "release"):
             reached = [int(np.argmax(states >= k)) for k in (1, 2, 3)]
             delays.append([i * PERIOD - EVENT if i > 0 else np.inf for i in reached])
-            if states[-1] == STATES.index("identified"):
+            if states[-1] == STATE_NAMES.index("identified"):
                 pair = (watch.load, load) if kind == "grasp" else (load, watch.load)
-                phi = identified_object(*pair).phi
+                phi = load_of_object(*pair).phi
                 mass = abs(phi[0] / OBJECT[0] - 1.0) * 100.0
                 com = np.linalg.norm(phi[1:4] / phi[0] - OBJECT[1:4] / OBJECT[0]) * 1e3
                 errors.append([mass, com])
     figures: dict[str, Any] = {
-        "highest": dict(zip(STATES, np.bincount(highest, minlength=4).tolist(), strict=True)),
-        "last": dict(zip(STATES, np.bincount(last, minlength=4).tolist(), strict=True)),
+        "highest": dict(zip(STATE_NAMES, np.bincount(highest, minlength=4).tolist(), strict=True)),
+        "last": dict(zip(STATE_NAMES, np.bincount(last, minlength=4).tolist(), strict=True)),
         "changed_s_max": max(changed),
     }
-    for name, column in zip(STATES[1:], np.transpose(delays) if delays else [], strict=False):
+    for name, column in zip(STATE_NAMES[1:], np.transpose(delays) if delays else [], strict=False):
         figures[f"{name}_after_s"] = [float(np.median(column)), float(np.max(column))]
     parts = ("mass_percent", "com_mm")
     for name, column in zip(parts, np.transpose(errors) if errors else [], strict=False):

@@ -30,7 +30,7 @@ from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    estimate_into,
+    estimate_sample_into,
     motion_estimator,
     path_delays,
 )
@@ -38,8 +38,8 @@ from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_SIZE,
     WristSensorConfig,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
@@ -86,13 +86,13 @@ def true_samples(table, phi, q, v, vdot, truth):  # type: ignore[no-untyped-def]
 @njit
 def read(chain, memory, noise, truth, readings):  # type: ignore[no-untyped-def]
     for k in range(truth.shape[0]):
-        read_into(chain, memory, noise[k // 32], truth[k], readings[k])
+        read_sensor_into(chain, memory, noise[k // 32], truth[k], readings[k])
 
 
 @njit
 def estimate(constants, memory, table, readings, samples):  # type: ignore[no-untyped-def]
     for k in range(readings.shape[0]):
-        estimate_into(constants, memory, table, readings[k], samples[k])
+        estimate_sample_into(constants, memory, table, readings[k], samples[k])
 
 
 def turning(arm: Any, seed: int) -> tuple[Array, Array, Array]:
@@ -127,7 +127,7 @@ class Record:
         noise = np.random.default_rng(0).standard_normal((len(self.truth) // 32 + 1, NOISE_SIZE))
         readings = np.empty((len(self.truth), 13 + n))
         samples = np.empty((len(self.truth), 16 + n))
-        read(*sensor_chain(sensor, n, T), noise, self.truth, readings)
+        read(*sensor_chain_constants(sensor, n, T), noise, self.truth, readings)
         constants, memory = motion_estimator(config, believed or sensor, n, T)
         begin = time.thread_time()
         estimate(constants, memory, self.arm.table, readings, samples)

@@ -32,27 +32,27 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     DAMPING,
-    LEDGER,
-    LIMIT,
-    LOST,
-    RECEIVED,
-    SENT,
+    DISSIPATED_ENERGY,
+    RECEIVED_ENERGY,
+    SENT_ENERGY,
     STIFFNESS,
+    STORED_ENERGY,
+    WRENCH_LIMIT,
     own_memory,
 )
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
-    initial_memory,
-    parameters,
+    initial_method_memory,
+    method_parameters,
 )
 from drake_teleop.station.passivity.packet import (
     INTEGRAL,
     PACKET_SIZE,
     WRENCH,
-    dot,
-    limit,
-    moved_pose_into,
+    dot_of_group,
+    limit_group,
+    move_pose_into,
     pose_difference_into,
 )
 
@@ -98,12 +98,12 @@ def _move(push, most, T, dx, pose):
             rate = 6.0 if g == 0 else 14.0
             for i in range(3 * g, 3 * g + 3):
                 a[i] = push[k, i] - rate * rate * x[i] - 2.0 * rate * v[i]
-            limit(a, g, 0.999 * most[g])
+            limit_group(a, g, 0.999 * most[g])
         for i in range(6):
             v[i] += a[i] * T
             x[i] += v[i] * T
             dx[k, i] = v[i] * T
-        moved_pose_into(now, dx[k], now)
+        move_pose_into(now, dx[k], now)
         pose[k] = now
 
 
@@ -127,7 +127,7 @@ def _push(wrenches, motion, active, out):
 
 @njit
 def _size(a, g):
-    return math.sqrt(dot(a, a, g))
+    return math.sqrt(dot_of_group(a, a, g))
 
 
 @njit
@@ -141,7 +141,7 @@ def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent,
     wrench, before, motor, pull = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
     command, old, moved, nothing = np.zeros(13), np.zeros(7), np.zeros(6), np.zeros(PACKET_SIZE)
     twists, energy, work = np.zeros((2, 6)), np.zeros((2, 2)), np.zeros((2, 2))
-    start = memories[:, LEDGER].copy()
+    start = memories[:, STORED_ENERGY].copy()
     old[0], rate, slots = 1.0, 1.0 / T, sent.shape[1]
     figures[:] = 0.0
     for k in range(newest.shape[1]):
@@ -155,16 +155,16 @@ def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent,
             fresh = now >= 0 and (k == 0 or now != newest[1 - end, k - 1])
             if end == 0:
                 _master(steps, received, fresh, poses[0, k], twists[0], motion[0, k], hand,
-                        p[LIMIT], T, p, memories[0], wrench, sent[0, k % slots])  # fmt: skip
+                        p[WRENCH_LIMIT], T, p, memories[0], wrench, sent[0, k % slots])  # fmt: skip
                 felt[:] = received[WRENCH]
             else:
                 _slave(steps, received, fresh, poses[1, k], twists[1], motion[1, k], f_e, T, p,
                        memories[1], command, sent[1, k % slots])  # fmt: skip
         for g in range(2):
-            work[0, g] += dot(before, motion[0, k], g)
+            work[0, g] += dot_of_group(before, motion[0, k], g)
         if at_motor:
             for g in range(2):
-                work[1, g] += dot(motor, motion[1, k], g)
+                work[1, g] += dot_of_group(motor, motion[1, k], g)
             # The pull of the slave's servo from now until the next step.
             pose_difference_into(command, poses[1, k], pull)
             for i in range(6):
@@ -173,14 +173,14 @@ def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent,
             pose_difference_into(command, old, moved)
             old[:] = command[:7]
             for g in range(2):
-                energy[0, g] += dot(f_e, moved, g) - dot(wrench, motion[0, k], g)
-                work[1, g] -= dot(motor, moved, g)
+                energy[0, g] += dot_of_group(f_e, moved, g) - dot_of_group(wrench, motion[0, k], g)
+                work[1, g] -= dot_of_group(motor, moved, g)
             motor[:] = f_e
         for g in range(2):
             energy[1, g] = -work[0, g] - work[1, g]
             for end in range(2):
-                books = memories[end, RECEIVED][g] - memories[end, SENT][g]
-                tank = start[end, g] + books - memories[end, LOST][g] - work[end, g]
+                books = memories[end, RECEIVED_ENERGY][g] - memories[end, SENT_ENERGY][g]
+                tank = start[end, g] + books - memories[end, DISSIPATED_ENERGY][g] - work[end, g]
                 figures[g, TANK] = min(figures[g, TANK], tank)
             figures[g, BACKWARD] = min(figures[g, BACKWARD], energy[0, g])
             figures[g, TRUE] = min(figures[g, TRUE], energy[1, g])
@@ -199,7 +199,7 @@ def _master(steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory,
         b = p[wave.IMPEDANCE][i // 3]  # the line's impedance
         wrench[i] = math.sqrt(2.0 * b) * received[INTEGRAL][i] - b * dx[i] / T
     for g in range(2):
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
     for i in range(6):
         b = p[wave.IMPEDANCE][i // 3]
         packet[INTEGRAL][i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
@@ -217,7 +217,7 @@ def _slave(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, comman
         b, u = p[wave.IMPEDANCE][i // 3], received[INTEGRAL][i]
         step[i] = T * (math.sqrt(2.0 * b) * u + wrench[i]) / b
         packet[INTEGRAL][i] = u + math.sqrt(2.0 / b) * wrench[i]
-    moved_pose_into(memory[COMMAND_POSE], step, memory[COMMAND_POSE])
+    move_pose_into(memory[COMMAND_POSE], step, memory[COMMAND_POSE])
     command[:] = memory[COMMAND]
 
 
@@ -231,11 +231,11 @@ def cases() -> dict[str, tuple[str, Array]]:
     }
     found = {}
     for name in METHODS:
-        found[name] = name, parameters(PassivityConfig(method=name, **soft))
+        found[name] = name, method_parameters(PassivityConfig(method=name, **soft))
     tank = PassivityConfig(method="two_layer", **soft)
-    found["two_layer_no_margin"] = "two_layer", parameters(tank)
+    found["two_layer_no_margin"] = "two_layer", method_parameters(tank)
     found["two_layer_no_margin"][1][two_layer.MAX_ACCELERATION] = 0.0
-    found["wave_hold"] = WAVE_HOLD, parameters(PassivityConfig(method="wave"))
+    found["wave_hold"] = WAVE_HOLD, method_parameters(PassivityConfig(method="wave"))
     return found
 
 
@@ -284,11 +284,11 @@ def _some_networks(job: tuple[int, int, int]) -> tuple[dict[str, Any], dict[str,
                 continue
             p = p.copy()
             if saturates:
-                p[LIMIT] = 0.5, 0.01
+                p[WRENCH_LIMIT] = 0.5, 0.01
             own = method == WAVE_HOLD
             steps_of = _OWN_STEPS if own else methods.steps_of(method)
-            start = initial_memory("none" if own else method, p, POSE)
-            initial = start[LEDGER]
+            start = initial_method_memory("none" if own else method, p, POSE)
+            initial = start[STORED_ENERGY]
             memories = np.stack([start, start])
             at_motors = not own and METHODS[method].balance_at_motors
             began = time.thread_time()

@@ -40,12 +40,12 @@ from calibrate import COLOURS, HZ, NOISE, Motion, Stream, excited, hand, load_of
 from numpy.typing import NDArray
 
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench, regressor
-from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
+from drake_teleop.load.tolerance import read_tolerance, tolerances_in_units, values_of_required
 from drake_teleop.logs.processing import identify_log, usable_phi
-from drake_teleop.logs.read.alignment import delay_of, low_pass, undelayed
+from drake_teleop.logs.read.alignment import choose_delay, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.calibration import evaluate_record
@@ -76,7 +76,7 @@ def ours(log: Log, path: Path) -> Found:
     """`identify`."""
     write_log(log, path)
     load = identify_log(path).identification
-    return Found(load.phi, *intervals(load))
+    return Found(load.phi, *confidence_intervals(load))
 
 
 def least_squares(log: Log) -> Found:
@@ -157,8 +157,10 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
         }
         at = evaluate_record(path, ASKED, None, cutoff_hz=30.0, delay="auto")
         for name, each in found.items():
-            error = np.abs(values_of(ASKED, each.phi) - values_of(ASKED, phi))
-            relative = error / sizes_of(ASKED, phi) * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])
+            error = np.abs(values_of_required(ASKED, each.phi) - values_of_required(ASKED, phi))
+            relative = (
+                error / tolerances_in_units(ASKED, phi) * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])
+            )
             if name == "ours":
                 false += int((at.sure & (relative > np.repeat([0.5, 0.5, 5.0], [1, 3, 6]))).sum())
             if each.low is not None and each.high is not None:
@@ -341,7 +343,7 @@ def ntnu(records: Path, folder: Path) -> dict[str, Any]:
     by_peer = {"ours": usable_phi(fit)[0], "kth": np.concatenate([theta[:4], np.zeros(6)])}
     for record in ("1-baseline", "2-vibrations"):
         log = read_log(described(records, record, folder))
-        late = undelayed(log, delay_of(log, 30.0, "auto", by_peer["ours"])[0])
+        late = remove_delay(log, choose_delay(log, 30.0, "auto", by_peer["ours"])[0])
         for name, phi in by_peer.items():
             # Others do not know of a delay, nor of more than gravity.
             of = late if name == "ours" else log

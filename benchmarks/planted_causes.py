@@ -51,7 +51,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.identification import PARAMETERS, Identification, natural_scale
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification, natural_scales
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 
@@ -86,7 +86,7 @@ def judge(found: Identification, phi: Array, offsets: Array | None) -> dict[str,
     judged = np.array(found.identifiable) & np.repeat([offsets is not None, True], [6, 10])
     error = np.concatenate([found.offsets, found.phi]) - truth
     deviations = found.standard_deviations
-    scale = natural_scale(phi if phi[0] else np.array([_SMALLEST_MASS, *np.zeros(9)]))
+    scale = natural_scales(phi if phi[0] else np.array([_SMALLEST_MASS, *np.zeros(9)]))
     off = np.abs(error)
     false = judged & (off > _DEVIATIONS * deviations) & (off > _SHARE * scale)
     inside = judged & (off < student.ppf(0.975, found.degrees_of_freedom) * deviations)
@@ -94,7 +94,7 @@ def judge(found: Identification, phi: Array, offsets: Array | None) -> dict[str,
         z = np.where(judged, off / deviations, 0.0)
     return {
         "false": [
-            {"name": PARAMETERS[i], "error": float(error[i]), "deviations": float(z[i])}
+            {"name": PARAMETER_NAMES[i], "error": float(error[i]), "deviations": float(z[i])}
             for i in np.flatnonzero(false)
         ],
         "worst": float(z.max()),
@@ -239,7 +239,7 @@ def check() -> None:
         for moved in (exact, _from_stream(record, t)):
             A = _columns(*(x[inner] for x in moved))
             found = np.linalg.lstsq(A.reshape(-1, 16), wrench.ravel(), rcond=None)[0]
-            line += f"  {np.abs((found - truth) / natural_scale(truth[6:])).max():.1e}"
+            line += f"  {np.abs((found - truth) / natural_scales(truth[6:])).max():.1e}"
         print(line + "  of the natural scale: exact motion, motion of the stream")
 
 

@@ -39,10 +39,10 @@ from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.read.alignment import (
     angular_motion,
     estimate_delay,
-    low_passed,
+    low_pass_log,
+    remove_delay,
     resample,
     smooth_derivatives,
-    undelayed,
 )
 from drake_teleop.logs.read.canonical import Log
 
@@ -196,8 +196,8 @@ def present(t: Array, wrench: Array, poses: Poses, cutoff: float) -> tuple[Array
     motion = np.einsum("nji,nj->ni", R, a), *angular_motion(R, dt, cutoff)
     inside = (t >= even[0]) & (t <= even[-1])
     log = Log(t[inside], wrench[inside], *(resample(t[inside], even, x) for x in motion))
-    log = undelayed(log, estimate_delay(log, cutoff) or 0.0)
-    log = low_passed(log, cutoff)
+    log = remove_delay(log, estimate_delay(log, cutoff) or 0.0)
+    log = low_pass_log(log, cutoff)
     load = identify_batch(log.wrench, *log.motion).identification
     return np.concatenate([load.offsets, load.phi]), load.standard_deviations
 

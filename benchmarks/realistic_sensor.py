@@ -32,7 +32,7 @@ from drake_teleop.lab.identification import (
     sensor_samples,
     slave_arm,
 )
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
@@ -41,14 +41,14 @@ from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station import scenario as scenarios
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.sensor.motion_estimation import estimate_into, motion_estimator
+from drake_teleop.station.sensor.motion_estimation import estimate_sample_into, motion_estimator
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
     PARTS,
+    SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.simulation import simulate
@@ -66,7 +66,7 @@ LATE = 1e-3
 
 
 def true_motions() -> tuple[Array, Array, FourierTrajectory]:
-    """What is true at 8 kHz (N, 15 + n), see `sensor_chain`: identification and swing."""
+    """What is true at 8 kHz (N, 15 + n), see `sensor_chain_constants`: identification and swing."""
     ideal = {"wrist_sensor__ideal": True, "rates__log_hz": RATE}
     found = identify_load(scenarios.replace(IDENTIFICATION, **ideal))
     swing = scenarios.replace(SWING, **ideal)
@@ -83,8 +83,10 @@ def truth(result: SimulationResult) -> Array:
 def _run(chain, chain_memory, estimator, estimator_memory, arm, noise, truth, samples):  # type: ignore[no-untyped-def]
     reading = np.empty(truth.shape[1] - 2)
     for k in range(truth.shape[0]):
-        read_into(chain, chain_memory, noise[k // NOISE_BLOCK], truth[k], reading)
-        estimate_into(estimator, estimator_memory, arm, reading, samples[k])
+        read_sensor_into(
+            chain, chain_memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading
+        )
+        estimate_sample_into(estimator, estimator_memory, arm, reading, samples[k])
 
 
 def sampled(
@@ -99,9 +101,9 @@ def sampled(
         believed: what the estimation of the motion takes it for.
     """
     n = truth.shape[1] - 15
-    chain, memory = sensor_chain(sensor, n, 1 / RATE)
+    chain, memory = sensor_chain_constants(sensor, n, 1 / RATE)
     motion = motion_estimator(IDENTIFICATION.motion_estimation, believed or sensor, n, 1 / RATE)
-    blocks = len(truth) // NOISE_BLOCK + 1
+    blocks = len(truth) // SAMPLES_PER_NOISE_BLOCK + 1
     noise = np.random.default_rng(seed).standard_normal((blocks, NOISE_SIZE))
     samples = np.empty((len(truth), 16 + n))
     _run(chain, memory, *motion, ARM.table, noise, truth, samples)
@@ -128,7 +130,7 @@ def errors_of(load: Identification) -> Array:
 
 def held(load: Identification) -> NDArray[np.bool_]:
     """(16,) whether the 95 % intervals hold what is true, the offsets at the start."""
-    low, high = intervals(load)
+    low, high = confidence_intervals(load)
     true = np.concatenate([JR3.offset, ARM.phi_load])
     return np.asarray((low <= true) & (true <= high))
 

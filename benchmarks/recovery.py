@@ -33,7 +33,7 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
-from drake_teleop.station.passivity.safe_state import RESUME_TIME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME_S
 
 TASK = Task(swing=0.3, swung=1.5, press=2.0, pressed=2.6, release=6.5, released=7.1, end=10.0)
 GOOD_FROM, TIMEOUT, LIMIT = 4.5, 0.1, 5.0  # s, s, N
@@ -81,10 +81,10 @@ class Row:
 
 
 def _resuming(silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The steps up to RESUME_TIME after a silence."""
+    """The steps up to RESUME_TIME_S after a silence."""
     steps = np.arange(len(silent))
     since = steps - np.maximum.accumulate(np.where(silent, steps, -len(silent)))
-    return (since > 0) & (since < round(RESUME_TIME / PERIOD))
+    return (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
 
 
 def rough_line(path: Path, rng: np.random.Generator) -> NetworkConfig:

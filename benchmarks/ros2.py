@@ -36,8 +36,8 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     read_tolerance,
-    sizes_of,
-    values_of,
+    tolerances_in_units,
+    values_of_required,
 )
 from drake_teleop.robots.calibration import half_widths
 
@@ -165,8 +165,10 @@ class Tables:
         """(3, k) which numbers are inside the intervals of 95 and 99.98 %, and the tolerance."""
         tolerance = read_tolerance(UNTIL)
         half, wide, _ = half_widths(SimpleNamespace(identification=found), tolerance)  # type: ignore[arg-type]
-        error = np.abs(values_of(tolerance, found.phi) - values_of(tolerance, self.phi))
-        error /= sizes_of(tolerance, self.phi)
+        error = np.abs(
+            values_of_required(tolerance, found.phi) - values_of_required(tolerance, self.phi)
+        )
+        error /= tolerances_in_units(tolerance, self.phi)
         return np.array([error <= half, error <= wide, error <= 1.0])
 
 

@@ -28,15 +28,20 @@ from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import design_shortest_motion
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
+from drake_teleop.load.tolerance import (
+    Tolerance,
+    read_tolerance,
+    tolerances_in_units,
+    values_of_required,
+)
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.sensor.motion_estimation import estimate_into, motion_estimator
+from drake_teleop.station.sensor.motion_estimation import estimate_sample_into, motion_estimator
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
-    read_into,
-    sensor_chain,
+    SAMPLES_PER_NOISE_BLOCK,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 
@@ -48,8 +53,8 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
     """The sensor's chain and the motion estimation, over a whole record."""
     reading = np.empty(truth.shape[1] - 2)
     for k in range(len(truth)):
-        read_into(constants, memory, noise[k // NOISE_BLOCK], truth[k], reading)
-        estimate_into(estimator, remembered, table, reading, samples[k])
+        read_sensor_into(constants, memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading)
+        estimate_sample_into(estimator, remembered, table, reading, samples[k])
 
 
 def reached(
@@ -69,19 +74,19 @@ def reached(
     write_sensor_motion(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
     noisy = without_parts(sensor, "calibration")
-    constants, memory = sensor_chain(noisy, joints[0].shape[1], period)
+    constants, memory = sensor_chain_constants(noisy, joints[0].shape[1], period)
     estimator, remembered = motion_estimator(
         scenario.motion_estimation, noisy, joints[0].shape[1], period
     )
     samples, within = np.empty((len(truth), 22)), 0
     rng = np.random.default_rng(0)
-    true, sizes = values_of(tolerance, phi), sizes_of(tolerance, phi)
+    true, sizes = values_of_required(tolerance, phi), tolerances_in_units(tolerance, phi)
     for _ in range(records):
-        noise = rng.standard_normal((len(truth) // NOISE_BLOCK + 1, NOISE_SIZE))
+        noise = rng.standard_normal((len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         parts = (samples[:, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(*parts, noise=sensor.wrench_std())
-        within += int((np.abs(values_of(tolerance, load.phi) - true) <= sizes).all())
+        within += int((np.abs(values_of_required(tolerance, load.phi) - true) <= sizes).all())
     return within / records
 
 

@@ -34,7 +34,7 @@ from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.run_summary import summarise
-from drake_teleop.station.master.data_sheets import FIGURES, LEADER, PHANTOM, Master
+from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME, Master
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -85,7 +85,7 @@ _RAIL = """<link name="foot"><inertial><mass>30</mass>
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--arms", default=",".join(ARMS))
-    parser.add_argument("--devices", default=",".join((PHANTOM, *FIGURES, LEADER)))
+    parser.add_argument("--devices", default=",".join((PHANTOM_NAME, *FIGURES, LEADER_NAME)))
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument(
         "--models", type=Path, default=described(), help="example-robot-data/robots"
@@ -128,8 +128,8 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
     own = 1.0 if arm == "rx90" else 0.5
     for what, name in _SCENARIOS.items():
         scenario, share = LoadScenario(name), 1.0
-        if device != PHANTOM:
-            size = _LEADERS if device == LEADER else min(FIGURES[device].size)
+        if device != PHANTOM_NAME:
+            size = _LEADERS if device == LEADER_NAME else min(FIGURES[device].size)
             share = min(1.0, 0.5 * size / _REACH)
         intent = [
             dataclasses.replace(move, translation=[own * share * x for x in move.translation])
@@ -144,11 +144,11 @@ def _scenarios(arm: str, device: str, models: Path | None) -> dict[str, Scenario
             scenario,
             slave=slave,
             environment=blocks,
-            master=Master(model=device, leader=_LEADER if device == LEADER else None),
+            master=Master(model=device, leader=_LEADER if device == LEADER_NAME else None),
             operator__intent=intent,
             kinematic_scaling__translation_scale=1 / share,
         )
-        if scenario.sheet_spring is not None and (arm, device) != ("rx90", PHANTOM):
+        if scenario.sheet_spring is not None and (arm, device) != ("rx90", PHANTOM_NAME):
             leaf = _lowest(changed)
             leaf[2] += own * _DEEP
             changed = replace(changed, sheet_spring__position=leaf.tolist())

@@ -22,7 +22,7 @@ import numpy as np
 
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, METHODS, identify_batch
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.regressor import non_contact_wrench
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "utias_workshop_tools"
@@ -65,12 +65,12 @@ def run(folder: Path, seeds: int) -> dict[str, dict[str, tuple[float, ...]]]:
     table: dict[str, dict[str, tuple[float, ...]]] = {}
     for level, (acceleration, angular, force, torque) in LEVELS.items():
         wrench_noise = np.repeat([force, torque], 3)
-        known = Noise(wrench_noise, s=acceleration, alpha=angular)
+        known = NoiseStd(wrench_noise, s=acceleration, alpha=angular)
         cases = {name: (name, known) for name in METHODS}
-        cases["consistent, motion taken as exact"] = ("consistent", Noise(wrench_noise))
+        cases["consistent, motion taken as exact"] = ("consistent", NoiseStd(wrench_noise))
         cases["consistent, wrench noise estimated"] = (
             "consistent",
-            Noise(s=acceleration, alpha=angular),
+            NoiseStd(s=acceleration, alpha=angular),
         )
         rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in cases}
         for k, (F, s, omega, alpha, phi) in enumerate(tools):

@@ -15,7 +15,7 @@ DOCS = Path(__file__).parent
 
 def main() -> None:
     texts = {
-        "scenario.md": scenario_reference.reference(),
+        "scenario.md": scenario_reference.reference_page(),
         "scenario.schema.json": scenario_reference.json_schema(),
         "log-description.schema.json": description.json_schema(),
     }

@@ -7,7 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.station.operator.operator import MinimumJerk, Sine, intent_into, pack_intent
+from drake_teleop.station.operator.operator import (
+    MinimumJerk,
+    Sine,
+    intended_motion_into,
+    pack_intent,
+)
 
 
 def intent_at(
@@ -26,5 +31,5 @@ def intent_at(
     packed = pack_intent(segments)
     poses, twists = np.empty((len(times), 7)), np.empty((len(times), 6))
     for time, pose, twist in zip(times, poses, twists, strict=True):
-        intent_into(packed, start, time, pose, twist)
+        intended_motion_into(packed, start, time, pose, twist)
     return poses, twists

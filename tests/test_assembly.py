@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
 from drake_teleop.lab.comparison.station_accounts import station_accounts
 from drake_teleop.load.contact.detection import NoiseFloor
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
-from drake_teleop.load.online.watched import OTHER_LOAD
+from drake_teleop.load.online.watched import STATE_OTHER_LOAD
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import BACKWARD, FORWARD, NetworkConfig, newest_packets
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
@@ -39,8 +39,12 @@ from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Rates, Scenario, Simulation, replace
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
-from drake_teleop.station.sensor.sensor_chain import NOISE_BLOCK
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.sensor.sensor_chain import SAMPLES_PER_NOISE_BLOCK
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+)
 from drake_teleop.station.slave.joint_control import JointControlConfig
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -140,8 +144,8 @@ def run(
     rows = round(scenario.simulation.duration * scenario.rates.log_hz)
     for engaged, until in ((1.0, OPENED), (0.0, CLOSED), (1.0, END)):
         clutch.FixValue(simulator.get_mutable_context(), [engaged])
-        advance(simulator, min(until, end) * PERIOD)
-    log = read_log(simulator, scenario.simulation.settle)
+        advance_without_garbage_collection(simulator, min(until, end) * PERIOD)
+    log = read_recorded_signals(simulator, scenario.simulation.settle)
     assert len(log.t) == rows + 1
     return Recorded(scenario, log, slave.plant, *poses_of_S(slave.plant, log["joint_position"]))
 
@@ -437,7 +441,7 @@ def test_the_load_estimator_learns_by_the_scenarios_method_and_sensor(finely_log
     estimator = RecursiveTotalLeastSquares(sensor.wrench_std(), motion, forgetting=0.98)
     # The log shows the last sample of each block of noise differently.
     rows = instants(finely_logged, 500.0)
-    rows = rows[log.t[rows] < 0.99 * NOISE_BLOCK * period]
+    rows = rows[log.t[rows] < 0.99 * SAMPLES_PER_NOISE_BLOCK * period]
     names = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
     estimator.learn(log["measured_wrench_S"][rows], *(log[name][rows] for name in names))
     expected = np.concatenate([estimator.offsets, estimator.phi])
@@ -515,7 +519,7 @@ def test_what_is_gripper_and_what_is_object_are_told_apart(slave):
     known = log["load_estimate"]
     np.testing.assert_allclose(known[0], np.concatenate([offsets, 0.9 * slave.arm.phi_load]))
     np.testing.assert_allclose(known[-1, 6:], gripper, rtol=1e-3)
-    assert log["load_state"][-1, 0] == OTHER_LOAD
+    assert log["load_state"][-1, 0] == STATE_OTHER_LOAD
     contact = log["measured_wrench_S"] - known[:, :6] - inertial_wrench(log, known[:, 6:])
     of_object = inertial_wrench(log, known[:, 6:] - gripper)
     np.testing.assert_allclose(log["scaled_wrench_S"], contact + eta * of_object, atol=1e-11)

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from matplotlib.figure import Figure
 
-from drake_teleop.station.film import Film
+from drake_teleop.station.film import ReplayFile
 
 pytestmark = pytest.mark.checks
 
@@ -66,7 +66,7 @@ def test_two_surroundings_that_have_nothing_in_common(benchmark, tmp_path, monke
     found = benchmark.written(others, commands, tmp_path / "there", program)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    for kind, name in ((Figure, "savefig"), (Film, "_record_scene")):
+    for kind, name in ((Figure, "savefig"), (ReplayFile, "_record_scene")):
         monkeypatch.setattr(kind, name, getattr(kind, name))  # to have it back
     monkeypatch.setattr("sys.argv", ["", json.dumps(benchmark.typed(commands))])
     exec(program, {})

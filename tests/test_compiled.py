@@ -149,8 +149,8 @@ def test_untraceable_references_raise(tmp_path, monkeypatch):
         import_module("reads_a_list").f()
 
 
-_call = _compiled.call_at((numba.float64[::1],))
-_call_other = _compiled.call_at((numba.float64[::1], numba.float64))
+_call = _compiled.make_call_at_address((numba.float64[::1],))
+_call_other = _compiled.make_call_at_address((numba.float64[::1], numba.float64))
 
 
 @_compiled.njit()

@@ -28,7 +28,7 @@ def test_its_scenarios_load(tmp_path):
         scenario = LoadScenario(str(path))
         scenario.check()
         assert scenario.passivity.method == "ledger"
-        assert scenario.channel.lines()[0].delay == 0.05
+        assert scenario.channel.networks_of_directions()[0].delay == 0.05
 
 
 def figures(row: str) -> tuple[list[bool], list[float]]:

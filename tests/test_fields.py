@@ -16,7 +16,7 @@ from drake_teleop.common.config import FieldInfo, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.station.operator.operator import OperatorConfig
-from drake_teleop.station.operator.task import KINDS
+from drake_teleop.station.operator.task import TASK_CLASSES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
@@ -53,7 +53,7 @@ def test_a_quantity_has_unit_and_range() -> None:
 def test_lists_blocks_and_optional_fields() -> None:
     intent, task = named(OperatorConfig, "intent"), named(OperatorConfig, "task")
     assert (intent.kind, intent.lists, intent.range) == ("block", 1, "MinimumJerk or Sine")
-    assert (task.blocks, task.lists, task.optional, task.default) == (KINDS, 0, True, None)
+    assert (task.blocks, task.lists, task.optional, task.default) == (TASK_CLASSES, 0, True, None)
     vectors = named(Factor, "vectors")
     assert (vectors.kind, vectors.lists, vectors.length) == ("number", 2, None)
     assert named(ForceScalingConfig, "eta").optional

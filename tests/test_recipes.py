@@ -21,7 +21,7 @@ from drake_teleop.live.scenarios import chosen_scenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.read.table_files import FORMATS
+from drake_teleop.logs.read.table_files import TABLE_READERS
 from drake_teleop.robots.connections import SINKS, SOURCES, open_sink, open_source
 from drake_teleop.robots.export import export_text
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
@@ -88,7 +88,7 @@ def test_the_command_line_runs_registered_parts_and_refuses_removed_ones(folder,
     ):
         LoadScenario(recorded)
     METHODS.remove("share")
-    FORMATS.remove(".f64")
+    TABLE_READERS.remove(".f64")
     for arguments, says in (
         (["run", str(recorded)], "'!Table' is not known; use one of"),
         (["identify", "log.f64"], "log.f64: format '.f64' is not known; give a canonical log"),

@@ -49,7 +49,7 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
         def show(self, canvas, film_time, place, force):
             shown[self.name] = force
 
-    monkeypatch.setattr(replay, "Arrow", Arrow)
+    monkeypatch.setattr(replay, "ForceArrow", Arrow)
     return shown
 
 
@@ -62,7 +62,7 @@ def test_postures_equal_the_record(meshcat, scenario, result):
     scene = ReplayScene(meshcat, scenario, result)
     base = scene.plant.GetFrameByName("base", scene.plant.GetModelInstanceByName("master::phantom"))
     for sample in (0, 25):
-        scene.show(0.0, result, sample)
+        scene.show_sample(0.0, result, sample)
         X_BE = scene.plant.GetFrameByName("stylus").CalcPose(scene.context, base)
         pose = result["pose_master"][sample]
         np.testing.assert_allclose(X_BE.translation(), pose[4:], atol=1e-12)
@@ -80,7 +80,7 @@ def test_arrows_of_load_point_down_and_of_contact_up(meshcat, scenario, result, 
     recorded["measured_wrench_S"][:, :3] = weight
     recorded["contact_wrench_S"][:, :3] = -0.5 * weight
     scene = ReplayScene(meshcat, scenario, result)
-    scene.show(0.0, SimulationResult(result.t, recorded, result.specs), 0)
+    scene.show_sample(0.0, SimulationResult(result.t, recorded, result.specs), 0)
     # The tool swings by less than a degree.
     np.testing.assert_allclose(arrows["measured_at_stylus"], [0, 0, -30.7], atol=0.5)
     np.testing.assert_allclose(arrows["contact_at_stylus"], [0, 0, 15.35], atol=0.25)
@@ -93,7 +93,7 @@ def test_replay_without_master_shows_slave_and_measured_force(meshcat, scenario,
     names = ("slave_state", "measured_wrench_S", "load_estimate", "sheet_state")
     recorded = {name: result[name] for name in names}
     scene = ReplayScene(meshcat, scenario, recorded)
-    scene.show(0.0, recorded, 0)
+    scene.show_sample(0.0, recorded, 0)
     assert list(arrows) == ["measured_at_wrist"]
     assert not scene.plant.HasFrameNamed("stylus")
 

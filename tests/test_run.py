@@ -15,7 +15,7 @@ from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.run import run_command
 from drake_teleop.lab.run_summary import _detection_figures, is_in_contact
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.processing import identify_log
@@ -148,7 +148,7 @@ def test_load_errors_match_their_stated_deviations(identification):
     assert np.abs(principal - 1).max() < 0.05
     error = np.abs(load.offsets - scenario.wrist_sensor.offset)
     assert np.all(error < [0.1, 0.1, 0.1, 0.005, 0.005, 0.005])
-    low, high = intervals(load)
+    low, high = confidence_intervals(load)
     truth = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     # With 16 intervals of 95 %, four or more misses have a probability of 1 %.
     assert np.sum((low <= truth) & (truth <= high)) >= 13

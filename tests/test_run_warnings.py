@@ -14,7 +14,7 @@ from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
-from drake_teleop.station.oscillation import find_reversals, oscillates
+from drake_teleop.station.oscillation import find_reversals, find_unexplained_oscillation
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
@@ -23,7 +23,7 @@ from drake_teleop.station.scenario import Scenario, Simulation, replace
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import SLIDES
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.station import MakeTeleopStation
@@ -200,7 +200,7 @@ def test_further_times_are_counted():
 
 def test_lag_of_prismatic_joint_is_in_millimetres():
     sliding = dataclasses.replace(ARM, table=ARM.table.copy())
-    sliding.table[5, SLIDES] = 1.0
+    sliding.table[5, IS_PRISMATIC_COLUMN] = 1.0
     late = recorded(slave_state=(5, 0.01 * during(1, 1.5)))
     (warning,) = run_warnings(late, OVER_NETWORK, sliding)
     assert "joint 6 is up to 10.0 mm behind" in warning
@@ -234,12 +234,12 @@ def test_reversals_are_extremes_beyond_the_swing():
 def test_following_an_oscillating_command_is_no_oscillation():
     command = 0.066 * np.sin(2 * np.pi * 2.63 * T)[:, np.newaxis]
     follows = 0.06 * np.sin(2 * np.pi * 2.63 * (T - 0.06))[:, np.newaxis]
-    assert not oscillates(T, command, follows, 5e-4).any()
-    assert oscillates(T, 0 * command, follows, 5e-4).mean() > 0.8
+    assert not find_unexplained_oscillation(T, command, follows, 5e-4).any()
+    assert find_unexplained_oscillation(T, 0 * command, follows, 5e-4).mean() > 0.8
     slow = 0.02 * np.sin(2 * np.pi * 2 * T)[:, np.newaxis]
     shaken = slow.copy()
     shaken[during(1, 2), 0] += 0.003 * np.sin(2 * np.pi * 20 * T[during(1, 2)])
-    found = T[oscillates(T, slow, shaken, 5e-4)]
+    found = T[find_unexplained_oscillation(T, slow, shaken, 5e-4)]
     assert 0.95 < found[0] < 1.1
     assert 1.9 < found[-1] < 2.05
     assert len(found) > 800

@@ -20,9 +20,9 @@ from drake_teleop.station.operator.operator import MinimumJerk, Sine
 from drake_teleop.station.operator.task import Press
 from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, ScenarioNames
 from drake_teleop.station.scenario_reference import (
-    commented,
     json_schema,
-    reference,
+    reference_page,
+    to_commented_yaml,
     write_scenario,
 )
 from drake_teleop.station.sensor.presets import PRESETS
@@ -48,13 +48,13 @@ def uncomment_block(text: str, head: str) -> str:
 
 def test_docs_equal_the_generated_reference() -> None:
     """`python docs/make_reference.py` writes them."""
-    assert (DOCS / "scenario.md").read_text(encoding="utf-8") == reference()
+    assert (DOCS / "scenario.md").read_text(encoding="utf-8") == reference_page()
     assert (DOCS / "scenario.schema.json").read_text(encoding="utf-8") == json_schema()
 
 
 def test_every_link_in_the_reference_leads_to_a_block() -> None:
-    links = {part.partition(")")[0] for part in reference().split("](#")[1:]}
-    titles = [line[3:] for line in reference().splitlines() if line.startswith("## ")]
+    links = {part.partition(")")[0] for part in reference_page().split("](#")[1:]}
+    titles = [line[3:] for line in reference_page().splitlines() if line.startswith("## ")]
     # As GitHub makes them: small letters, no points, colons and exclamation marks.
     anchors = [title.lower().translate({ord(" "): "-", **dict.fromkeys(map(ord, ".:!"))})
                for title in titles]  # fmt: skip
@@ -72,18 +72,18 @@ def test_a_printed_scenario_loads_back(name: str, capsys: pytest.CaptureFixture[
 
 def test_a_file_with_a_preset_keeps_it() -> None:
     scenario = loaded("wrist_sensor: {preset: ati_gamma_imu, force_noise: 0.125}")
-    again = loaded(commented(scenario))
+    again = loaded(to_commented_yaml(scenario))
     assert again == scenario
     assert again.wrist_sensor.preset == "ati_gamma_imu"
 
 
 def test_preset_can_be_changed_in_the_printed_scenario() -> None:
-    text = commented(Scenario()).replace("preset: custom", "preset: ati_gamma_imu")
+    text = to_commented_yaml(Scenario()).replace("preset: custom", "preset: ati_gamma_imu")
     assert loaded(text).wrist_sensor == PRESETS["ati_gamma_imu"]
 
 
 def test_commented_blocks_can_be_activated() -> None:
-    text = commented(Scenario())
+    text = to_commented_yaml(Scenario())
     assert loaded(uncomment_block(text, "# slot:")).slot == Slot()
     assert loaded(uncomment_block(text, "  # task: !Press")).operator.task == Press()
     assert loaded(uncomment_block(text, "  # intent:")).operator.intent == [MinimumJerk(), Sine()]
@@ -118,7 +118,7 @@ def test_schema_accepts_shipped_scenarios(name: str) -> None:
 
 
 def test_schema_accepts_every_field() -> None:
-    SCHEMA.validate(parse_without_tags(commented(Scenario())))
+    SCHEMA.validate(parse_without_tags(to_commented_yaml(Scenario())))
 
 
 @pytest.mark.parametrize(
@@ -150,9 +150,9 @@ def test_scenario_that_reads_back_differently_is_not_written(
     scenario = LoadScenario("free_motion_force")
     scenario.slave.model = "arm.sdf #2.sdf"
     write_scenario(tmp_path / "whole.yaml", scenario)
-    unquoted = commented(scenario).replace("'arm.sdf #2.sdf'", "arm.sdf #2.sdf")
-    assert unquoted != commented(scenario)
-    monkeypatch.setattr(scenario_reference, "commented", lambda _: unquoted)
+    unquoted = to_commented_yaml(scenario).replace("'arm.sdf #2.sdf'", "arm.sdf #2.sdf")
+    assert unquoted != to_commented_yaml(scenario)
+    monkeypatch.setattr(scenario_reference, "to_commented_yaml", lambda _: unquoted)
     with pytest.raises(DrakeTeleopError, match="YAML cannot represent the scenario's block slave;"):
         write_scenario(tmp_path / "cut.yaml", scenario)
     assert not (tmp_path / "cut.yaml").exists()

@@ -22,7 +22,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.table_files import read_table
-from drake_teleop.station.film import Film
+from drake_teleop.station.film import ReplayFile
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 
@@ -245,7 +245,7 @@ def test_a_film_is_made_for_this_machine_alone(tmp_path):
         seen.append(listening())
         return lambda time, frame: None
 
-    Film("x", np.arange(2.0), 1.0).write(tmp_path / "x.html", make_scene)
+    ReplayFile("x", np.arange(2.0), 1.0).write(tmp_path / "x.html", make_scene)
     assert seen[0] and seen[0] <= THIS_MACHINE
 
 

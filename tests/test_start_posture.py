@@ -22,7 +22,7 @@ from drake_teleop.lab.new_station.random_postures import (
 )
 from drake_teleop.lab.new_station.text import scenario_text, wall_of_plan
 from drake_teleop.station.environment.solids import Wall
-from drake_teleop.station.master.data_sheets import PHANTOM
+from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import holding_torque, pose_into
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
@@ -113,7 +113,7 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
     plan.shapes.move_to(plan.place.q)
     # The base link has a plate on the plane; everything that moves is above it.
     assert plan.plane == pytest.approx(0.0, abs=1e-9)
-    assert plan.shapes.points(plan.shapes.moving())[:, 2].min() > 0.02
+    assert plan.shapes.points_on_bodies(plan.shapes.moving_bodies())[:, 2].min() > 0.02
     assert start_overlaps(slave_of(plan, path), wall_of_plan(plan))[0] == ()
     assert wall_of_plan(plan).position[2] < plan.lowest[2] - 0.01
 
@@ -270,7 +270,7 @@ def test_torque_limits_that_cannot_hold_the_arm_are_left_out_and_stated(tmp_path
     assert set(plan.weak_joints) <= set(weak) and bool(plan.weak_joints) == bool(weak)
     stated = [text for text in plan.assumptions if text.startswith("no torque limit for j")]
     assert len(stated) == len(plan.weak_joints)
-    text = scenario_text(plan, {"model": str(path), "sensor_frame": "ft"}, None, PHANTOM, None)
+    text = scenario_text(plan, {"model": str(path), "sensor_frame": "ft"}, None, PHANTOM_NAME, None)
     scenario = tmp_path / "station.yaml"
     scenario.write_text(text)
     slave = LoadScenario(scenario).slave

@@ -26,8 +26,12 @@ from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, 
 from drake_teleop.station.operator.task import Touch
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.signals import SIGNALS
-from drake_teleop.station.simulation import MakeSimulator, advance, simulate
-from drake_teleop.station.slave.arm import MOTION_SIZE, sensor_motion
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    simulate,
+)
+from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, sensor_motion
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -302,7 +306,7 @@ def test_the_slave_follows_the_scaled_master(slave):
     result = simulate(
         MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
     )
-    out = np.zeros(MOTION_SIZE)
+    out = np.zeros(FRAME_STATE_SIZE)
     heights = []
     for state in result["slave_state"]:
         sensor_motion(slave.arm.table, state[:6], state[6:], np.zeros(6), out)
@@ -351,7 +355,7 @@ def test_scales_change_during_a_run_without_force_step(slave):
 
     def forces(duration: float | None) -> np.ndarray:
         simulator = MakeSimulator(station, scenario.simulation)
-        advance(simulator, 0.7)
+        advance_without_garbage_collection(simulator, 0.7)
         context = simulator.get_mutable_context()
         shown = [station.GetOutputPort("force_to_master").Eval(context)[:3].copy()]
         if duration is not None:
@@ -364,7 +368,7 @@ def test_scales_change_during_a_run_without_force_step(slave):
                 duration=duration,
             )
         for time in np.arange(0.7, 1.0, 1 / scenario.rates.hand_hz):
-            advance(simulator, time)
+            advance_without_garbage_collection(simulator, time)
             shown.append(station.GetOutputPort("force_to_master").Eval(context)[:3].copy())
         return np.array(shown)
 

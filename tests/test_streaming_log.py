@@ -19,7 +19,12 @@ from drake_teleop.station import simulation
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+    simulate,
+)
 from drake_teleop.station.station import MakeTeleopStation
 
 SCENARIO = replace(
@@ -45,7 +50,7 @@ rates: {sensor_hz: 2000, log_hz: 2000}
 
 @pytest.fixture(autouse=True)
 def _small_parts(monkeypatch):
-    monkeypatch.setattr(simulation, "_PART_ROWS", 100)
+    monkeypatch.setattr(simulation, "_ROWS_PER_PART", 100)
 
 
 def run(**options) -> SimulationResult:
@@ -78,8 +83,8 @@ def test_looking_at_the_progress_changes_nothing():
     often = replace(SCENARIO, rates__log_hz=8000.0, simulation__duration=0.25)
     simulator = MakeSimulator(MakeTeleopStation(often), often.simulation)
     simulator.Initialize()
-    advance(simulator, 0.3)
-    at_once = read_log(simulator, often.simulation.settle)
+    advance_without_garbage_collection(simulator, 0.3)
+    at_once = read_recorded_signals(simulator, often.simulation.settle)
     assert_same(simulate(MakeTeleopStation(often), often.simulation), at_once)
 
 

@@ -10,13 +10,13 @@ import pytest
 
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.operator.decision import (
-    FEELING,
-    MOVING,
-    OVER,
-    PRESSING,
-    SEEKING,
-    STATE,
-    WAITING,
+    PHASE_APPROACHING,
+    PHASE_MOVING,
+    PHASE_OVER,
+    PHASE_PRESSING,
+    PHASE_SEARCHING_SLOT,
+    PHASE_WAITING,
+    STATE_SIZE,
 )
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Touch
@@ -40,15 +40,17 @@ def measures(task, **log):
     return task_measures(*run(task, **log))
 
 
-def run(task, *, done: float = 1.0, force: float = 6.0, early: bool = False, phase: int = MOVING):
+def run(
+    task, *, done: float = 1.0, force: float = 6.0, early: bool = False, phase: int = PHASE_MOVING
+):
     """Return a log of a hand force of 2 N at 0.1 m/s back and forth, with contact from CONTACT on.
 
     The tool stays at its start.
     """
-    state = np.zeros((len(T), STATE))
+    state = np.zeros((len(T), STATE_SIZE))
     state[T >= START, 0] = phase
     if done:
-        state[T >= END, :2] = OVER, done
+        state[T >= END, :2] = PHASE_OVER, done
     state[T >= NOTICED, 2] = 1.0
     if early:
         state[(T >= 1.0) & (T < 1.2), 2] = 1.0
@@ -120,20 +122,20 @@ FAILURES = {
     "but the tip is 140.0 mm above the floor": (Insert(), {}),
     # It gives up.
     f"at 3.00 s, after the 2.5 s of its timeout, while pressing, {FAR}, 6.0 N at the tool instead"
-    " of 8 N": (Press(**AT, timeout=2.5), {"done": -1.0, "phase": PRESSING}),
+    " of 8 N": (Press(**AT, timeout=2.5), {"done": -1.0, "phase": PHASE_PRESSING}),
     f"at 3.00 s: it saw the tool far beyond the surface and detected no contact, {FAR}, 0.0 N": (
         Touch(**AT),
-        {"done": -1.0, "phase": FEELING, "force": 0.0},
+        {"done": -1.0, "phase": PHASE_APPROACHING, "force": 0.0},
     ),
     # The log ends before.
     f"after 3.50 s of the task, while the operator was searching for the slot, {FAR}": (
         Insert(**AT),
-        {"done": 0.0, "phase": SEEKING},
+        {"done": 0.0, "phase": PHASE_SEARCHING_SLOT},
     ),
     f"moving to the target, {FAR}; set a longer": (Reach(**AT), {"done": 0.0}),
     "begins at 7 s, when the simulation has ended": (
         Reach(t_start=7.0),
-        {"done": 0.0, "phase": WAITING},
+        {"done": 0.0, "phase": PHASE_WAITING},
     ),
 }
 

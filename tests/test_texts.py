@@ -9,8 +9,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError, one_line
-from drake_teleop.common.texts import read_json, read_yaml, yaml_data, yaml_text
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError, to_one_line
+from drake_teleop.common.texts import parse_yaml, read_json, read_yaml, to_yaml_text
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -202,7 +202,7 @@ def test_overlong_integers_raise():
 
 
 def test_shortened_line_keeps_beginning_and_end():
-    line = one_line("begin\n" + "x" * 1000 + " \x1b[31m end")
+    line = to_one_line("begin\n" + "x" * 1000 + " \x1b[31m end")
     assert len(line) == LONGEST_LINE
     assert line.startswith("begin x") and line.endswith("x ?[31m end")
 
@@ -243,19 +243,19 @@ DATA = st.recursive(
 @given(DATA)
 def test_written_yaml_is_read_back(data) -> None:
     """Read the text with this package and with YAML 1.1, whose numbers and booleans differ."""
-    text = yaml_text(data, head=["a\nb: 1"])
-    assert yaml_data(text, "text") == data
+    text = to_yaml_text(data, head=["a\nb: 1"])
+    assert parse_yaml(text, "text") == data
     assert yaml.safe_load(text) == data
 
 
 def test_comments_follow_their_fields() -> None:
     data = {"a": {"b": "x: #", "c": [1.5, 2]}, "b": [{"_tag": "!Wall", "b": "two\nlines"}]}
-    text = yaml_text(data, head=["above"], comments={"a.b": "of a", "b": "of b"})
+    text = to_yaml_text(data, head=["above"], comments={"a.b": "of a", "b": "of b"})
     lines = text.splitlines()
     assert lines[0] == "# above" and "  b: 'x: #'  # of a" in lines and "b:  # of b" in lines
-    assert yaml_data(text, "text", tagged=True) == data
+    assert parse_yaml(text, "text", tagged=True) == data
     with pytest.raises(DrakeTeleopError, match="cannot be written"):
-        yaml_text({"a": (1, 2)})
+        to_yaml_text({"a": (1, 2)})
 
 
 @pytest.mark.parametrize("word", ["1e-3", "010", "a\nb: 1", "x # y", "\x1b[31m", "!Touch {}"])
@@ -272,5 +272,5 @@ def test_column_names_stay_inside_comments_of_a_draft(tmp_path) -> None:
     path = tmp_path / "x.parquet"
     names = ["t", "fx", "fy", "fz", "a\nimu: {file: /etc/passwd}\n#"]
     pl.DataFrame({name: np.arange(5.0) for name in names}).write_parquet(path)
-    draft = yaml_data(draft_description(read_table(path), tmp_path).text(), "draft")
+    draft = parse_yaml(draft_description(read_table(path), tmp_path).text(), "draft")
     assert set(draft) == {"wrench"}

@@ -31,7 +31,7 @@ from drake_teleop.lab import run as runs
 from drake_teleop.lab.studies import study as studies
 from drake_teleop.logs import sample
 from drake_teleop.station import replay
-from drake_teleop.station.film import Film
+from drake_teleop.station.film import ReplayFile
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 
@@ -254,8 +254,8 @@ def test_summary_of_an_earlier_run_is_removed(tmp_path, monkeypatch, little_work
 
 
 def test_replay_that_cannot_be_written_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(Film, "_record_scene", lambda self, make_scene: "<body></body>")
-    film = Film("x", np.arange(2.0), 1.0)
+    monkeypatch.setattr(ReplayFile, "_record_scene", lambda self, make_scene: "<body></body>")
+    film = ReplayFile("x", np.arange(2.0), 1.0)
     with small_disk(), pytest.raises(CannotWrite, match=r"x\.html: cannot be written"):
         film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)
     assert list(tmp_path.iterdir()) == []

@@ -17,12 +17,12 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
+    SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
 )
 
 _CHANNELS = 12
@@ -103,10 +103,12 @@ def rest_record(
         period: sampling period [s].
         seed: of the noise.
     """
-    constants, memory = sensor_chain(config, 1, period)
+    constants, memory = sensor_chain_constants(config, 1, period)
     truth = np.zeros(16)
     truth[8] = 9.81
-    noise = np.random.default_rng(seed).standard_normal((-(-count // NOISE_BLOCK), NOISE_SIZE))
+    noise = np.random.default_rng(seed).standard_normal(
+        (-(-count // SAMPLES_PER_NOISE_BLOCK), NOISE_SIZE)
+    )
     record = np.empty((count, _CHANNELS))
     _record_into(constants, memory, noise, truth, record)
     return record
@@ -116,7 +118,7 @@ def rest_record(
 def _record_into(constants, memory, noise, truth, record):
     reading = np.empty(14)
     for k in range(record.shape[0]):
-        read_into(constants, memory, noise[k // NOISE_BLOCK], truth, reading)
+        read_sensor_into(constants, memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth, reading)
         record[k] = reading[:12]
 
 

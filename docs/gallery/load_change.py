@@ -28,13 +28,13 @@ noise = np.repeat([0.25, 0.012], 3)
 known = identify_batch(free + noise * rng.normal(size=free.shape), s, omega, alpha).identification
 
 wrench = free + (t > 5.0)[:, None] * non_contact_wrench(s, omega, alpha, held)
-parameters = change.change_parameters(noise, np.full(9, 1e-3), dt)
-memory = change.change_memory(np.concatenate([known.offsets, known.phi]), known.covariance)
+parameters = change.change_detector_parameters(noise, np.full(9, 1e-3), dt)
+memory = change.initial_change_memory(np.concatenate([known.offsets, known.phi]), known.covariance)
 measured = wrench + noise * rng.normal(size=free.shape)
-states = change.watch_load(memory, parameters, measured, s, omega, alpha)
-mass = change.identified_load(memory, known).mass
+states = change.detector_states_of_log(memory, parameters, measured, s, omega, alpha)
+mass = change.identified_or_known_load(memory, known).mass
 print(f"held: {mass - known.mass:.3f} kg")
 figure, axes = plt.subplots(figsize=(7, 2.8))
 axes.step(t, states)
-axes.set_yticks(range(len(change.STATES)), change.STATES)
+axes.set_yticks(range(len(change.STATE_NAMES)), change.STATE_NAMES)
 axes.set(xlabel="t [s]", title=f"the load counts as, in the end {mass:.3f} kg")

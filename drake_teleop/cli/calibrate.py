@@ -16,12 +16,12 @@ from drake_teleop.cli.logs import identify_command
 from drake_teleop.common.files import make_folder, write_json, write_picture
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.load.tolerance import (
-    QUANTITIES,
-    UNITS,
+    QUANTITY_NAMES,
+    QUANTITY_UNITS,
     Tolerance,
     read_tolerance,
-    sizes_of,
-    values_of,
+    tolerances_in_units,
+    values_of_required,
 )
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, Evaluation, calibrate
 from drake_teleop.robots.connections import open_recording
@@ -68,9 +68,9 @@ def calibrate_command(
     write_picture(out / "settling.png", draw_settling(looks, tolerance))
     summary |= {
         "tolerance": str(tolerance),
-        "known": dict(zip(tolerance.entries, last.known.tolist(), strict=True)),
+        "known": dict(zip(tolerance.required_entries, last.known.tolist(), strict=True)),
         "all_known": bool(last.known.all()),
-        "half_widths_95": dict(zip(tolerance.entries, last.half.tolist(), strict=True)),
+        "half_widths_95": dict(zip(tolerance.required_entries, last.half.tolist(), strict=True)),
         "doubts": list(last.doubts),
         "advice": last.advice,
         "seconds": last.t,
@@ -92,12 +92,17 @@ def progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
         table.add_column(heading, justify="left" if heading == "unit" else "right")
     table.add_column("settled", width=_BAR_CELLS)
     table.add_column("verdict")
-    units = [UNITS[name] for name in QUANTITIES for entry in tolerance.entries if name in entry]
+    units = [
+        QUANTITY_UNITS[name]
+        for name in QUANTITY_NAMES
+        for entry in tolerance.required_entries
+        if name in entry
+    ]
     values = sizes = np.full(len(units), np.nan)
     if at.found is not None:
         phi = at.found.identification.phi
-        values, sizes = values_of(tolerance, phi), sizes_of(tolerance, phi)
-    for k, entry in enumerate(tolerance.entries):
+        values, sizes = values_of_required(tolerance, phi), tolerances_in_units(tolerance, phi)
+    for k, entry in enumerate(tolerance.required_entries):
         half = at.half[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
@@ -132,7 +137,7 @@ def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
         axes = figure.subplots()
         t = np.array([at.t for at in looks])
         halves = np.array([at.half for at in looks])
-        for k, entry in enumerate(tolerance.entries):
+        for k, entry in enumerate(tolerance.required_entries):
             style = ("-", "--")[k // len(COLOURS) % 2]
             finite = np.isfinite(halves[:, k])
             colour = COLOURS[k % len(COLOURS)]

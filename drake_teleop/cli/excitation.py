@@ -118,7 +118,7 @@ def excite_command(
             )
             report(1.0)
             found = result.excitation
-            shares = dict(zip(tolerance.entries, result.reached.tolist(), strict=True))
+            shares = dict(zip(tolerance.required_entries, result.reached.tolist(), strict=True))
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
     summary = summarise(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}

@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
 from drake_teleop.common.files import output_folder, write_json, write_picture, write_table
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
-from drake_teleop.load.contact.noise_floor import STATISTICS
-from drake_teleop.load.identification import Identification, identified_object
-from drake_teleop.logs.contact import contacts_of
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
+from drake_teleop.load.identification import Identification, load_of_object
+from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.figures import (
     common_figures,
     contact_figures,
+    figures_of_object_alone,
+    figures_of_record_part,
     load_figures,
-    load_of_stretch,
-    object_figures,
-    object_notes,
-    plain,
+    notes_on_object_alone,
     rms_figures,
     share_above_force,
+    to_plain_values,
 )
 from drake_teleop.logs.processing import (
     DetectedLog,
@@ -33,7 +33,7 @@ from drake_teleop.logs.processing import (
     eliminate_log,
     identify_log,
 )
-from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 
 if TYPE_CHECKING:
     import polars as pl
@@ -53,13 +53,13 @@ def identify_command(
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
     result = found.identification
-    alone = None if gripper_load is None else identified_object(result, gripper_load)
+    alone = None if gripper_load is None else load_of_object(result, gripper_load)
     summary = common_figures(log, found, cutoff_hz, result.delay_s) | {
         "samples": result.samples,
         **load_figures(result),
         "offsets": result.offsets,
         "offsets_std": result.standard_deviations[:6],
-        "determined": found.base.lines(),
+        "determined": found.base.text_lines(),
         "method": result.method,
         "rejected": found.rejected.mean(),
         "condition_number": result.condition_number,
@@ -67,13 +67,13 @@ def identify_command(
         "residual_rms_force": float(np.linalg.norm(result.residual_rms[:3])),
         "residual_rms_torque": float(np.linalg.norm(result.residual_rms[3:])),
         "causes": [asdict(cause) for cause in found.causes],
-        "loads": [load_of_stretch(stretch) for stretch in found.loads],
+        "loads": [figures_of_record_part(stretch) for stretch in found.loads],
     }
     if alone is not None:
-        summary |= {"gripper": str(gripper), "object": object_figures(alone)}
-        summary["notes"] += object_notes(alone)
-    summary = plain(summary)
-    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, stack_pictures
+        summary |= {"gripper": str(gripper), "object": figures_of_object_alone(alone)}
+        summary["notes"] += notes_on_object_alone(alone)
+    summary = to_plain_values(summary)
+    from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, stack_pictures
     from drake_teleop.logs.report import write_report
 
     with output_folder(out):
@@ -81,7 +81,7 @@ def identify_command(
         if alone is not None:
             alone.save(out / "object.json")
         write_picture(out / "fit.png", draw_fit(found))
-        write_picture(out / "knowledge.png", draw_knowledge(found))
+        write_picture(out / "knowledge.png", draw_spectrum_and_intervals(found))
         stack_pictures(out / "fit.png", out / "knowledge.png", out / "report.png")
         write_report(out / "report.html", found, summary, alone)
         write_json(out / "summary.json", summary)
@@ -152,7 +152,7 @@ def eliminate_command(
         summary["notes"] += found.detection.notes
     elif not found.log.static:
         summary["notes"].append(f"{len(found.log)} samples are too few to tell contact from noise")
-    summary = plain(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
+    summary = to_plain_values(summary | rms_figures(found) | contact_figures(found, causal_tare_s))
     from drake_teleop.logs.pictures import draw_elimination
 
     with output_folder(out):
@@ -170,11 +170,11 @@ def _wrench_table(found: EliminatedLog) -> pl.DataFrame:
     columns: dict[str, NDArray[Any]] = {"t": found.log.t}
     for name in ("contact", "scaled", "non_contact", "measured"):
         values = getattr(found, name)
-        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+        columns |= {f"{name}_{c}": values[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     if found.causal is not None:
         for name in ("contact", "scaled"):
             values = getattr(found.causal, name)
-            columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH)}
+            columns |= {f"causal_{name}_{c}": values[:, i] for i, c in enumerate(WRENCH_COLUMNS)}
     columns |= {"in_contact": found.touched, "edge": found.edge}
     return pl.DataFrame(columns)
 
@@ -201,14 +201,14 @@ def detect_command(
         "threshold": found.threshold,
         "noise": found.floor.noise,
         "per_acceleration": found.floor.per_acceleration,
-        "above_threshold": found.above.mean(),
+        "above_threshold": found.is_above_threshold.mean(),
         "in_contact": found.touched.mean(),
         "force_threshold": found.force_threshold,
         "above_force_threshold": share_above_force(eliminated, found.force_threshold),
-        "contacts": contacts_of(eliminated.log.t, eliminated.contact, found.touched),
+        "contacts": summarize_contacts(eliminated.log.t, eliminated.contact, found.touched),
     }
     summary["notes"] += found.notes
-    summary = plain(summary)
+    summary = to_plain_values(summary)
     from drake_teleop.logs.pictures import draw_detection
 
     with output_folder(out):
@@ -224,6 +224,8 @@ def _detection_table(found: DetectedLog) -> pl.DataFrame:
     import polars as pl
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
-    columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}
-    columns |= {f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH)}
+    columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTIC_NAMES)}
+    columns |= {
+        f"contact_{c}": found.eliminated.contact[:, i] for i, c in enumerate(WRENCH_COLUMNS)
+    }
     return pl.DataFrame(columns | {"in_contact": found.touched, "edge": found.eliminated.edge})

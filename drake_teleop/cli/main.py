@@ -13,8 +13,8 @@ from typing import Any
 import click
 
 from drake_teleop.cli import options as option
-from drake_teleop.common.errors import DrakeTeleopError, one_line
-from drake_teleop.common.interruption import INTERRUPTED, install_handlers
+from drake_teleop.common.errors import DrakeTeleopError, to_one_line
+from drake_teleop.common.interruption import INTERRUPTED_EVENT, install_handlers
 from drake_teleop.common.version import __version__
 
 
@@ -168,10 +168,10 @@ def print_scenario(name: str | None) -> None:
     its range and its meaning: drake-teleop scenario press > mine.yaml
     """
     from drake_teleop.station.scenario import LoadScenario, ScenarioNames
-    from drake_teleop.station.scenario_reference import commented
+    from drake_teleop.station.scenario_reference import to_commented_yaml
 
     if name is not None:
-        click.echo(commented(LoadScenario(name)), nl=False)
+        click.echo(to_commented_yaml(LoadScenario(name)), nl=False)
         return
     for shipped in ScenarioNames():
         click.echo(f"{shipped:20} {LoadScenario(shipped).description}")
@@ -790,7 +790,7 @@ def main(arguments: list[str] | None = None) -> None:
         try:
             status = _run_with_exit_status(arguments)
         finally:
-            INTERRUPTED.clear()
+            INTERRUPTED_EVENT.clear()
     sys.exit(status if isinstance(status, int) else 0)
 
 
@@ -813,5 +813,5 @@ def _run_with_exit_status(arguments: list[str] | None) -> Any:
 
 
 def _print_error(message: str) -> int:
-    click.echo(one_line(f"error: {message}"), err=True)
+    click.echo(to_one_line(f"error: {message}"), err=True)
     return 2

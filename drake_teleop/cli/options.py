@@ -342,6 +342,6 @@ def _arm_from_options(
             where="--sensor-frame",
             remedy="name the frame or link at which the sensor measures",
         )
-    from drake_teleop.station.slave.plant import arm_of
+    from drake_teleop.station.slave.plant import arm_of_model_file
 
-    return arm_of(model, sensor_frame, package_paths)
+    return arm_of_model_file(model, sensor_frame, package_paths)

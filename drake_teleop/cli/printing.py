@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from drake_teleop.load.identification import PARAMETERS
+from drake_teleop.load.identification import PARAMETER_NAMES
 
 
 def print_identification(summary: dict[str, Any], out: Path) -> None:
@@ -19,7 +19,7 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     rows = [
         (name, value, std, 1.0, "N" if i < 3 else "N m", name)
         for i, (name, value, std) in enumerate(
-            zip(PARAMETERS[:6], summary["offsets"], summary["offsets_std"], strict=True)
+            zip(PARAMETER_NAMES[:6], summary["offsets"], summary["offsets_std"], strict=True)
         )
     ]
     _add_rows(table, rows, summary["identifiable"])
@@ -50,7 +50,7 @@ def _load_rows(load: dict[str, Any]) -> list[_Row]:
     ]
     return rows + [
         (name, load["phi"][4 + i], load["phi_std"][4 + i], 1e3, "g m^2", name)
-        for i, name in enumerate(PARAMETERS[10:])
+        for i, name in enumerate(PARAMETER_NAMES[10:])
     ]
 
 

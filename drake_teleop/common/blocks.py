@@ -18,10 +18,10 @@ def weak_callback(method: Any) -> Callable[..., None]:
     """Return a callback for C++ that refers weakly to the system of `method`."""
     system, function = weakref.ref(method.__self__), method.__func__
 
-    def call(context: Any, output: Any) -> None:
+    def call_method(context: Any, output: Any) -> None:
         function(system(), context, output)
 
-    return call
+    return call_method
 
 
 class DoubleOnly:
@@ -29,18 +29,18 @@ class DoubleOnly:
 
     __slots__ = ONE_DICT
 
-    def _refuse(self, *_: Any) -> NoReturn:
+    def _refuse_scalar_conversion(self, *_: Any) -> NoReturn:
         raise DrakeTeleopError(
             "computes with compiled code for double only",
             where=type(self).__name__,
             remedy="use NonContactWrench or WrenchScaling, or linearize numerically",
         )
 
-    ToAutoDiffXd = ToSymbolic = _refuse
+    ToAutoDiffXd = ToSymbolic = _refuse_scalar_conversion
 
 
 #: Maximum magnitude of any force, torque, length, angle or speed of a station, in SI units.
-LARGEST = 1e6
+LARGEST_PORT_VALUE = 1e6
 
 
 class Fault(IntEnum):
@@ -56,7 +56,7 @@ class Fault(IntEnum):
     RESUMING = 7
 
 
-MEANINGS = {
+FAULT_MEANINGS = {
     Fault.STALE: "the wrist sensor's last sample is too old, or of another time",
     Fault.READING: "the wrist sensor gives no reading, or one that no sensor survives",
     Fault.JOINTS: "the slave's joint angles are no numbers",
@@ -70,8 +70,8 @@ MEANINGS = {
 
 @njit(cache=True)
 def all_in_range(numbers):
-    """Return whether all numbers are finite and at most `LARGEST` in magnitude."""
+    """Return whether all numbers are finite and at most `LARGEST_PORT_VALUE` in magnitude."""
     good = True
     for x in numbers:
-        good = good and abs(x) <= LARGEST
+        good = good and abs(x) <= LARGEST_PORT_VALUE
     return good

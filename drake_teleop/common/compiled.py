@@ -45,7 +45,7 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
     return compile_function
 
 
-def call_at(arguments: tuple[types.Type, ...]) -> Any:
+def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
     """Return a compiled function (address, arguments) that calls the function at an address."""
 
     @intrinsic
@@ -96,7 +96,7 @@ class _CacheFiles:
     def load(self, key: Any) -> Any:
         with (
             suppress(OSError, EOFError, pickle.UnpicklingError),
-            self._path(key).open("rb") as file,
+            self._path_of_key(key).open("rb") as file,
         ):
             if not _is_trusted(os.fstat(file.fileno())):
                 return None
@@ -104,25 +104,25 @@ class _CacheFiles:
             return code if stored_key == key else None
 
     def save(self, key: Any, code: Any) -> None:
-        path = self._path(key)
+        path = self._path_of_key(key)
         temporary = path.with_suffix(f".{uuid4().hex}")
         try:
             temporary.touch(mode=0o644)  # not writable by others, with any umask
             temporary.write_bytes(dumps((key, code)))
             os.replace(temporary, path)
-            self._discard(keep=self._prefix + fingerprint(self._dispatcher))
+            self._discard_other_files(keep=self._prefix + fingerprint_of_code(self._dispatcher))
         except OSError:  # full disk: compile again next time
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
 
     def flush(self) -> None:
-        self._discard()
+        self._discard_other_files()
 
-    def _path(self, key: Any) -> Path:
+    def _path_of_key(self, key: Any) -> Path:
         this = sha256(str(key).encode()).hexdigest()[:16]
-        return self._folder / f"{self._prefix}{fingerprint(self._dispatcher)}-{this}.nbc"
+        return self._folder / f"{self._prefix}{fingerprint_of_code(self._dispatcher)}-{this}.nbc"
 
-    def _discard(self, keep: str | None = None) -> None:
+    def _discard_other_files(self, keep: str | None = None) -> None:
         for path in self._folder.glob(f"{self._prefix}*.nbc"):
             if keep is None or not path.name.startswith(keep):
                 path.unlink(missing_ok=True)
@@ -133,7 +133,7 @@ def _is_trusted(file: os.stat_result) -> bool:
     return file.st_uid in owners and not file.st_mode & stat.S_IWOTH
 
 
-def fingerprint(dispatcher: Dispatcher) -> str:
+def fingerprint_of_code(dispatcher: Dispatcher) -> str:
     found: set[Any] = {dispatcher}
     pending: list[Any] = [dispatcher]
     while pending:
@@ -147,7 +147,7 @@ def fingerprint(dispatcher: Dispatcher) -> str:
 @cache
 def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
     function = getattr(compiled, "py_func", compiled)
-    constants = dict(_referenced_values(function))
+    constants = dict(_values_referenced_by(function))
     options = getattr(compiled, "targetoptions", {})
     text = (
         _qualified_name(compiled),
@@ -166,7 +166,7 @@ def _is_callee(value: Any, package: str) -> bool:
     return plain or isinstance(value, Dispatcher)
 
 
-def _referenced_values(function: FunctionType) -> Iterator[tuple[str, Any]]:
+def _values_referenced_by(function: FunctionType) -> Iterator[tuple[str, Any]]:
     cells = function.__closure__ or ()
     for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
         yield name, cell.cell_contents

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 from drake_teleop.common.errors import DrakeTeleopError, field_place, suggest_name
 from drake_teleop.common.registry import Registry
 
-KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
+KIND_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 """Name of each value type in messages."""
 _checks_assignments = ContextVar("checks_assignments", default=True)
 
@@ -203,10 +203,10 @@ def _check_type(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
         inner = Kind(kind.lists - 1, kind.items, False)
         for index, item in enumerate(value):
             _check_type(inner, item, f"{place}[{index}]", from_file=from_file)
-    elif first in KINDS:
-        if not _has_kind(first, value, from_file=from_file):
+    elif first in KIND_NAMES:
+        if not _is_value_of_kind(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"
-            raise _kind_error(KINDS[first], value, place, remedy if first is float else "")
+            raise _kind_error(KIND_NAMES[first], value, place, remedy if first is float else "")
     elif from_file:
         several = len(kind.items) > 1
         check_structure(_selected_block(kind.items, value, place), value, place, tagged=several)
@@ -225,7 +225,7 @@ def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     return blocks[names.index(tag) if tag else 0]
 
 
-def _has_kind(kind: type, value: Any, *, from_file: bool) -> bool:
+def _is_value_of_kind(kind: type, value: Any, *, from_file: bool) -> bool:
     if kind in (bool, str):
         return isinstance(value, kind)
     if isinstance(value, bool):
@@ -303,21 +303,21 @@ def settings(block: _Class) -> _Class:
     Its module must not postpone annotations: `yaml_load_typed` reads the types of the fields.
     """
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
-    block.__str__ = _changed_fields  # type: ignore[assignment]
+    block.__str__ = _describe_changed_fields  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.text) for entry in fields_of(block)]
     block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
     return block
 
 
-def _changed_fields(self: Any) -> str:
-    return "\n  ".join([type(self).__name__, *_changed_lines(self)])
+def _describe_changed_fields(self: Any) -> str:
+    return "\n  ".join([type(self).__name__, *_lines_of_changed_fields(self)])
 
 
-def _changed_lines(config: Any) -> Iterator[str]:
+def _lines_of_changed_fields(config: Any) -> Iterator[str]:
     for entry in dataclasses.fields(config):
         value = getattr(config, entry.name)
-        if value == _default(entry):
+        if value == _default_value(entry):
             continue
         blocks = value if isinstance(value, list) else [value]
         if not blocks or not dataclasses.is_dataclass(blocks[0]):
@@ -326,7 +326,7 @@ def _changed_lines(config: Any) -> Iterator[str]:
         for index, block in enumerate(blocks):
             place = f"{entry.name}[{index}]" if isinstance(value, list) else entry.name
             yield f"{place}: {type(block).__name__}"
-            yield from (f"  {line}" for line in _changed_lines(block))
+            yield from (f"  {line}" for line in _lines_of_changed_fields(block))
 
 
 def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
@@ -358,15 +358,15 @@ def fields_of(config: Any) -> list[FieldInfo]:
 
 def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
     lists, items, optional, by_name = _kind_of_field(entry, entry.type)
-    blocks = tuple(item for item in items if item not in KINDS)
+    blocks = tuple(item for item in items if item not in KIND_NAMES)
     metadata = entry.metadata
     return FieldInfo(
         name=entry.name,
-        kind="block" if blocks else KINDS[items[0]].removeprefix("a "),
+        kind="block" if blocks else KIND_NAMES[items[0]].removeprefix("a "),
         lists=lists,
         length=metadata.get("length"),
         optional=optional,
-        default=_default(entry) if isinstance(config, type) else getattr(config, entry.name),
+        default=_default_value(entry) if isinstance(config, type) else getattr(config, entry.name),
         unit=metadata.get("unit", ""),
         low=metadata.get("low"),
         high=metadata.get("high"),
@@ -374,12 +374,12 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         if "choices" in metadata
         else (),
         blocks=blocks,
-        meaning=metadata.get("doc") or _first_line(blocks[0]),
+        meaning=metadata.get("doc") or _first_docstring_line(blocks[0]),
         by_name=by_name,
     )
 
 
-def _default(entry: dataclasses.Field[Any]) -> Any:
+def _default_value(entry: dataclasses.Field[Any]) -> Any:
     if entry.default_factory is not dataclasses.MISSING:
         return entry.default_factory()
     return entry.default
@@ -391,5 +391,5 @@ def _format_value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
 
 
-def _first_line(block: type) -> str:
+def _first_docstring_line(block: type) -> str:
     return (block.__doc__ or "").partition("\n")[0].rstrip(".")

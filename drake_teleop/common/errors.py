@@ -31,10 +31,10 @@ class DrakeTeleopError(ValueError):
         text = f"{where}: {what}" if where else what
         if remedy:
             text = f"{text}; {remedy}"
-        super().__init__(one_line(text, LONGEST_LINE - len("error: ")))
+        super().__init__(to_one_line(text, LONGEST_LINE - len("error: ")))
 
 
-def one_line(text: str, max_length: int = LONGEST_LINE) -> str:
+def to_one_line(text: str, max_length: int = LONGEST_LINE) -> str:
     """Return the text as one printable line; the middle of a longer text is cut out."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
     if len(text) <= max_length:

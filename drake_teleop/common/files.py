@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 _MAX_LISTED_FILES = 6  # maximum number of listed files
 _RUST_ERROR = re.compile(r"([^:]+) \(os error \d+\)")
 
-_PART_NAME = "row_{:010d}.parquet"
-PARTS_OF_LOG = _PART_NAME.format(0).replace("0", "?")
+_PART_NAME_FORMAT = "row_{:010d}.parquet"
+LOG_PARTS_PATTERN = _PART_NAME_FORMAT.format(0).replace("0", "?")
 
 
 class CannotWrite(DrakeTeleopError):
@@ -53,7 +53,9 @@ def wrap_write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise CannotWrite(f"cannot be written ({_reason(error)})", where=str(path)) from error
+        raise CannotWrite(
+            f"cannot be written ({_reason_of_failure(error)})", where=str(path)
+        ) from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -94,11 +96,11 @@ def output_folder(
     make_folder(out)
     with wrap_write_errors(out / last):
         (out / last).unlink(missing_ok=True)
-    before = _file_states(out)
+    before = _file_times_and_sizes(out)
     try:
         yield
     except CannotWrite as error:
-        after = _file_states(out)
+        after = _file_times_and_sizes(out)
         existing = [name for name in after if name in kept or before.get(name) != after[name]]
         raise CannotWrite(str(error), remedy=f"{out} keeps {_join_names(existing)}") from error
 
@@ -108,7 +110,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        what = f"cannot be made a folder ({_reason(error)})"
+        what = f"cannot be made a folder ({_reason_of_failure(error)})"
         raise CannotWrite(what, where=str(folder), remedy=remedy) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise CannotWrite("is a write-protected folder", where=str(folder), remedy=remedy)
@@ -129,7 +131,7 @@ def move_earlier_recordings(*paths: Path) -> Path | None:
 
 
 def part_of_log(folder: Path, first_row: int) -> Path:
-    return folder / _PART_NAME.format(first_row)
+    return folder / _PART_NAME_FORMAT.format(first_row)
 
 
 def remove_log(path: Path) -> None:
@@ -137,7 +139,7 @@ def remove_log(path: Path) -> None:
     if not path.is_dir():
         path.unlink(missing_ok=True)
         return
-    parts = sorted(path.glob(PARTS_OF_LOG))
+    parts = sorted(path.glob(LOG_PARTS_PATTERN))
     if others := sorted(set(path.iterdir()) - set(parts)):
         raise DrakeTeleopError(
             f"contains {others[0].name}, which is not part of a log",
@@ -148,7 +150,7 @@ def remove_log(path: Path) -> None:
         part.unlink()
 
 
-def _reason(error: OSError) -> str:
+def _reason_of_failure(error: OSError) -> str:
     if found := _RUST_ERROR.search(str(error)):
         return found[1].strip()
     return error.strerror or str(error) or type(error).__name__
@@ -162,7 +164,7 @@ def _replace_nonfinite_numbers(data: Any) -> Any:
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
-def _file_states(folder: Path) -> dict[str, tuple[int, int]]:
+def _file_times_and_sizes(folder: Path) -> dict[str, tuple[int, int]]:
     found = {}
     for path in sorted(folder.iterdir()):
         if not path.is_dir() or any(path.iterdir()):

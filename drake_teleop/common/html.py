@@ -18,12 +18,12 @@ def render_page(package: str, template: str, **values: Any) -> str:
     `values` are escaped; a missing one is an error.
     """
 
-    def source(name: str) -> str:
+    def read_template(name: str) -> str:
         owner = "drake_teleop.common" if name == "page.html.j2" else package
         return resources.files(owner).joinpath(name).read_text(encoding="utf-8")
 
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(source),
+        loader=jinja2.FunctionLoader(read_template),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -37,12 +37,12 @@ def png_data_url(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
-_SCRIPT = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
+_SCRIPT_PATTERN = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
 
 
 def content_security_policy(page: str, host: str = "") -> str:
     """Return a page's Content-Security-Policy; `host`: server's "address:port", "" for a file."""
-    scripts = (script.replace("\r\n", "\n") for script in _SCRIPT.findall(page))
+    scripts = (script.replace("\r\n", "\n") for script in _SCRIPT_PATTERN.findall(page))
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     own, stream = ("'self'", f"ws://{host}") if host else ("", "")

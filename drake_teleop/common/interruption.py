@@ -8,22 +8,22 @@ from collections.abc import Iterator
 from contextlib import ContextDecorator, contextmanager
 from typing import Any
 
-INTERRUPTED = threading.Event()
+INTERRUPTED_EVENT = threading.Event()
 """Set from the first signal on, until the command ends; an endless loop checks it."""
 
 
-class _Delays(threading.local):
+class _DelayedSignalState(threading.local):
     depth, received = 0, 0  # open contexts, and the last signal in them
 
 
-_DELAYS = _Delays()
+_DELAYED = _DelayedSignalState()
 
 
 def install_handlers() -> None:
-    """Handle SIGINT, unless it is ignored, and SIGTERM by a KeyboardInterrupt and `INTERRUPTED`."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    """Handle SIGTERM, and SIGINT unless ignored, by KeyboardInterrupt and `INTERRUPTED_EVENT`."""
+    signal.signal(signal.SIGTERM, _raise_interrupt)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGINT, _raise_interrupt)
 
 
 @contextmanager
@@ -34,18 +34,18 @@ def handled_sigint() -> Iterator[None]:
     if before is not signal.default_int_handler or not in_main_thread:
         yield
         return
-    signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGINT, _raise_interrupt)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-        INTERRUPTED.clear()
+        INTERRUPTED_EVENT.clear()
 
 
-def _interrupt(number: int, _frame: Any) -> None:
-    INTERRUPTED.set()
-    if _DELAYS.depth:
-        _DELAYS.received = number
+def _raise_interrupt(number: int, _frame: Any) -> None:
+    INTERRUPTED_EVENT.set()
+    if _DELAYED.depth:
+        _DELAYED.received = number
         return
     if number == signal.SIGTERM:
         raise KeyboardInterrupt("SIGTERM")
@@ -56,10 +56,10 @@ class delayed_signals(ContextDecorator):
     """Delay the KeyboardInterrupt of these handlers to the end of the context; also a decorator."""
 
     def __enter__(self) -> None:
-        _DELAYS.depth += 1
+        _DELAYED.depth += 1
 
     def __exit__(self, *_: object) -> None:
-        _DELAYS.depth -= 1
-        if _DELAYS.received and not _DELAYS.depth:
-            number, _DELAYS.received = _DELAYS.received, 0
-            _interrupt(number, None)
+        _DELAYED.depth -= 1
+        if _DELAYED.received and not _DELAYED.depth:
+            number, _DELAYED.received = _DELAYED.received, 0
+            _raise_interrupt(number, None)

@@ -54,10 +54,12 @@ def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...],
         raise DrakeTeleopError(
             f"the numbers of samples differ: {shapes}", remedy="give one row of each per sample"
         ) from error
-    return leading, [_rows(table, (*leading, table.shape[-1])) for table in tables.values()]
+    return leading, [
+        _broadcast_to_table(table, (*leading, table.shape[-1])) for table in tables.values()
+    ]
 
 
-def _rows(table: Array, shape: tuple[int, ...]) -> Array:
+def _broadcast_to_table(table: Array, shape: tuple[int, ...]) -> Array:
     # numpy broadcasts to read-only arrays, another type, which would be compiled again.
     same = table if table.shape == shape else np.array(np.broadcast_to(table, shape))
     return np.ascontiguousarray(same).reshape(-1, shape[-1])

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 _MAGIC = b"PAR1"
-_FOOTER_END = 8  # bytes: length of the footer, and magic
+_FOOTER_END_BYTES = 8  # bytes: length of the footer, and magic
 _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
 _REPEATED = 2
 # Type codes of Thrift.
-_TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _STRUCT = 1, 2, 3, 7, 8, 12
-_INTEGERS, _LISTS = (4, 5, 6), (9, 10)
+_TRUE, _FALSE, _BYTE_TYPE, _DOUBLE_TYPE, _BINARY_TYPE, _STRUCT_TYPE = 1, 2, 3, 7, 8, 12
+_INTEGER_TYPES, _LIST_TYPES = (4, 5, 6), (9, 10)
 _MAX_DEPTH = 32
 _MAX_NUMBER_BYTES = 10
 
@@ -31,29 +31,33 @@ def check_parquet(path: Path) -> None:
 
 def check_parquet_content(content: bytes | mmap.mmap) -> None:
     try:
-        _check(content)
+        _check_sizes(content)
     except (IndexError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
         raise ValueError("it is damaged: its metadata cannot be read") from None
 
 
-def _check(content: bytes | mmap.mmap) -> None:
-    end = len(content) - _FOOTER_END
+def _check_sizes(content: bytes | mmap.mmap) -> None:
+    end = len(content) - _FOOTER_END_BYTES
     if end < len(_MAGIC) or content[-len(_MAGIC) :] != _MAGIC:
         raise ValueError("it does not end as a Parquet file does")
     start = end - int.from_bytes(content[end : end + 4], "little")
-    _require(start >= len(_MAGIC), "its footer is longer than the file")
-    footer = _CompactReader(content[start:end]).struct()
-    columns = list(_columns(footer[2]))
+    _require_undamaged(start >= len(_MAGIC), "its footer is longer than the file")
+    footer = _CompactReader(content[start:end]).read_struct()
+    columns = list(_leaf_columns(footer[2]))
     groups = footer.get(4, [])
-    rows = [_size(group, 3, "rows in a row group") for group in groups]
-    _require(_size(footer, 3, "rows") == sum(rows), "its row groups do not add up to its rows")
+    rows = [_read_size(group, 3, "rows in a row group") for group in groups]
+    _require_undamaged(
+        _read_size(footer, 3, "rows") == sum(rows), "its row groups do not add up to its rows"
+    )
     for group, count in zip(groups, rows, strict=True):
-        _require(len(group[1]) == len(columns), "a row group has not the columns of the schema")
+        _require_undamaged(
+            len(group[1]) == len(columns), "a row group has not the columns of the schema"
+        )
         for chunk, (name, is_flat) in zip(group[1], columns, strict=True):
             _check_column(content, start, chunk[3], name, count if is_flat else None)
 
 
-def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
+def _leaf_columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
@@ -61,7 +65,7 @@ def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
         left, is_flat = above[-1]
         above[-1] = left - 1, is_flat
         is_flat = is_flat and element.get(3) != _REPEATED
-        if children := _size(element, 5, "children", 0):
+        if children := _read_size(element, 5, "children", 0):
             above.append((children, is_flat))
         elif element is not schema[0]:
             yield element[4].decode(), is_flat
@@ -70,48 +74,61 @@ def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
 def _check_column(
     content: bytes | mmap.mmap, end: int, column: _Struct, name: str, rows: int | None
 ) -> None:
-    values = _size(column, 5, f"values in {name}")
-    _require(rows in (None, values), f"{name} has {values} values in {rows} rows")
-    largest, length = _size(column, 6, f"bytes in {name}"), _size(column, 7, f"bytes in {name}")
-    at = _size(column, 9, f"the first byte of {name}")
-    at = min(at, _size(column, 11, f"the first byte of {name}", 0) or at)
-    _require(at + length <= end, f"{name} goes beyond the end of the file")
+    values = _read_size(column, 5, f"values in {name}")
+    _require_undamaged(rows in (None, values), f"{name} has {values} values in {rows} rows")
+    largest, length = (
+        _read_size(column, 6, f"bytes in {name}"),
+        _read_size(column, 7, f"bytes in {name}"),
+    )
+    at = _read_size(column, 9, f"the first byte of {name}")
+    at = min(at, _read_size(column, 11, f"the first byte of {name}", 0) or at)
+    _require_undamaged(at + length <= end, f"{name} goes beyond the end of the file")
     found, where = 0, f"a page of {name}"
     while found < values:
         reader = _CompactReader(content, at)
-        page = reader.struct()
-        length = _size(page, 3, f"bytes in {where}")
+        page = reader.read_struct()
+        length = _read_size(page, 3, f"bytes in {where}")
         at = reader.at + length
-        _require(at <= end, f"{where} goes beyond the end of the file")
-        _require(_size(page, 2, f"bytes in {where}") <= largest, f"{where} is larger than {name}")
-        found += _values(page, length, where)
-    _require(found == values, f"the pages of {name} have {found} values instead of {values}")
+        _require_undamaged(at <= end, f"{where} goes beyond the end of the file")
+        _require_undamaged(
+            _read_size(page, 2, f"bytes in {where}") <= largest, f"{where} is larger than {name}"
+        )
+        found += _count_values_of_page(page, length, where)
+    _require_undamaged(
+        found == values, f"the pages of {name} have {found} values instead of {values}"
+    )
 
 
-def _values(page: _Struct, length: int, where: str) -> int:
+def _count_values_of_page(page: _Struct, length: int, where: str) -> int:
     kind, what = page[1], f"values in {where}"
     if kind == _DATA_PAGE:
-        return _size(page[5], 1, what)
+        return _read_size(page[5], 1, what)
     if kind == _DICTIONARY_PAGE:
-        _require(_size(page[7], 1, what) <= page[2], f"{where} has fewer bytes than values")
+        _require_undamaged(
+            _read_size(page[7], 1, what) <= page[2], f"{where} has fewer bytes than values"
+        )
     if kind != _DATA_PAGE_V2:
         return 0
     header = page[8]
-    values = _size(header, 1, what)
-    _require(_size(header, 2, f"nulls in {where}") <= values, f"{where} has more nulls than values")
-    _require(_size(header, 3, f"rows in {where}") <= values, f"{where} has more rows than values")
-    levels = sum(_size(header, number, f"bytes in {where}") for number in (5, 6))
-    _require(levels <= length, f"{where} is shorter than its levels")
+    values = _read_size(header, 1, what)
+    _require_undamaged(
+        _read_size(header, 2, f"nulls in {where}") <= values, f"{where} has more nulls than values"
+    )
+    _require_undamaged(
+        _read_size(header, 3, f"rows in {where}") <= values, f"{where} has more rows than values"
+    )
+    levels = sum(_read_size(header, number, f"bytes in {where}") for number in (5, 6))
+    _require_undamaged(levels <= length, f"{where} is shorter than its levels")
     return values
 
 
-def _size(struct: _Struct, number: int, what: str, default: int | None = None) -> int:
+def _read_size(struct: _Struct, number: int, what: str, default: int | None = None) -> int:
     size = struct[number] if default is None else struct.get(number, default)
-    _require(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
+    _require_undamaged(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
     return int(size)
 
 
-def _require(condition: bool, otherwise: str) -> None:
+def _require_undamaged(condition: bool, otherwise: str) -> None:
     if not condition:
         raise ValueError(f"it is damaged: {otherwise}")
 
@@ -120,55 +137,55 @@ class _CompactReader:
     def __init__(self, content: bytes | mmap.mmap, at: int = 0) -> None:
         self._content, self.at = content, at
 
-    def struct(self, depth: int = 0) -> _Struct:
-        _require(depth < _MAX_DEPTH, "its metadata is nested too deeply")
+    def read_struct(self, depth: int = 0) -> _Struct:
+        _require_undamaged(depth < _MAX_DEPTH, "its metadata is nested too deeply")
         fields: _Struct = {}
         number = 0
-        while head := self._byte():
-            number = number + (head >> 4) if head >> 4 else self._integer()
+        while head := self._read_byte():
+            number = number + (head >> 4) if head >> 4 else self._read_integer()
             kind = head & 15
-            fields[number] = kind == _TRUE if kind <= _FALSE else self._value(kind, depth + 1)
+            fields[number] = kind == _TRUE if kind <= _FALSE else self._read_value(kind, depth + 1)
         return fields
 
-    def _value(self, kind: int, depth: int) -> Any:
-        if kind in _INTEGERS:
-            return self._integer()
-        if kind == _BINARY:
-            return self._bytes(self._varint())
-        if kind == _STRUCT:
-            return self.struct(depth)
-        if kind in _LISTS:
-            return self._list(depth)
-        if kind <= _BYTE:  # a boolean in a list has its own byte
-            return self._byte()
-        _require(kind == _DOUBLE, "its metadata has an unknown type")
-        return self._bytes(8)
+    def _read_value(self, kind: int, depth: int) -> Any:
+        if kind in _INTEGER_TYPES:
+            return self._read_integer()
+        if kind == _BINARY_TYPE:
+            return self._read_bytes(self._read_varint())
+        if kind == _STRUCT_TYPE:
+            return self.read_struct(depth)
+        if kind in _LIST_TYPES:
+            return self._read_list(depth)
+        if kind <= _BYTE_TYPE:  # a boolean in a list has its own byte
+            return self._read_byte()
+        _require_undamaged(kind == _DOUBLE_TYPE, "its metadata has an unknown type")
+        return self._read_bytes(8)
 
-    def _list(self, depth: int) -> list[Any]:
-        _require(depth < _MAX_DEPTH, "its metadata is nested too deeply")
-        head = self._byte()
-        size = head >> 4 if head >> 4 < 15 else self._varint()
-        return [self._value(head & 15, depth + 1) for _ in range(size)]
+    def _read_list(self, depth: int) -> list[Any]:
+        _require_undamaged(depth < _MAX_DEPTH, "its metadata is nested too deeply")
+        head = self._read_byte()
+        size = head >> 4 if head >> 4 < 15 else self._read_varint()
+        return [self._read_value(head & 15, depth + 1) for _ in range(size)]
 
-    def _bytes(self, size: int) -> bytes:
+    def _read_bytes(self, size: int) -> bytes:
         at, self.at = self.at, self.at + size
-        _require(self.at <= len(self._content), "its metadata goes beyond its end")
+        _require_undamaged(self.at <= len(self._content), "its metadata goes beyond its end")
         return bytes(self._content[at : self.at])
 
-    def _byte(self) -> int:
+    def _read_byte(self) -> int:
         self.at += 1
         return self._content[self.at - 1]
 
-    def _integer(self) -> int:
-        number = self._varint()
+    def _read_integer(self) -> int:
+        number = self._read_varint()
         return (number >> 1) ^ -(number & 1)
 
-    def _varint(self) -> int:
-        if (byte := self._byte()) < 128:
+    def _read_varint(self) -> int:
+        if (byte := self._read_byte()) < 128:
             return byte
         number = byte & 127
         for place in range(1, _MAX_NUMBER_BYTES):
-            byte = self._byte()
+            byte = self._read_byte()
             number |= (byte & 127) << 7 * place
             if byte < 128:
                 return number

@@ -8,28 +8,28 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeAlias
 
-Progress: TypeAlias = Callable[..., None]
+UpdateProgress: TypeAlias = Callable[..., None]
 """Function that displays a completed fraction, 0 to 1, and an optional status text."""
-Stage: TypeAlias = Callable[[str], Progress]
+StartStage: TypeAlias = Callable[[str], UpdateProgress]
 """Function that begins a stage of work by its name, and returns its `Progress`."""
 
 
-def show_no_progress(name: str) -> Progress:
+def show_no_progress(name: str) -> UpdateProgress:
     """Return a progress function that shows nothing."""
     return lambda fraction, words="": None
 
 
 @contextmanager
-def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Stage]:
-    """Yield a `Stage` that shows progress in this context, after `after` seconds."""
+def show_progress(progress: bool | StartStage, *, after: float = 0.0) -> Iterator[StartStage]:
+    """Yield a `StartStage` that shows progress in this context, after `after` seconds."""
     if callable(progress):
         yield progress
     elif not progress:
         yield show_no_progress
     elif not _is_interactive():
-        yield _line_stages(after)
+        yield _stages_as_lines(after)
     else:
-        yield from _bar_stages(after)
+        yield from _stages_as_bars(after)
 
 
 def _is_interactive() -> bool:
@@ -39,10 +39,10 @@ def _is_interactive() -> bool:
     return console.is_terminal or console.is_jupyter
 
 
-def _line_stages(after: float) -> Stage:
+def _stages_as_lines(after: float) -> StartStage:
     opened = time.monotonic()
 
-    def stage(name: str) -> Progress:
+    def start_stage(name: str) -> UpdateProgress:
         printed = False
 
         def update(fraction: float, words: str = "") -> None:
@@ -54,10 +54,10 @@ def _line_stages(after: float) -> Stage:
         update(0.0)
         return update
 
-    return stage
+    return start_stage
 
 
-def _bar_stages(after: float) -> Iterator[Stage]:
+def _stages_as_bars(after: float) -> Iterator[StartStage]:
     from rich import progress as rich_progress
     from rich.errors import LiveError
 
@@ -69,7 +69,7 @@ def _bar_stages(after: float) -> Iterator[Stage]:
     )
     opened, shown = time.monotonic(), False
 
-    def show() -> None:
+    def show_bars() -> None:
         nonlocal shown
         if not shown and time.monotonic() - opened >= after:
             shown = True
@@ -78,18 +78,18 @@ def _bar_stages(after: float) -> Iterator[Stage]:
             except LiveError:  # older rich: other bars are active
                 bars.disable = True
 
-    def stage(name: str) -> Progress:
+    def start_stage(name: str) -> UpdateProgress:
         task = bars.add_task(name, total=1.0)
-        show()
+        show_bars()
 
         def update(fraction: float, words: str = "") -> None:
             bars.update(task, completed=fraction, description=f"{name} {words}")
-            show()
+            show_bars()
 
         return update
 
     try:
-        yield stage
+        yield start_stage
     finally:
         if shown:
             bars.stop()

@@ -97,7 +97,6 @@ def register_from(script: Path) -> None:
 
 
 def _run_scripts() -> bool:
-    """Register the parts of the parent process; return whether there were any new ones."""
     paths = [Path(path) for path in os.environ.get(_SCRIPTS, "").split(os.pathsep) if path]
     new = [path for path in paths if path.stem not in sys.modules]
     for path in new:

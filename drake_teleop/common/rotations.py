@@ -8,8 +8,13 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 
-WIDTHS = {"matrix": 9, "quaternion_wxyz": 4, "quaternion_xyzw": 4, "rotation_vector": 3}
-WIDTHS |= {"euler": 3}
+NUM_COLUMNS_OF_FORM = {
+    "matrix": 9,
+    "quaternion_wxyz": 4,
+    "quaternion_xyzw": 4,
+    "rotation_vector": 3,
+}
+NUM_COLUMNS_OF_FORM |= {"euler": 3}
 """Number of columns of each form."""
 
 

@@ -22,7 +22,7 @@ COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 #: Resolution of pictures in HTML pages [dots per inch].
 PAGE_DPI = 160
 
-_STYLE: dict[Any, Any] = {
+_PLOT_STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
     "figure.constrained_layout.use": True,
     "font.family": "sans-serif",
@@ -49,7 +49,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def plot_style() -> AbstractContextManager[None]:
-    return mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
+    return mpl.rc_context({**_PLOT_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
 
 
 class Picture(Figure):

@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from drake_teleop.common.errors import DrakeTeleopError, field_place, one_line
+from drake_teleop.common.errors import DrakeTeleopError, field_place, to_one_line
 
 _MAX_VALUES = 50_000  # including repetitions by aliases
 _MAX_DEPTH = 50  # nested brackets
@@ -66,21 +66,21 @@ class _Dumper(yaml.SafeDumper):
 
 _Dumper.add_representer(str, _Dumper.represent_text)
 _Dumper.add_representer(dict, _Dumper.represent_fields)
-_PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _CORE_SCHEMA}
+_SCALAR_PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _CORE_SCHEMA}
 for _kind, _, _first in _CORE_SCHEMA:
     for _side in (_Loader, _Dumper):
-        _side.add_implicit_resolver(_TAG_PREFIX + _kind, _PATTERNS[_kind], _first)
+        _side.add_implicit_resolver(_TAG_PREFIX + _kind, _SCALAR_PATTERNS[_kind], _first)
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
     """Return the data of a YAML file; with `tagged` a mapping's tag is under the key "_tag"."""
-    return yaml_data(read_text(path), str(path), tagged=tagged)
+    return parse_yaml(read_text(path), str(path), tagged=tagged)
 
 
-def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
+def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
     try:
         node = yaml.compose(text, _Loader)
-        return None if node is None else _NodeConverter(tagged).data(node, where)
+        return None if node is None else _NodeConverter(tagged).convert_node(node, where)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}: " if mark else ""
@@ -94,18 +94,18 @@ def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
         ) from None
 
 
-def yaml_text(
+def to_yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
     """Return YAML that `read_yaml` reads as the same data, with comments by field."""
-    lines, place, left = [f"# {one_line(text)}" for text in head], list[str](), comments or {}
+    lines, place, left = [f"# {to_one_line(text)}" for text in head], list[str](), comments or {}
     for line in yaml_scalar(data, flow=None).splitlines():
         inner = line.lstrip(" ")
         place[(len(line) - len(inner)) // 2 :] = [inner.partition(":")[0]]
         comment = left.get(".".join(place), "")
         lines.append(f"{line}  # {comment}" if comment else line)
     text = "\n".join(lines) + "\n"
-    if yaml_data(text, "YAML", tagged=True) != data:
+    if parse_yaml(text, "YAML", tagged=True) != data:
         raise DrakeTeleopError(
             f"{reprlib.repr(data)} cannot be written",
             where="YAML",
@@ -131,7 +131,7 @@ def read_json(path: str | Path) -> Any:
     """Return the data of a JSON file; raise DrakeTeleopError if invalid or ambiguous."""
     where, text = str(path), read_text(path)
 
-    def unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    def check_unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for name, value in pairs:
             if name in found:
@@ -141,11 +141,11 @@ def read_json(path: str | Path) -> Any:
             found[name] = value
         return found
 
-    def integer(digits: str) -> float:
+    def parse_integer(digits: str) -> float:
         return int(digits) if len(digits) <= _MAX_INTEGER_DIGITS else float(digits)
 
     try:
-        return json.loads(text, object_pairs_hook=unique_fields, parse_int=integer)
+        return json.loads(text, object_pairs_hook=check_unique_fields, parse_int=parse_integer)
     except json.JSONDecodeError as error:
         what = f"is not JSON (line {error.lineno}: {error.msg})"
         raise DrakeTeleopError(what, where=where) from None
@@ -170,42 +170,48 @@ class _NodeConverter:
         self._tagged = tagged
         self._values = 0
 
-    def data(self, node: Any, place: str) -> Any:
+    def convert_node(self, node: Any, place: str) -> Any:
         self._values += 1
         if self._values > _MAX_VALUES:
-            raise _error(f"there are more than {_MAX_VALUES} values", node, place)
+            raise _error_at_node(f"there are more than {_MAX_VALUES} values", node, place)
         if isinstance(node, yaml.MappingNode):
-            return self._mapping(node, place)
+            return self._convert_mapping(node, place)
         if isinstance(node, yaml.SequenceNode):
             if node.tag != f"{_TAG_PREFIX}seq":
-                raise _error(f"a list takes no tag {_quote_value(node.tag)}", node, place)
-            return [self.data(item, f"{place}[{i}]") for i, item in enumerate(node.value)]
-        return _scalar(node, place)
+                raise _error_at_node(f"a list takes no tag {_quote_value(node.tag)}", node, place)
+            return [self.convert_node(item, f"{place}[{i}]") for i, item in enumerate(node.value)]
+        return _scalar_data(node, place)
 
-    def _mapping(self, node: Any, place: str) -> dict[str, Any]:
+    def _convert_mapping(self, node: Any, place: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
-                raise _error(f"a field's name is a word, not {_quote_value(key.value)}", key, place)
+                raise _error_at_node(
+                    f"a field's name is a word, not {_quote_value(key.value)}", key, place
+                )
             field = field_place(place, key.value)
             if key.value in found:
-                raise _error("is defined twice", key, field)
+                raise _error_at_node("is defined twice", key, field)
             if key.value == "_tag":
-                raise _error("there is no such field", key, field, "a kind is a tag: !Kind {...}")
-            found[key.value] = self.data(value, field)
+                raise _error_at_node(
+                    "there is no such field", key, field, "a kind is a tag: !Kind {...}"
+                )
+            found[key.value] = self.convert_node(value, field)
         if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
             if not self._tagged:
-                raise _error(f"the tag {_quote_value(node.tag)} is not allowed here", node, place)
+                raise _error_at_node(
+                    f"the tag {_quote_value(node.tag)} is not allowed here", node, place
+                )
             found["_tag"] = node.tag
         return found
 
 
-def _scalar(node: Any, place: str) -> Any:
+def _scalar_data(node: Any, place: str) -> Any:
     kind, text = node.tag.removeprefix(_TAG_PREFIX), node.value
     if kind == "str":
         return text
-    if kind not in _PATTERNS or not _PATTERNS[kind].match(text):
-        raise _error(
+    if kind not in _SCALAR_PATTERNS or not _SCALAR_PATTERNS[kind].match(text):
+        raise _error_at_node(
             f"{_quote_value(text)} does not match the tag {_quote_value(node.tag)}", node, place
         )
     if kind == "null":
@@ -217,13 +223,13 @@ def _scalar(node: Any, place: str) -> Any:
     digits = text.lstrip("+-")
     if digits.startswith("0") and digits != "0":
         remedy = f"write {digits.lstrip('0') or 0}, or '{text}' in quotes for a word"
-        raise _error(f"{_quote_value(text)} may be octal", node, place, remedy)
+        raise _error_at_node(f"{_quote_value(text)} may be octal", node, place, remedy)
     if len(digits) > _MAX_INTEGER_DIGITS:
-        raise _error(f"an integer of {len(digits)} digits is too long", node, place)
+        raise _error_at_node(f"an integer of {len(digits)} digits is too long", node, place)
     return int(text)
 
 
-def _error(what: str, node: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _error_at_node(what: str, node: Any, place: str, remedy: str = "") -> DrakeTeleopError:
     line = node.start_mark.line + 1
     return DrakeTeleopError(f"{what} (line {line})", where=place, remedy=remedy)
 

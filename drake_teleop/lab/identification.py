@@ -14,16 +14,16 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, check_identified, one_blas_thread
-from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.excitation.check import check_trajectory
 from drake_teleop.lab.excitation.excite import criterion_values, excite
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import fit_noise_floor
-from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
+from drake_teleop.load.contact.noise_floor import NoiseFloor, limit_covariance
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.result import SimulationResult
@@ -82,7 +82,7 @@ class LoadIdentification:
         offsets, phi = self.estimate[:6], self.estimate[6:]
         contact = contact_wrench(wrench, offsets, s, omega, alpha, phi)
         a = accelerations(arm, self.result["joint_position"][usable], s)
-        P = finite_covariance(phi, self.batch.covariance)
+        P = limit_covariance(phi, self.batch.covariance)
         return fit_noise_floor(contact, s, omega, alpha, a, P)
 
     @property
@@ -122,7 +122,7 @@ def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
 
 def identify_load(
     scenario: Scenario,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
     *,
     trajectory: FourierTrajectory | None = None,
     log: Path | None = None,
@@ -130,7 +130,7 @@ def identify_load(
     """Simulate an excitation trajectory and identify the load.
 
     Args:
-        progress: True shows progress bars; or a `Stage` that receives the progress.
+        progress: True shows progress bars; or a `StartStage` that receives the progress.
         trajectory: excitation of the scenario's duration; None: one that each process designs once.
         log: folder of the log, see `simulate`.
 
@@ -179,7 +179,7 @@ def identify_by_batch(
     walk = sensor.random_walk()
     if scenario.motion_estimation.source != "accelerometer":  # encoders have no random walk
         walk[6:] = 0.0
-    noise = Noise(
+    noise = NoiseStd(
         wrench=sensor.wrench_std(),
         s=motion[:3],
         omega=motion[3:6],
@@ -190,9 +190,9 @@ def identify_by_batch(
     return found.identification
 
 
-def _design_trajectory(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
+def _design_trajectory(scenario: Scenario, stage: StartStage) -> tuple[FourierTrajectory, float]:
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
-    models = [path.read_bytes() for path in scenario.slave.files()]
+    models = [path.read_bytes() for path in scenario.slave.model_files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
     if key not in _DESIGN_CACHE or scenario.environment:  # the environment's files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
@@ -222,7 +222,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
 
 
 def simulate_with_timing(
-    station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
+    station: Diagram, simulation: Simulation, progress: UpdateProgress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
     """Return the result of a simulation, and simulated time over elapsed time."""
     start = time.perf_counter()

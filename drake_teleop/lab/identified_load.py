@@ -16,7 +16,7 @@ import numpy as np
 
 from drake_teleop.common.files import CannotWrite, make_folder, models_dir, whole_file
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.progress import Stage
+from drake_teleop.common.progress import StartStage
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
 from drake_teleop.load.contact.noise_floor import NoiseFloor
@@ -51,7 +51,7 @@ class IdentifiedLoad:
 
 def identified_load(
     scenario: Scenario,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
     *,
     fresh: bool = False,
     folder: Path | None = None,
@@ -99,7 +99,7 @@ def _cache_key(before: Scenario, detects: bool) -> str:
 
     computed_by = [f"{name} {version(name)}" for name in _LIBRARIES]
     computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
-    models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.files()]
+    models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.model_files()]
     what = (__version__, dataclasses.asdict(before), detects, computed_by, models)
     return sha256(repr(what).encode()).hexdigest()
 

@@ -16,7 +16,7 @@ from drake_teleop.common.files import (
     write_picture,
     write_table,
 )
-from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identification import identify_load, simulate_with_timing
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.run_summary import ScenarioRun, draw_overview, summarise
@@ -50,7 +50,7 @@ class RecordedDrive(Protocol):
     def load(self) -> IdentifiedLoad | None:
         """Load identified before the session; None if estimated during it."""
 
-    def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
+    def repeat(self, progress: UpdateProgress, log: Path | None = None) -> SimulationResult:
         """Simulate the recorded session again."""
 
 
@@ -107,7 +107,7 @@ def run_command(
 
 
 def _run_with_log(
-    setup: Scenario, out: Path, stage: Stage, fresh: bool, drive: RecordedDrive | None
+    setup: Scenario, out: Path, stage: StartStage, fresh: bool, drive: RecordedDrive | None
 ) -> ScenarioRun:
     log, scenario_file = out / "log.parquet", out / "scenario.yaml"
     # After an interruption, old files must not look like results of this run.
@@ -135,7 +135,7 @@ def _run_with_log(
 
 def run_scenario(
     scenario: Scenario,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
     log: Path | None = None,
     *,
     fresh: bool = False,
@@ -145,7 +145,7 @@ def run_scenario(
     An estimation without intended motion or task uses an excitation trajectory.
 
     Args:
-        progress: True shows progress bars; or a `Stage` that receives the progress.
+        progress: True shows progress bars; or a `StartStage` that receives the progress.
         log: folder of the log, see `simulate`.
         fresh: True ignores the cached load.
 
@@ -172,7 +172,7 @@ def run_scenario(
     return ScenarioRun(scenario, result, identification, source, factor)
 
 
-def _repeat_drive(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioRun:
+def _repeat_drive(drive: RecordedDrive, progress: StartStage, log: Path) -> ScenarioRun:
     start = time.perf_counter()
     result = drive.repeat(progress("Repeat the drive"), log)
     factor = drive.scenario.simulation.duration / (time.perf_counter() - start)

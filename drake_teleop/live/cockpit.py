@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.blocks import MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.inputs import RANGES, Inputs
@@ -113,7 +113,7 @@ class Cockpit:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
-                yield from (MEANINGS[Fault(int(fault))] for fault in sorted(faults))
+                yield from (FAULT_MEANINGS[Fault(int(fault))] for fault in sorted(faults))
         if rows["ik_status"].max() >= IkStatus.OUT_OF_REACH:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:

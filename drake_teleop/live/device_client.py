@@ -31,7 +31,7 @@ from drake_teleop.live.device_packets import (
 from drake_teleop.live.haply import HaplyDevice
 from drake_teleop.live.virtual_device import VirtualDevice, tapping_motion
 from drake_teleop.robots.udp import host_and_port
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
 _MAX_AGES = 100_000  # ticks
@@ -166,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("device", help="virtual, or haply://HOST:PORT")
     parser.add_argument("station", help="udp://127.0.0.1:PORT")
     parser.add_argument(
-        "--grip", choices=tuple(GRIPS), default="medium", help="of the virtual hand"
+        "--grip", choices=tuple(GRIP_IMPEDANCES), default="medium", help="of the virtual hand"
     )
     parser.add_argument("--depth", type=float, default=0.08, help="stroke of that hand [m]")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="duration")

@@ -25,13 +25,13 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
-from drake_teleop.station.master_side import CLUTCH_PERIOD
+from drake_teleop.station.master_side import CLUTCH_PERIOD_S
 from drake_teleop.station.operator.operator import HandImpedance
-from drake_teleop.station.passivity.packet import limit
+from drake_teleop.station.passivity.packet import limit_group
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.plant import start_pose
-from drake_teleop.station.wiring import export
+from drake_teleop.station.wiring import export_outputs
 
 Array = NDArray[np.float64]
 
@@ -74,11 +74,11 @@ def _update_displayed_wrench(wrench, held, period, limits, last, now):
     if enabled:
         target[:] = wrench
     for g in range(2):
-        limit(target, g, allowed * limits[g])
+        limit_group(target, g, allowed * limits[g])
     for i in range(6):
         step[i] = target[i] - last[i]
     for g in range(2):
-        limit(step, g, _SLEW_RATE * period * limits[g])
+        limit_group(step, g, _SLEW_RATE * period * limits[g])
     for i in range(6):
         now[i] = last[i] + step[i]
     now[_FAULT], now[_ALLOWED] = fault, allowed
@@ -193,11 +193,11 @@ def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> D
     builder, inner = DiagramBuilder(), DiagramBuilder()
     scaling = inner.AddNamedSystem(
         "kinematic_scaling",
-        KinematicScaling(scenario.kinematic_scaling, CLUTCH_PERIOD, start_pose(scenario.slave)),
+        KinematicScaling(scenario.kinematic_scaling, CLUTCH_PERIOD_S, start_pose(scenario.slave)),
     )
     for name in ("pose_master", "clutch"):
         inner.ExportInput(scaling.GetInputPort(name), name)
-    export(inner, scaling, "pose_command")
+    export_outputs(inner, scaling, "pose_command")
     inner_side = builder.AddNamedSystem("inner_side", inner.Build())
     master = builder.AddNamedSystem(
         "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, limits)
@@ -208,7 +208,7 @@ def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> D
         wrench = add_cross_fade(builder, wrench, 1 / scenario.rates.hand_hz)
     builder.ExportInput(wrench, "wrench_command")
     builder.ExportInput(inner_side.GetInputPort("clutch"), "clutch")
-    export(builder, inner_side, "pose_command")
+    export_outputs(builder, inner_side, "pose_command")
     for index in range(master.num_output_ports()):
-        export(builder, master, master.get_output_port(index).get_name())
+        export_outputs(builder, master, master.get_output_port(index).get_name())
     return builder.Build()

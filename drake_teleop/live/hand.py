@@ -38,7 +38,7 @@ from drake_teleop.station.operator.operator import (
     hand_wrench_into,
 )
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.wiring import export
+from drake_teleop.station.wiring import export_outputs
 
 Array = NDArray[np.float64]
 
@@ -228,5 +228,5 @@ def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagr
     builder.ExportInput(wrench, "wrench_command")
     builder.ExportInput(side.GetInputPort("clutch"), "clutch")
     for index in range(side.num_output_ports()):
-        export(builder, side, side.get_output_port(index).get_name())
+        export_outputs(builder, side, side.get_output_port(index).get_name())
     return builder.Build()

@@ -17,7 +17,7 @@ from drake_teleop.common.texts import read_text
 from drake_teleop.common.vectors import quaternion_exponential, quaternion_logarithm
 from drake_teleop.common.version import __version__
 from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
@@ -39,7 +39,7 @@ MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 def choice_names() -> dict[str, tuple[str, ...]]:
     """Return the names of each choice; a choice is the index of its name."""
-    shipped = {"network": NETWORKS, "grip": tuple(GRIPS), "sensor": SENSORS}
+    shipped = {"network": NETWORKS, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSORS}
     return shipped | {"method": tuple(METHODS)}
 
 
@@ -48,7 +48,7 @@ def initial_choices(scenario: Scenario) -> dict[str, int]:
     return {
         "network": 0,
         "method": list(METHODS).index(scenario.passivity.method),
-        "grip": list(GRIPS).index(scenario.operator.grip),
+        "grip": list(GRIP_IMPEDANCES).index(scenario.operator.grip),
         "object": int(scenario.slave.payload.mass > 0.0),
         "detection": int(scenario.contact_detection is not None),
         "sensor": 0,
@@ -174,7 +174,7 @@ _CHOICE_RANGES = {
     "jitter": (0, 100),
     "loss": (0, 500),
     "method": (0, 0),  # see `range_of`
-    "grip": (0, len(GRIPS) - 1),
+    "grip": (0, len(GRIP_IMPEDANCES) - 1),
     **dict.fromkeys(("object", "detection"), (0, 1)),
     "sensor": (0, len(SENSORS) - 1),
 }

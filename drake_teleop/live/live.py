@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RollPitchYaw
 
-from drake_teleop.common.errors import DrakeTeleopError, one_line
+from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.cockpit import Cockpit
@@ -249,7 +249,7 @@ class Live:
         try:
             action()
         except _FAILURE_EXCEPTIONS as error:
-            self.stopped = one_line(str(error))
+            self.stopped = to_one_line(str(error))
 
     def _simulate_slice(self, now: float) -> None:
         by_device = {} if self._link is None else self._link.hand_inputs(now)
@@ -261,9 +261,9 @@ class Live:
         except _FAILURE_EXCEPTIONS as error:
             present = self._session.inputs
             if self._requested.station_choices == present.station_choices:
-                self.stopped = one_line(str(error))
+                self.stopped = to_one_line(str(error))
             else:  # there is no such station: keep the present one
-                self._refusal = one_line(str(error))
+                self._refusal = to_one_line(str(error))
                 removed = {name: getattr(present, name) for name in CHOICES}
                 self._requested = self._requested.with_changes(removed)
         if not self.stopped:

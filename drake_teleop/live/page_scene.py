@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
-from drake_teleop.common.errors import one_line
-from drake_teleop.station.film import quiet_drake
+from drake_teleop.common.errors import to_one_line
+from drake_teleop.station.film import silence_drake_log
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import Scenario
 
@@ -39,7 +39,7 @@ class PageScene:
         arrows = ("measured_wrench_S", "contact_wrench_S") if forces else ()
         recorded = ("slave_state", "master_state", *arrows)
         try:
-            with quiet_drake():
+            with silence_drake_log():
                 meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
             self._scene = ReplayScene(meshcat, scenario, recorded)
             self.objects = _extract_objects(meshcat.StaticHtml())
@@ -56,7 +56,7 @@ class PageScene:
         moves = _SceneRecorder()
         try:
             self._scene.canvas = moves
-            self._scene.show(0.0, rows, -1)
+            self._scene.show_sample(0.0, rows, -1)
         except _FAILURE_EXCEPTIONS as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._fail(error)
@@ -64,7 +64,7 @@ class PageScene:
         return moves.rounded_changes()
 
     def _fail(self, error: BaseException) -> None:
-        self.failure = one_line(f"no 3D scene: {error}")
+        self.failure = to_one_line(f"no 3D scene: {error}")
         print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
 
 

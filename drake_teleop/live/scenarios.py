@@ -13,10 +13,10 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
-from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.master.data_sheets import LEADER_NAME, PHANTOM_NAME, Master
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.passivity.safe_state import RESUME_TIME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME_S
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 from drake_teleop.station.slave.plant import NominalSlave
@@ -58,7 +58,7 @@ def live_scenario(scenario: Scenario) -> Scenario:
 
 def with_task_space_device(scenario: Scenario) -> Scenario:
     """Return the scenario with a task-space device if its master is a serial arm."""
-    if scenario.master.model not in (PHANTOM, LEADER):
+    if scenario.master.model not in (PHANTOM_NAME, LEADER_NAME):
         return scenario
     return replace(scenario, master=Master(model="haply_inverse3"))
 
@@ -80,7 +80,7 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
     method = tuple(METHODS)[inputs.method]
     changes: dict[str, object] = {
         "passivity__method": method,
-        "operator__grip": list(GRIPS)[inputs.grip],
+        "operator__grip": list(GRIP_IMPEDANCES)[inputs.grip],
     }
     if method == "wave" != scenario.passivity.method:
         along, turning = scenario.passivity.wave.impedance
@@ -145,4 +145,7 @@ def channel_fill_time(scenario: Scenario) -> float:
     """Return the time until all packets of a new channel arrive [s]."""
     if scenario.is_direct:
         return 0.0
-    return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME_TIME
+    return (
+        sum(longest_delay(line) for line in scenario.channel.networks_of_directions())
+        + RESUME_TIME_S
+    )

@@ -35,7 +35,7 @@ from websockets.http11 import Request, Response
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder
 from drake_teleop.common.html import content_security_policy
-from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceConnection
@@ -105,7 +105,7 @@ class LiveDrive:
             self._load = _identify_load(scenario, stage)
             self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
 
-    def _make_scenes(self, scenario: Scenario, device: bool, progress: Progress) -> None:
+    def _make_scenes(self, scenario: Scenario, device: bool, progress: UpdateProgress) -> None:
         self._scene_scenarios: dict[str, Scenario] = {}
         for name in SCENES:
             setup = load_scene(name, scenario)
@@ -271,7 +271,7 @@ class LiveDrive:
             with contextlib.suppress(ConnectionClosed):
                 await page.send(self._hello(page))
 
-    def _raise_when_stopped(self, name: str) -> Progress:
+    def _raise_when_stopped(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
                 raise DrakeTeleopError("the drive has ended")
@@ -338,7 +338,7 @@ class LiveDrive:
                 )
 
 
-def _identify_load(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
+def _identify_load(scenario: Scenario, progress: bool | StartStage) -> IdentifiedLoad | None:
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()

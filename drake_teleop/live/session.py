@@ -16,7 +16,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.progress import Progress
+from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
@@ -38,8 +38,13 @@ from drake_teleop.live.scenarios import (
 from drake_teleop.live.station_swap import copy_state
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.signals import LOG, SIGNALS, signal_of
-from drake_teleop.station.simulation import MakeSimulator, advance, log_columns, read_log
+from drake_teleop.station.signals import LOG_BLOCK_NAME, SIGNALS, signal_of
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    log_columns,
+    read_recorded_signals,
+)
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 #: Rows in a part of a log on disk, two seconds. Copying a longer part would delay a slice; each
@@ -121,7 +126,7 @@ class _Station:
         if scenario.simulation.integrator == "runge_kutta3":  # has error control
             take_short_steps_in_contact(self.simulator, _MIN_STEP_S)
         self.context = self.simulator.get_mutable_context()
-        self.sink = self.station.GetSubsystemByName(LOG).FindMutableLog(self.context)
+        self.sink = self.station.GetSubsystemByName(LOG_BLOCK_NAME).FindMutableLog(self.context)
         self.columns = log_columns(self.station)
 
     def block(self, name: str) -> tuple[Any, Context]:
@@ -260,7 +265,7 @@ class Session:
     def _advance_to(self, ms: int) -> None:
         self.ms = ms
         # The same product as Drake's event times, see `simulate`.
-        advance(self._station.simulator, 1e-3 * ms)
+        advance_without_garbage_collection(self._station.simulator, 1e-3 * ms)
 
     def new_rows(self) -> dict[str, NDArray[np.float64]]:
         """Return the log's rows since the last call: signal -> (n, k), and "t" (n,) [s]."""
@@ -306,7 +311,7 @@ class Session:
             self._on_disk.finish()
 
     def _rows(self) -> SimulationResult:
-        return add_missing_signals(read_log(self._station.simulator, 0.0))
+        return add_missing_signals(read_recorded_signals(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
         parts = [*self._earlier_rows, self._rows()]
@@ -340,7 +345,7 @@ class Drive:
     folder: Path = Path()
 
     def repeat(
-        self, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
+        self, progress: UpdateProgress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
         """Simulate the session again in steps of at most `slice_ms`; return the same log."""
         session = Session(self.scenario, self.load, log=log, device=self.device)

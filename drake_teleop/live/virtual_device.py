@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _STEPS_PER_MS = 10  # per ms
 
@@ -24,7 +24,7 @@ class VirtualDevice:
         mass: float = 0.15,
         damping: float = 0.5,
     ) -> None:
-        held = GRIPS[grip]
+        held = GRIP_IMPEDANCES[grip]
         self._hand, self._b = hand, damping
         self._mass, self._k, self._d = mass + held.mass, held.stiffness, held.damping
         self.position, self.velocity = list(map(float, hand(0.0)[0])), [0.0, 0.0, 0.0]

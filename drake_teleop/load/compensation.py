@@ -14,7 +14,7 @@ from drake_teleop.load.regressor import wrench_of_load
 
 
 @register_jitable
-def wrench_of_scales(
+def scaled_wrench_as_tuples(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
 ):
     """Return force and torque of `scaled_wrench` as tuples, for scalars of any type."""
@@ -39,7 +39,7 @@ def wrench_of_scales(
 
 
 @register_jitable
-def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
+def scaled_weight_as_tuples(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
     """Return force and torque of V(-g) (excess_gripper phi_gripper + excess_object phi_object)."""
     a, b = excess_gripper, excess_object
     up = scale_vector(-1.0, vector_at(gravity, 0))
@@ -51,7 +51,7 @@ def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_ob
 def scaled_wrench_into(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
-    force, torque = wrench_of_scales(
+    force, torque = scaled_wrench_as_tuples(
         wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
     )
     out[0], out[1], out[2] = force
@@ -60,7 +60,7 @@ def scaled_wrench_into(
 
 @njit(cache=True)
 def add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
-    force, torque = weight_of_scales(
+    force, torque = scaled_weight_as_tuples(
         gravity, phi_gripper, phi_object, excess_gripper, excess_object
     )
     add_into(out, 0, force)
@@ -68,13 +68,13 @@ def add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_obj
 
 
 @njit(cache=True)
-def _add_weights(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
+def _add_weights_of_rows(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
     for i in range(out.shape[0]):
         add_weight_into(gravity[i], phi_gripper, phi_object, excess_gripper, excess_object, out[i])
 
 
 @njit(cache=True)
-def _scaled_wrenches(
+def _scaled_wrenches_of_rows(
     wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gr, sigma_obj, gamma, out
 ):
     scales = phi_gripper, phi_object, sigma_gr, sigma_obj, gamma
@@ -136,26 +136,26 @@ def scaled_wrench(
         DrakeTeleopError: for a negative scale, or a missing gravity.
     """
     weights, inertias = weight_and_inertia_scales(
-        _scale("sigma_gripper", sigma_gripper),
-        _scale("sigma_object", sigma_object),
-        None if sigma_weight is None else _scale("sigma_weight", sigma_weight),
-        None if sigma_inertia is None else _scale("sigma_inertia", sigma_inertia),
+        _check_scale("sigma_gripper", sigma_gripper),
+        _check_scale("sigma_object", sigma_object),
+        None if sigma_weight is None else _check_scale("sigma_weight", sigma_weight),
+        None if sigma_inertia is None else _check_scale("sigma_inertia", sigma_inertia),
     )
-    scales = [*inertias, _scale("gamma", gamma)]
+    scales = [*inertias, _check_scale("gamma", gamma)]
     if weights != inertias and gravity is None:
-        raise unknown_gravity("gravity", "pass gravity, g in S, for each sample")
+        raise unknown_gravity_error("gravity", "pass gravity, g in S, for each sample")
     phis = finite_array("phi_gripper", phi_gripper, 10), finite_array("phi_object", phi_object, 10)
     leading, rows = broadcast_to_rows(
         wrench=(wrench, 6), offsets=(offsets, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
     )
     out = np.empty_like(rows[0])
-    _scaled_wrenches(*rows, *phis, *scales, out)
+    _scaled_wrenches_of_rows(*rows, *phis, *scales, out)
     if weights != inertias and gravity is not None:
         _, (down, _) = broadcast_to_rows(
             gravity=(gravity, 3), wrench=(rows[0].reshape(*leading, 6), 6)
         )
         excess = [weight - inertia for weight, inertia in zip(weights, inertias, strict=True)]
-        _add_weights(down, *phis, *excess, out)
+        _add_weights_of_rows(down, *phis, *excess, out)
     return out.reshape(*leading, 6)
 
 
@@ -170,7 +170,7 @@ def weight_and_inertia_scales(
     return weights, both if sigma_inertia is None else (sigma_inertia, sigma_inertia)
 
 
-def unknown_gravity(where: str, remedy: str) -> DrakeTeleopError:
+def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
     return DrakeTeleopError(
         "is unknown, and sigma_weight differs from sigma_inertia", where=where, remedy=remedy
     )
@@ -187,7 +187,7 @@ def scales_from_eta(eta: float) -> tuple[float, float, float]:
     return 0.0, float(eta), 1.0
 
 
-def _scale(name: str, value: float) -> float:
+def _check_scale(name: str, value: float) -> float:
     if not 0.0 <= to_float(name, value) < np.inf:
         raise DrakeTeleopError(
             f"{value} is not a finite number >= 0",

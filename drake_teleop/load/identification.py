@@ -17,19 +17,19 @@ from drake_teleop.common.files import write_json
 from drake_teleop.common.numeric import Array, check_identified, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
 
-VERDICTS = ("identified", "weakly", "not", "prior")
+VERDICT_NAMES = ("identified", "weakly", "not", "prior")
 """Values of `Identification.verdicts`."""
 
-PARAMETERS = (
+PARAMETER_NAMES = (
     *("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz"),
     *("m", "m c_x", "m c_y", "m c_z", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz"),
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
 
-WORTH_STATING = 0.05
+MAX_IDENTIFIED_DEVIATION = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
-_WEAK, _MIN_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
+_MAX_WEAKLY_IDENTIFIED_DEVIATION, _MIN_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
 _MAX_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
 _OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
@@ -98,15 +98,22 @@ class Identification:
     def verdicts(self) -> tuple[str, ...]:
         """Verdicts (16,) on [offsets; phi]: "identified", "weakly", "not" or "prior".
 
-        "identified": standard deviation up to 5 % of `natural_scale`; "weakly": up to 50 %;
+        "identified": standard deviation up to 5 % of `natural_scales`; "weakly": up to 50 %;
         "prior": the value is mostly that of the prior.
         """
-        share = self.standard_deviations / natural_scale(self.phi)
-        rest = np.where(self.prior_dominated, "prior", np.where(share <= _WEAK, "weakly", "not"))
+        share = self.standard_deviations / natural_scales(self.phi)
+        rest = np.where(
+            self.prior_dominated,
+            "prior",
+            np.where(share <= _MAX_WEAKLY_IDENTIFIED_DEVIATION, "weakly", "not"),
+        )
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def __repr__(self) -> str:
-        deviations, named = self.standard_deviations, zip(PARAMETERS, self.verdicts, strict=True)
+        deviations, named = (
+            self.standard_deviations,
+            zip(PARAMETER_NAMES, self.verdicts, strict=True),
+        )
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
         force, torque = (np.linalg.norm(part) for part in np.split(self.residual_rms, 2))
@@ -115,12 +122,14 @@ class Identification:
         return "\n".join(
             (
                 f"{self.method}, {self.samples} samples: {known}",
-                f"  mass              {_numbers([mass], deviations[6:7])} kg",
-                f"  centre of mass    {_numbers(com, com_deviations(self.phi, self.covariance))} m",
-                f"  inertia xx yy zz  {_numbers(inertia[[0, 3, 5]])} kg m^2, about that centre",
-                f"  inertia xy xz yz  {_numbers(inertia[[1, 2, 4]])} kg m^2",
-                f"  offset of force   {_numbers(self.offsets[:3], deviations[:3])} N",
-                f"  offset of torque  {_numbers(self.offsets[3:], deviations[3:6])} N m",
+                f"  mass              {_format_numbers([mass], deviations[6:7])} kg",
+                "  centre of mass   "
+                f" {_format_numbers(com, com_deviations(self.phi, self.covariance))} m",
+                f"  inertia xx yy zz  {_format_numbers(inertia[[0, 3, 5]])} kg m^2, about that"
+                " centre",
+                f"  inertia xy xz yz  {_format_numbers(inertia[[1, 2, 4]])} kg m^2",
+                f"  offset of force   {_format_numbers(self.offsets[:3], deviations[:3])} N",
+                f"  offset of torque  {_format_numbers(self.offsets[3:], deviations[3:6])} N m",
                 f"  residual, rms     {force:.3g} N of |F|, {torque:.3g} N m of |tau|",
             )
         )
@@ -142,7 +151,7 @@ class Identification:
             "covariance": covariance,
             "identifiable": self.identifiable.tolist(),
             "verdicts": list(self.verdicts),
-            **self._derived(),
+            **self._derived_quantities(),
             "condition_number": self.condition_number,
             "delay_s": self.delay_s,
             "residual_rms": self.residual_rms.tolist(),
@@ -172,8 +181,8 @@ class Identification:
             problem = "is missing" if name in known else "is not a field of an identification"
             raise DrakeTeleopError(problem, where=f"{path}:{name}")
 
-        def numbers(name: str, *shape: int, largest: float = np.inf) -> Array:
-            if not _only_numbers(document[name]):
+        def read_number_array(name: str, *shape: int, largest: float = np.inf) -> Array:
+            if not _contains_only_numbers(document[name]):
                 raise _file_error("contains values that are not numbers", f"{path}:{name}")
             array = finite_array(f"{path}:{name}", document[name], *shape)
             if np.abs(array).max() > largest:
@@ -190,34 +199,34 @@ class Identification:
         optional = {
             k: read(f"{path}:{k}", document[k]) for k, read in readers.items() if k in document
         }
-        phi = check_identified(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
+        phi = check_identified(f"{path}:phi", read_number_array("phi", 10, largest=_MAX_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise _file_error("has no mass", f"{path}:phi")
         result = cls(
             phi=phi,
-            offsets=numbers("offsets", 6, largest=_MAX_VALUE),
+            offsets=read_number_array("offsets", 6, largest=_MAX_VALUE),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
-            condition_number=float(numbers("condition_number")),
-            delay_s=float(numbers("delay_s", largest=_MAX_VALUE)),
-            residual_rms=numbers("residual_rms", 6, largest=_MAX_VALUE),
+            condition_number=float(read_number_array("condition_number")),
+            delay_s=float(read_number_array("delay_s", largest=_MAX_VALUE)),
+            residual_rms=read_number_array("residual_rms", 6, largest=_MAX_VALUE),
             method=document["method"],
-            samples=int(numbers("samples")),
+            samples=int(read_number_array("samples")),
             **optional,
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
             raise _file_error("contradicts phi, covariance and flags", f"{path}:verdicts")
-        for name, value in result._derived().items():
+        for name, value in result._derived_quantities().items():
             if isinstance(value, bool):
                 follows = document[name] is value
             else:
-                stated = numbers(name, *np.shape(value))
+                stated = read_number_array(name, *np.shape(value))
                 follows = np.allclose(stated, value, rtol=1e-6, atol=1e-9)
             if not follows:
                 raise DrakeTeleopError("contradicts phi", where=f"{path}:{name}", remedy="edit phi")
         return result
 
-    def _derived(self) -> dict[str, Any]:
+    def _derived_quantities(self) -> dict[str, Any]:
         mass, com, inertia = mass_com_inertia(self.phi)
         return {
             "mass": mass,
@@ -227,7 +236,7 @@ class Identification:
         }
 
 
-def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:
+def _format_numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:
     text = ", ".join("?" if np.isnan(value) else f"{value:.4g}" for value in values)
     text = text if len(values) == 1 else f"[{text}]"
     if deviations is None:
@@ -246,10 +255,10 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def is_precise_enough(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    return standard_deviations <= WORTH_STATING * natural_scale(phi)
+    return standard_deviations <= MAX_IDENTIFIED_DEVIATION * natural_scales(phi)
 
 
-def natural_scale(phi: Array) -> Array:
+def natural_scales(phi: Array) -> Array:
     """Return the typical size (16,) of each of [offsets; phi], to judge its uncertainty."""
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
@@ -270,9 +279,9 @@ def _read_json(path: str | Path) -> dict[str, Any]:
     return document
 
 
-def _only_numbers(value: Any) -> bool:
+def _contains_only_numbers(value: Any) -> bool:
     if isinstance(value, list):
-        return all(map(_only_numbers, value))
+        return all(map(_contains_only_numbers, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
@@ -284,7 +293,7 @@ def _read_covariance(where: str, value: Any) -> Array:
     if raw.shape != (16, 16):
         raise _file_error("is not a (16, 16) table of numbers", where)
     unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
-    if not _only_numbers(raw[~unknown].tolist()):
+    if not _contains_only_numbers(raw[~unknown].tolist()):
         raise _file_error("contains values that are not numbers", where)
     covariance = finite_array(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
@@ -311,7 +320,9 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
 
 
 def _read_degrees(where: str, value: Any) -> Array:
-    if not (isinstance(value, list) and _only_numbers([v for v in value if v is not None])):
+    if not (
+        isinstance(value, list) and _contains_only_numbers([v for v in value if v is not None])
+    ):
         raise _file_error("is not a list of 16 numbers or null", where)
     degrees = finite_array(where, [0.0 if v is None else v for v in value], 16)
     unknown = np.array([v is None for v in value])
@@ -320,13 +331,13 @@ def _read_degrees(where: str, value: Any) -> Array:
     return np.where(unknown, np.inf, degrees)
 
 
-SIGNIFICANT = 3.0
+SIGNIFICANT_DEVIATIONS = 3.0
 """Standard deviations below zero at which a mass counts as negative."""
 
 _IS_PHI = np.arange(16) >= 6
 
 
-def identified_object(total: Identification, gripper: Identification) -> Identification:
+def load_of_object(total: Identification, gripper: Identification) -> Identification:
     """Return the object's load: that of gripper with object (`total`) minus that of `gripper`."""
     phi: Array = total.phi - gripper.phi
     covariance = total.covariance.copy()
@@ -335,7 +346,7 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
     covariance[undetermined, :] = covariance[:, undetermined] = 0.0
     covariance[undetermined, undetermined] = np.inf
     deviations = np.sqrt(np.diag(covariance))
-    if phi[0] < -SIGNIFICANT * deviations[6] or phi[0] == 0.0:
+    if phi[0] < -SIGNIFICANT_DEVIATIONS * deviations[6] or phi[0] == 0.0:
         raise DrakeTeleopError(
             f"total minus gripper leaves {phi[0]:.4g} kg for the object",
             where="gripper",
@@ -348,12 +359,12 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
         phi=phi,
         covariance=covariance,
         identifiable=identifiable,
-        degrees_of_freedom=_degrees_of_freedom(total, gripper),
+        degrees_of_freedom=_degrees_of_freedom_of_difference(total, gripper),
         prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_PHI,
     )
 
 
-def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array:
+def _degrees_of_freedom_of_difference(total: Identification, gripper: Identification) -> Array:
     a, b = (np.diag(load.covariance) for load in (total, gripper))
     b = np.where(_IS_PHI, b, 0.0)
     finite = np.isfinite(a + b) & (a + b > 0.0)

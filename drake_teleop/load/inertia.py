@@ -15,10 +15,10 @@ from drake_teleop.common.numeric import Array, finite_array
 # Tolerance for rounding, so that rods, plates and points are consistent.
 _ROUNDING = 1e-12
 # Squared radius of gyration [m^2] below which a body is a point.
-_POINT_SPREAD_M2 = 1e-290
+_POINT_MASS_EXTENT_M2 = 1e-290
 
 
-def _point_inertia(about: Array, mass: float) -> Array:
+def _inertia_of_point_mass(about: Array, mass: float) -> Array:
     return mass * (about @ about * np.eye(3) - np.outer(about, about))
 
 
@@ -32,7 +32,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
             where="I_BBcm_S",
             remedy="give equal products of inertia above and below the diagonal",
         )
-    about_origin = I + _point_inertia(p, m)
+    about_origin = I + _inertia_of_point_mass(p, m)
     return np.concatenate([[m], m * p, about_origin[np.triu_indices(3)]])
 
 
@@ -47,7 +47,7 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
             remedy="give a mass phi[0] other than 0",
         )
     p = phi[1:4] / m
-    return m, p, inertia_about_origin(phi) - _point_inertia(p, m)
+    return m, p, inertia_about_origin(phi) - _inertia_of_point_mass(p, m)
 
 
 def inertia_about_origin(phi: ArrayLike) -> Array:
@@ -89,7 +89,7 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     if mass <= 0.0 or spread < 0.0:
         return False
     # Quotients of denormal numbers are inaccurate: treat such a body as a point.
-    length = np.sqrt(spread / mass) if spread > _POINT_SPREAD_M2 * mass else 1.0
+    length = np.sqrt(spread / mass) if spread > _POINT_MASS_EXTENT_M2 * mass else 1.0
     unit = np.array([length, length, length, 1.0])
     eigenvalues = np.linalg.eigvalsh(J / np.outer(unit, unit) / mass)
     return bool(eigenvalues[0] >= -(tolerance + _ROUNDING))

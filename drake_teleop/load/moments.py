@@ -19,17 +19,17 @@ from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, 
 from drake_teleop.load.regressor import regressor
 
 _MAX_BLOCKS = 1024
-CHUNK = 2**15
+CHUNK_ROWS = 2**15
 """Samples per pass over a long record."""
 # Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
 # `normal_equations`.
 _MIN_EIGENVALUE, _MIN_EXCITATION = 1e-12, 1e-9
 # Indices of the products w_i w_j in z.
-_PRODUCTS = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
+_OMEGA_PRODUCT_INDICES = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseStd:
     """Standard deviations of white measurement noise, independent between channels.
 
     Attributes:
@@ -68,7 +68,7 @@ class Noise:
             positive_array("noise.wrench", self.wrench, 6)
 
 
-class Moments:
+class SecondMoments:
     """Second moments z z^T (19, 19) of a record, summed over its samples."""
 
     def __init__(self) -> None:
@@ -77,18 +77,18 @@ class Moments:
         self._state = np.array([0, 1, 0])
 
     @property
-    def samples(self) -> float:
+    def num_samples(self) -> float:
         """Number of samples, or the sum of their weights."""
         return float(self._sums[0, 0])
 
     @property
-    def mean(self) -> Array:
-        if self.samples < 3:
+    def mean_products(self) -> Array:
+        if self.num_samples < 3:
             raise DrakeTeleopError(
-                f"{self.samples:.3g} samples cannot determine a load",
+                f"{self.num_samples:.3g} samples cannot determine a load",
                 remedy="give at least 3, in different orientations",
             )
-        return self._sums / self.samples
+        return self._sums / self.num_samples
 
     def add(
         self,
@@ -104,28 +104,28 @@ class Moments:
         )
         n = rows[0].shape[0]
         weight = np.ones(n) if weights is None else finite_array("weights", weights, n)
-        for start in range(0, n, CHUNK):
+        for start in range(0, n, CHUNK_ROWS):
             part = np.zeros((19, 19))
-            chunk = (table[start : start + CHUNK] for table in (*rows, weight))
-            _accumulate(*chunk, part, self._blocks, self._state)
+            chunk = (table[start : start + CHUNK_ROWS] for table in (*rows, weight))
+            _add_products(*chunk, part, self._blocks, self._state)
             self._sums += part + np.triu(part, 1).T
 
-    def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
+    def noise_covariance(self, noise: NoiseStd, wrench: Array) -> Array:
         """Return the mean noise covariance (19, 19) of z, for wrench noise (6,) [N, N m]."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
-        products = self.mean[0, _PRODUCTS]
+        products = self.mean_products[0, _OMEGA_PRODUCT_INDICES]
         jacobian = np.zeros((3, 3, 19))  # derivative of z by w_k, coefficient of w_i
         for i in range(3):
             for j in range(3):
-                jacobian[j, i, _PRODUCTS[i, j]] += 1.0 + (i == j)
+                jacobian[j, i, _OMEGA_PRODUCT_INDICES[i, j]] += 1.0 + (i == j)
         for k in range(3):
             Q += noise.motion[1, k] ** 2 * jacobian[k].T @ products @ jacobian[k]
         return Q
 
     @staticmethod
-    def walk_covariance(noise: Noise) -> Array:
+    def walk_covariance(noise: NoiseStd) -> Array:
         """Return the covariance (19, 19) of a random-walk step of z, Eq. (T4)."""
         Q = np.zeros((19, 19))
         Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
@@ -133,7 +133,7 @@ class Moments:
 
 
 @cache
-def coefficients() -> Array:
+def regressor_coefficients() -> Array:
     """Return the constant T (6, 16, 19) with regressor [E V] = T z, Eq. (T4)."""
     T, unit, zero = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
     T[np.arange(6), np.arange(6), 0] = 1.0
@@ -157,7 +157,7 @@ def centripetal_matrix(r: Array) -> Array:
 
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
     """Return Gram matrix (16, 16) and right-hand side (16,) of least squares for [offsets; phi]."""
-    T = coefficients()
+    T = regressor_coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
     WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
     gram = TZ.transpose(1, 0, 2).reshape(16, -1) @ WT.transpose(1, 0, 2).reshape(16, -1).T
@@ -167,7 +167,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
     """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta."""
-    L = -np.einsum("cjk,j->ck", coefficients(), theta)
+    L = -np.einsum("cjk,j->ck", regressor_coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T
     return 0.5 * (S + S.T)
@@ -178,7 +178,7 @@ def excited_columns(Z: Array) -> NDArray[np.bool_]:
     return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
 
 
-def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
+def root_of_pseudo_inverse(gram: Array, used: NDArray[np.bool_]) -> Array:
     """Return R (n, rank) such that R R^T is the pseudo-inverse of the Gram matrix."""
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
@@ -187,7 +187,7 @@ def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
 
 
 @njit(cache=True)
-def _accumulate(wrench, s, omega, alpha, weights, sums, blocks, state):
+def _add_products(wrench, s, omega, alpha, weights, sums, blocks, state):
     z = np.empty(19)
     last, length, filled = state
     for i in range(wrench.shape[0]):

@@ -10,10 +10,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, positive_array, to_float
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
-    Moments,
-    coefficients,
+    SecondMoments,
     excited_columns,
     normal_equations,
+    regressor_coefficients,
     residual_covariance,
 )
 
@@ -30,11 +30,11 @@ _MIN_DEGREES_LONGEST, _MIN_ABSORBED_SHARE = 20.0, 0.9
 _SAME_POSE_M_S2, _F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
 _ROUNDING_RESIDUAL = 1e-6
-_WRENCH, _FORCE = slice(1, 7), slice(7, 10)
-"""Indices of wrench and specific force in the vector z of `Moments`, Eq. (T4)."""
+_WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
+"""Indices of wrench and specific force in the vector z of `SecondMoments`, Eq. (T4)."""
 
 
-class NormalEquations(Moments):
+class NormalEquations(SecondMoments):
     """Least squares sums of a record, from which load and sensor offsets are solved.
 
     Args:
@@ -58,7 +58,7 @@ class NormalEquations(Moments):
                 where="wrench",
                 remedy="check that the sensor is connected and that its orientation changes",
             )
-        covariance, degrees = self._covariance(theta, inverse)
+        covariance, degrees = self._covariance_and_degrees(theta, inverse)
         covariance[undetermined, :] = covariance[:, undetermined] = 0.0
         covariance[undetermined, undetermined] = degrees[undetermined] = np.inf
         return Identification(
@@ -68,18 +68,18 @@ class NormalEquations(Moments):
             identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), theta[6:]),
             condition_number=condition_number,
             delay_s=to_float("delay_s", delay_s),
-            residual_rms=np.sqrt(self.residual_squares(theta) / self.samples),
+            residual_rms=np.sqrt(self.residual_squares(theta) / self.num_samples),
             method="batch least squares",
-            samples=int(self.samples),
+            samples=int(self.num_samples),
             degrees_of_freedom=degrees,
         )
 
     def covariance(self) -> Array:
         """Return the finite covariance (16, 16) of the minimum-norm solution [offsets; phi]."""
         inverse, _, _ = self._pseudo_inverse()
-        return self._covariance(inverse @ self.normal_equations()[1], inverse)[0]
+        return self._covariance_and_degrees(inverse @ self.normal_equations()[1], inverse)[0]
 
-    def _covariance(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
+    def _covariance_and_degrees(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
         variances, degrees, _ = self._long_run_variances(theta, inverse)
         # Contribution of each channel to the covariance, and Satterthwaite's degrees of freedom.
         parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
@@ -94,22 +94,22 @@ class NormalEquations(Moments):
         )
 
     def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
-        return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
+        return _pseudo_inverse(self.normal_equations()[0], self.unexcited_directions)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
         weights = self._weights if weights is None else finite_array("weights", weights, 6)
         return normal_equations(self._sums, np.diag(weights))
 
     def _channel_grams(self) -> Array:
-        T = coefficients()
+        T = regressor_coefficients()
         return np.asarray(T @ self._sums @ T.transpose(0, 2, 1))
 
     @property
-    def unexcited(self) -> NDArray[np.bool_]:
-        return ~excited_columns(self.mean)
+    def unexcited_directions(self) -> NDArray[np.bool_]:
+        return ~excited_columns(self.mean_products)
 
     @property
-    def weights(self) -> Array:
+    def channel_weights(self) -> Array:
         return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
@@ -121,7 +121,7 @@ class NormalEquations(Moments):
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(finite_array("theta", theta, 16), inverse)[:2]
 
-    def slow_noise(self) -> NDArray[np.bool_]:
+    def has_slow_noise(self) -> NDArray[np.bool_]:
         """Return (6,) True for wrench channels whose noise is slower than the record resolves."""
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(inverse @ self.normal_equations()[1], inverse)[2]
@@ -130,26 +130,28 @@ class NormalEquations(Moments):
         self, theta: Array, inverse: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         grams = self._channel_grams()
-        n = float(self.samples)
+        n = float(self.num_samples)
         power = self.residual_squares(theta)
         if self._resolution is not None:
-            absorbed = self._absorbed(grams, inverse)
+            absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
             return *self._pose_variances(power, absorbed, theta), np.zeros(6, dtype=bool)
-        variances, degrees = self._unbiased(power, n, grams, grams, inverse)
+        variances, degrees = self._unbiased_variances(power, n, grams, grams, inverse)
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
-        wrench = np.diag(self._sums)[_WRENCH]
+        wrench = np.diag(self._sums)[_WRENCH_COLUMNS]
         found, slow = np.zeros(6, dtype=bool), np.zeros(6, dtype=bool)
-        sample_absorbed = self._absorbed(grams, inverse)
+        sample_absorbed = self._absorbed_degrees_of_freedom(grams, inverse)
         longest, longest_degrees = variances, degrees
         last, length, filled = (int(number) for number in self._state)
         # An unfinished last block would have the weight of a full one.
         blocks = self._blocks[: last + (filled == length)]
         while len(blocks) > _MIN_DEGREES:
-            rows = _rows(blocks)
-            power = np.sum((blocks[:, _WRENCH] - rows @ theta) ** 2, axis=0) / length
+            rows = _regressors_of_blocks(blocks)
+            power = np.sum((blocks[:, _WRENCH_COLUMNS] - rows @ theta) ** 2, axis=0) / length
             between = rows.transpose(1, 2, 0) @ rows.transpose(1, 0, 2) / length
-            estimated, counted = self._unbiased(power, len(blocks), between, grams, inverse)
+            estimated, counted = self._unbiased_variances(
+                power, len(blocks), between, grams, inverse
+            )
             usable = ~found & (counted >= _MIN_DEGREES)
             correlation = np.divide(estimated, of_samples, out=np.ones(6), where=of_samples > 0.0)
             at_borders = np.minimum(correlation / (2.0 * length), 0.5 / _MIN_CORRELATION_TIMES)
@@ -160,7 +162,10 @@ class NormalEquations(Moments):
             variances = np.where(take, corrected, variances)
             degrees = np.where(take, counted, degrees)
             found |= enough
-            has_motion = self._absorbed(between, inverse) >= _MIN_ABSORBED_SHARE * sample_absorbed
+            has_motion = (
+                self._absorbed_degrees_of_freedom(between, inverse)
+                >= _MIN_ABSORBED_SHARE * sample_absorbed
+            )
             is_longest = has_motion & (counted >= _MIN_DEGREES_LONGEST)
             longest = np.where(is_longest, estimated, longest)
             longest_degrees = np.where(is_longest, counted, longest_degrees)
@@ -180,12 +185,12 @@ class NormalEquations(Moments):
         min_variance = np.array(self._resolution) ** 2 / 12.0
         blocks = self._blocks[: self._state[0] + 1]
         count = blocks[:, 0]
-        s = blocks[:, _FORCE] / count[:, None]
+        s = blocks[:, _SPECIFIC_FORCE_COLUMNS] / count[:, None]
         first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_M_S2).argmax(axis=1)
         groups = (np.unique(first)[:, None] == first).astype(float)
-        sums = groups @ (blocks[:, _WRENCH] - _rows(blocks) @ theta)
+        sums = groups @ (blocks[:, _WRENCH_COLUMNS] - _regressors_of_blocks(blocks) @ theta)
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
-        left, repeats = 3.0 * len(groups) - absorbed_sums, 3.0 * (self.samples - len(groups))
+        left, repeats = 3.0 * len(groups) - absorbed_sums, 3.0 * (self.num_samples - len(groups))
         within = np.maximum(squares - between, repeats * min_variance) / max(repeats, 1.0)
         f_ratio = np.divide(
             between, left * within, out=np.zeros(2), where=(left > 0.0) & (within > 0.0)
@@ -196,14 +201,14 @@ class NormalEquations(Moments):
         variances = np.maximum(squares / np.maximum(degrees, 1.0), min_variance)
         return variances.repeat(3), degrees.repeat(3)
 
-    def _absorbed(self, between: Array, inverse: Array) -> Array:
+    def _absorbed_degrees_of_freedom(self, between: Array, inverse: Array) -> Array:
         return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
 
-    def _unbiased(
+    def _unbiased_variances(
         self, power: Array, count: float, between: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array]:
         w = self._weights
-        absorbed = self._absorbed(between, inverse)
+        absorbed = self._absorbed_degrees_of_freedom(between, inverse)
         spread = inverse @ grams @ inverse
         shares = np.einsum("cij,kji->ck", between, spread) * w**2
         degrees = np.maximum(count - absorbed, 0.0)
@@ -241,8 +246,8 @@ def identify(
     return equations.solve(delay_s)
 
 
-def _rows(blocks: Array) -> Array:
-    return np.asarray(np.einsum("cjk,bk->bcj", coefficients(), blocks))
+def _regressors_of_blocks(blocks: Array) -> Array:
+    return np.asarray(np.einsum("cjk,bk->bcj", regressor_coefficients(), blocks))
 
 
 def _pseudo_inverse(

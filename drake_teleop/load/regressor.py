@@ -23,19 +23,19 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 
-WRENCH = slice(0, 6)
-SPECIFIC_FORCE = slice(6, 9)
-ANGULAR_VELOCITY = slice(9, 12)
-ANGULAR_ACCELERATION = slice(12, 15)
-MOTION = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
-WRENCH_AND_MOTION = slice(0, 15)
-SATURATED = 15  #: above 0.5 the wrench is not valid
+SAMPLE_WRENCH = slice(0, 6)
+SAMPLE_SPECIFIC_FORCE = slice(6, 9)
+SAMPLE_ANGULAR_VELOCITY = slice(9, 12)
+SAMPLE_ANGULAR_ACCELERATION = slice(12, 15)
+SAMPLE_MOTION = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
+SAMPLE_WRENCH_AND_MOTION = slice(0, 15)
+SATURATION_FLAG_INDEX = 15  #: above 0.5 the wrench is not valid
 #: At this value of SATURATED and above, the reading was lost or impossible: the sample is an old
 #: one. The excess counts the samples with remaining effects.
-LOST = 2.0
-BEFORE_JOINTS = 16
-JOINT_POSITION = slice(BEFORE_JOINTS, None)
-TIME = -1  #: [s], only in the output of the wrist sensor
+LOST_SAMPLE_FLAG = 2.0
+FIRST_JOINT_INDEX = 16
+SAMPLE_JOINT_POSITION = slice(FIRST_JOINT_INDEX, None)
+SAMPLE_TIME_INDEX = -1  #: [s], only in the output of the wrist sensor
 
 
 @njit(cache=True)
@@ -78,13 +78,13 @@ def non_contact_wrench_into(s, omega, alpha, phi, out):
 
 
 @njit(cache=True)
-def _regressors(s, omega, alpha, V):
+def _regressors_of_rows(s, omega, alpha, V):
     for i in range(s.shape[0]):
         regressor_into(s[i], omega[i], alpha[i], V[i])
 
 
 @njit(cache=True)
-def _non_contact_wrenches(s, omega, alpha, phi, out):
+def _non_contact_wrenches_of_rows(s, omega, alpha, phi, out):
     for i in range(s.shape[0]):
         non_contact_wrench_into(s[i], omega[i], alpha[i], phi, out[i])
 
@@ -99,7 +99,7 @@ def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
     """
     leading, motion = broadcast_to_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     V = np.empty((motion[0].shape[0], 6, 10))
-    _regressors(*motion, V)
+    _regressors_of_rows(*motion, V)
     return V.reshape(*leading, 6, 10)
 
 
@@ -111,11 +111,11 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
     phi = finite_array("phi", phi, 10)
     leading, motion = broadcast_to_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     out = np.empty((motion[0].shape[0], 6))
-    _non_contact_wrenches(*motion, phi, out)
+    _non_contact_wrenches_of_rows(*motion, phi, out)
     return out.reshape(*leading, 6)
 
 
-def sample_parts(num_joints: int) -> dict[str, int]:
+def signals_of_sample(num_joints: int) -> dict[str, int]:
     """Return the signals of a wrist sensor's sample and their sizes, in order."""
     return {
         "measured_wrench_S": 6,
@@ -128,4 +128,4 @@ def sample_parts(num_joints: int) -> dict[str, int]:
 
 
 def sample_size(num_joints: int) -> int:
-    return BEFORE_JOINTS + num_joints
+    return FIRST_JOINT_INDEX + num_joints

@@ -11,18 +11,18 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.inertia import mass_com_inertia
 
-QUANTITIES = ("mass", "com", "inertia")
+QUANTITY_NAMES = ("mass", "com", "inertia")
 """Names of the quantities whose accuracy a tolerance can require."""
-ENTRIES = {
+ENTRY_NAMES = {
     "mass": ("mass",),
     "com": ("com x", "com y", "com z"),
     "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 }
 """Names of the numbers that each quantity consists of."""
-UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
+QUANTITY_UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
 """Unit of each quantity in printed values."""
 
-_FACTORS = {"%": 0.01, "mm": 1e-3, "m": 1.0}
+_SI_VALUE_OF_UNIT = {"%": 0.01, "mm": 1e-3, "m": 1.0}
 _ENTRY_PATTERN = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
 _MIN_VALUE, _MAX_VALUE = 1e-9, 10.0
 
@@ -41,18 +41,18 @@ class Tolerance(NamedTuple):
     inertia: float | None = None
 
     @property
-    def required(self) -> tuple[str, ...]:
-        return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
+    def required_quantities(self) -> tuple[str, ...]:
+        return tuple(name for name in QUANTITY_NAMES if getattr(self, name) is not None)
 
     @property
-    def entries(self) -> tuple[str, ...]:
+    def required_entries(self) -> tuple[str, ...]:
         """Names (k,) of the single required numbers, such as "com x"."""
-        return tuple(entry for name in self.required for entry in ENTRIES[name])
+        return tuple(entry for name in self.required_quantities for entry in ENTRY_NAMES[name])
 
     def __str__(self) -> str:
         return ", ".join(
             f"com {1e3 * value:g} mm" if name == "com" else f"{name} {100.0 * value:g} %"
-            for name, value in zip(QUANTITIES, self, strict=True)
+            for name, value in zip(QUANTITY_NAMES, self, strict=True)
             if value is not None
         )
 
@@ -63,10 +63,10 @@ def read_tolerance(text: str) -> Tolerance:
         match = _ENTRY_PATTERN.fullmatch(part)
         name, unit = (match[1], match[3]) if match else ("", "")
         try:
-            value = float(match[2]) * _FACTORS[unit] if match else 0.0
+            value = float(match[2]) * _SI_VALUE_OF_UNIT[unit] if match else 0.0
         except ValueError:
             value = 0.0
-        if name not in QUANTITIES or (unit == "%") == (name == "com") or name in found:
+        if name not in QUANTITY_NAMES or (unit == "%") == (name == "com") or name in found:
             raise DrakeTeleopError(
                 f"{part.strip()!r} cannot be read as one tolerance per quantity",
                 where=text,
@@ -82,7 +82,7 @@ def read_tolerance(text: str) -> Tolerance:
     return Tolerance(**found)
 
 
-def errors_of(tolerance: Tolerance, phi: Array) -> Array:
+def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
     """Return derivatives (k, 16) of the required numbers by [offsets; phi], over the tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
@@ -99,13 +99,13 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
     # Lower bound, because a poorly determined inertia can have any estimate.
     scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
     out, rows_of = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
-    for name in tolerance.required:
+    for name in tolerance.required_quantities:
         start, stop, size = rows_of[name]
         out.append(rows[start:stop] / (size * getattr(tolerance, name)))
     return np.hstack([np.zeros((sum(map(len, out)), 6)), np.concatenate(out)])
 
 
-def deviations_of(errors: Array, covariance: Array) -> Array:
+def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
     """Return standard deviations (k,) of the required numbers, over the tolerances."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
@@ -114,16 +114,16 @@ def deviations_of(errors: Array, covariance: Array) -> Array:
     return np.where(is_undetermined, np.inf, np.sqrt(np.maximum(variances, 0.0)))
 
 
-def values_of(tolerance: Tolerance, phi: Array) -> Array:
+def values_of_required(tolerance: Tolerance, phi: Array) -> Array:
     """Return the values (k,) of the required numbers of load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
-    return np.concatenate([values[name] for name in tolerance.required])
+    return np.concatenate([values[name] for name in tolerance.required_quantities])
 
 
-def sizes_of(tolerance: Tolerance, phi: Array) -> Array:
+def tolerances_in_units(tolerance: Tolerance, phi: Array) -> Array:
     """Return the tolerances (k,) of the required numbers for load phi (10,) [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
-    sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required]
-    return np.repeat(sizes, [len(ENTRIES[name]) for name in tolerance.required])
+    sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required_quantities]
+    return np.repeat(sizes, [len(ENTRY_NAMES[name]) for name in tolerance.required_quantities])

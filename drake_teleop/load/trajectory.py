@@ -14,7 +14,7 @@ from drake_teleop.common.files import write_text
 
 Array: TypeAlias = NDArray[np.float64]
 
-_FIELDS, _JOINT_FIELDS = {"frequency", "joints"}, {"q0", "rho", "delta"}
+_FILE_FIELDS, _FIELDS_PER_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
 _MAX_NUMBER = 1e6  # of any number in a file [rad, Hz]
 
 
@@ -60,19 +60,19 @@ class FourierTrajectory:
         qdd = -(rate**2 * sine) @ rho - (rate**2 * cosine) @ delta
         return q, qd, qdd
 
-    def scaled(self, factor: float) -> FourierTrajectory:
+    def with_scaled_amplitudes(self, factor: float) -> FourierTrajectory:
         """Return the trajectory with `factor` times the amplitudes; q0 is unchanged."""
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
-        from drake_teleop.common.texts import yaml_text
+        from drake_teleop.common.texts import to_yaml_text
 
         joints = {
             name: {"q0": float(q0), "rho": rho.tolist(), "delta": delta.tolist()}
             for name, q0, rho, delta in zip(joint_names, self.q0, self.rho, self.delta, strict=True)
         }
         data = {"frequency": float(self.frequency), "joints": joints}
-        write_text(Path(path), yaml_text(data, head=["Eqs. (9)-(10), rad and Hz."]))
+        write_text(Path(path), to_yaml_text(data, head=["Eqs. (9)-(10), rad and Hz."]))
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:
@@ -81,7 +81,10 @@ class FourierTrajectory:
         data = read_yaml(path)
         try:
             joints = list(data["joints"].values())
-            for fields, known in [(data, _FIELDS), *((joint, _JOINT_FIELDS) for joint in joints)]:
+            for fields, known in [
+                (data, _FILE_FIELDS),
+                *((joint, _FIELDS_PER_JOINT) for joint in joints),
+            ]:
                 if unknown := sorted(fields.keys() - known):
                     raise DrakeTeleopError(
                         f"there is no field '{unknown[0]}'",

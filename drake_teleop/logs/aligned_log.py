@@ -21,18 +21,20 @@ from drake_teleop.logs.pose_motion.estimate import (
     motion_of_load,
 )
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
-from drake_teleop.logs.read.alignment import delay_of, low_pass, near_ends, undelayed
+from drake_teleop.logs.read.alignment import choose_delay, is_near_ends, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
 _MAX_DELAY_DEVIATION_S = 0.005  # s, standard deviation
-_EDGE_KNOTS = 2.0
+_EDGE_IN_KNOT_SPACINGS = 2.0
 _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
-def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
+def estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
     """Return motion and load of a log with poses, and the source of the delay."""
-    return _with_delay(log, delay, lambda late: _estimate(log, late), 0.0, "undetermined")
+    return _fit_with_delay_or_usual(
+        log, delay, lambda late: _estimate_load_and_motion(log, late), 0.0, "undetermined"
+    )
 
 
 def motion_of_known_load(
@@ -48,30 +50,30 @@ def motion_of_known_load(
         return None
     arrays = log.t, log.wrench, posed.poses, posed.gravity_W, load
 
-    def chosen(late: float | None) -> PoseMotion:
+    def motion_at_delay(late: float | None) -> PoseMotion:
         return motion_of_load(*arrays, delay=late, lost=log.bridged, imu=posed.imu)
 
     with suppress(DrakeTeleopError):  # too short
-        found, source = _with_delay(log, delay, chosen, usual_s, "load")
+        found, source = _fit_with_delay_or_usual(log, delay, motion_at_delay, usual_s, "load")
         return (found, source) if found.imu_agrees else None
     return None
 
 
-def _with_delay(
+def _fit_with_delay_or_usual(
     log: Log,
     delay: str | float,
     motion: Callable[[float | None], _Motion],
     usual_s: float,
     usual: str,
 ) -> tuple[_Motion, str]:
-    known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
+    known, source = (None, "estimated") if delay == "auto" else choose_delay(log, None, delay)
     found = motion(known)
     if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
     return found, source
 
 
-def _estimate(log: Log, delay: float | None) -> PoseEstimate:
+def _estimate_load_and_motion(log: Log, delay: float | None) -> PoseEstimate:
     assert log.posed is not None
     return estimate_from_poses(
         log.t,
@@ -88,7 +90,7 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
     """Return the log with spline motion and without delay, and (N,) True near ends and gaps."""
     assert log.posed is not None
-    moved, splines = undelayed(log, found.delay_s), found.splines
+    moved, splines = remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
     s, omega, alpha = splines.motion(t, gravity_W)
     moved = replace(
@@ -98,7 +100,7 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
         angular_acceleration=alpha,
         gravity=splines.gravity(t, gravity_W),
     )
-    stamps, margin = splines.poses.t, _EDGE_KNOTS * splines.spacing
+    stamps, margin = splines.poses.t, _EDGE_IN_KNOT_SPACINGS * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
     change = np.zeros(len(t) + 1)
@@ -107,7 +109,7 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
     return moved, np.cumsum(change[:-1]) > 0.0
 
 
-def clock_note(found: PoseMotion) -> list[str]:
+def clock_rate_notes(found: PoseMotion) -> list[str]:
     """Return a note if the clock rate of the poses differs from that of the wrench."""
     if not found.clock_rate:
         return []
@@ -162,24 +164,26 @@ def aligned_log(
     if found is not None:
         motion, source = found
         moved, one_sided = use_spline_motion(log, motion)
-        moved = replace(moved, notes=(*moved.notes, *clock_note(motion)))
-        plain = undelayed(log, motion.delay_s) if differentiate else None
+        moved = replace(moved, notes=(*moved.notes, *clock_rate_notes(motion)))
+        plain = remove_delay(log, motion.delay_s) if differentiate else None
         if weight_removed:
             moved = replace_force_by_acceleration(moved)
             plain = None if plain is None else replace_force_by_acceleration(plain)
-        edge = one_sided | near_ends(moved, 0.0, cutoff_hz)
+        edge = one_sided | is_near_ends(moved, 0.0, cutoff_hz)
         smooth = AlignedLog(moved, motion.delay_s, source, plain, edge)
         if log.posed is None or log.posed.imu is None:
             return smooth
     elif log.posed is not None and not differentiate:
         log = read_log(path, bandwidth_hz=cutoff_hz)
     log = replace_force_by_acceleration(log) if weight_removed else log
-    delay_s, source = delay_of(log, cutoff_hz, delay, phi)
+    delay_s, source = choose_delay(log, cutoff_hz, delay, phi)
     if source == "undetermined":
         delay_s, source = usual_s, "load"
-    log = undelayed(log, delay_s)
-    other = AlignedLog(log, delay_s, source, log, near_ends(log, log.one_sided_s, cutoff_hz))
-    if smooth is None or _spread(other, phi, cutoff_hz) < _spread(smooth, phi, cutoff_hz):
+    log = remove_delay(log, delay_s)
+    other = AlignedLog(log, delay_s, source, log, is_near_ends(log, log.one_sided_s, cutoff_hz))
+    if smooth is None or _residual_spread(other, phi, cutoff_hz) < _residual_spread(
+        smooth, phi, cutoff_hz
+    ):
         return other
     return smooth
 
@@ -200,7 +204,7 @@ def replace_force_by_acceleration(log: Log) -> Log:
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 
-def _spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
+def _residual_spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
     log = aligned.log
     left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
     return float(np.log(narrowest_half(left[~aligned.edge])[0] + 1e-12).sum())

@@ -80,7 +80,7 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
     """Return the delay of `causal_low_pass` for slow signals [s]."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
-    return _ROOT_OF_2 / _prewarped(cutoff_hz, dt)
+    return _ROOT_OF_2 / _prewarped_frequency(cutoff_hz, dt)
 
 
 def causal_wrenches(
@@ -99,13 +99,13 @@ def causal_wrenches(
     lag = wait * dt + filter_lag(dt, cutoff_hz)
     ahead = lag if mode == "predicted" else 0.0
 
-    def late(wrench: Array) -> Array:
+    def filter_and_delay(wrench: Array) -> Array:
         filtered = causal_low_pass(wrench, dt, cutoff_hz, ahead)
         rows = np.maximum(np.arange(len(filtered)) - wait, 0)
         return filtered[rows]
 
-    return CausalWrench(mode, lag, late(contact), late(scaled))
+    return CausalWrench(mode, lag, filter_and_delay(contact), filter_and_delay(scaled))
 
 
-def _prewarped(cutoff_hz: float, dt: float) -> float:
+def _prewarped_frequency(cutoff_hz: float, dt: float) -> float:
     return 2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / _ROOT_4_OF_3

@@ -13,11 +13,16 @@ from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half
 from drake_teleop.load.contact.detection import (
     MAX_NOISE_LEVEL,
     ContactDetector,
+    central_axis_of_wrenches,
     fit_noise_floor,
-    statistics,
-    wrench_axis,
+    statistics_of_log,
 )
-from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, Samples, statistic_index
+from drake_teleop.load.contact.noise_floor import (
+    THRESHOLD_MARGIN,
+    DetectorSamples,
+    NoiseFloor,
+    statistic_index,
+)
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
@@ -30,8 +35,8 @@ _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
 _GRAVITY_CUTOFF_HZ = 0.5
 _QUIET_DEVIATIONS = 4.0
 _DEFAULT_CUTOFF_HZ = 30.0  # assumed cut-off without a low-pass
-_BLOCK_S, _BLOCKS = 0.1, 20
-_CONCENTRATION_STEPS, _ROUNDS = 4, 3
+_BLOCK_S, _MIN_NUM_BLOCKS = 0.1, 20
+_CONCENTRATION_STEPS, _NUM_FLOOR_ROUNDS = 4, 3
 _RECORD_MARGIN, _MIN_REACHED = 1.6, 5.0  # times 1.25 is about `MAX_NOISE_LEVEL`
 _MAX_FLOOR_SAMPLES = 30_000  # largest number of samples for a noise floor, in spans of ten blocks
 _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
@@ -63,29 +68,29 @@ class Detection:
     notes: tuple[str, ...] = ()
 
     @property
-    def above(self) -> NDArray[np.bool_]:
+    def is_above_threshold(self) -> NDArray[np.bool_]:
         """Booleans (N,): True where the statistic reaches the threshold, without hysteresis."""
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
-def detector_samples(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
+def samples_for_detector(log: Log, contact: Array, cutoff_hz: float | None) -> DetectorSamples:
     s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
     else:
         gravity = -low_pass(log.specific_force, log.dt, _GRAVITY_CUTOFF_HZ)
-    return Samples(contact, s, omega, alpha, s + gravity)
+    return DetectorSamples(contact, s, omega, alpha, s + gravity)
 
 
 def detect_contact(
-    rows: Samples,
+    rows: DetectorSamples,
     dt: float,
     cutoff_hz: float | None,
     covariance: Array,
     usual: Array,
     *,
     edge: NDArray[np.bool_] | None = None,
-    free: tuple[Samples, float] | None = None,
+    free: tuple[DetectorSamples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
     """Find contact in a log; return None for fewer than 100 judged samples.
@@ -95,8 +100,8 @@ def detect_contact(
     identification [N, N m]. `free` is a log of free motion, and its sample time [s].
     """
     period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
-    inner = _judged_samples(rows, dt, period, edge)
-    judged = rows.at(inner)
+    inner = _select_judged_samples(rows, dt, period, edge)
+    judged = rows.select_rows(inner)
     if len(judged.contact) < MIN_SAMPLES:
         return None
     hold = round(period / dt)
@@ -105,15 +110,15 @@ def detect_contact(
         fade = math.exp(-dt / period)
         floor, threshold, train = _floor_from_record(judged, dt, hold, fade, covariance, statistic)
     else:
-        train = free[0].at(_judged_samples(free[0], free[1], period))
+        train = free[0].select_rows(_select_judged_samples(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
         threshold = max(MAX_NOISE_LEVEL, floor.threshold(statistic))
     values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
     detector = ContactDetector(floor, threshold, statistic=statistic, hold=hold)
-    values[inner] = statistics(floor, *judged)
-    touched[inner] = _without_hold(detector.detect(*judged), hold)
+    values[inner] = statistics_of_log(floor, *judged)
+    touched[inner] = _remove_hold_after_contact(detector.detect(*judged), hold)
     if free is None:
-        _remove_marginal(touched, values[:, statistic_index(statistic)], threshold, hold)
+        _remove_marginal_contacts(touched, values[:, statistic_index(statistic)], threshold, hold)
     return Detection(
         floor=floor,
         statistic=statistic,
@@ -121,13 +126,14 @@ def detect_contact(
         statistics=values,
         touched=touched,
         free_s=len(train.contact) * (dt if free is None else free[1]),
-        force_threshold=MARGIN * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
+        force_threshold=THRESHOLD_MARGIN
+        * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
         notes=() if free is not None else _detection_notes(floor, touched, usual),
     )
 
 
-def _judged_samples(
-    rows: Samples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
+def _select_judged_samples(
+    rows: DetectorSamples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
 ) -> slice | NDArray[np.bool_]:
     ends, judged = max(1, round(period / dt)), np.zeros(len(rows.contact), bool)
     judged[ends : len(judged) - ends] = True
@@ -139,45 +145,47 @@ def _judged_samples(
 
 
 def _floor_from_record(
-    rows: Samples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
-) -> tuple[NoiseFloor, float, Samples]:
+    rows: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
+) -> tuple[NoiseFloor, float, DetectorSamples]:
     from scipy.ndimage import maximum_filter1d
 
     n = len(rows.contact)
     block = max(hold, round(_BLOCK_S / dt))
     selected = np.arange(n) // (10 * block) % math.ceil(n / _MAX_FLOOR_SAMPLES) == 0
-    quiet = _quiet(rows.contact, noise_floor(rows.contact))
+    quiet = _is_below_noise_limit(rows.contact, noise_floor(rows.contact))
     if (quiet & selected).sum() < MIN_SAMPLES:
         quiet = selected = np.ones(n, bool)
-    for _ in range(_CONCENTRATION_STEPS if n >= _BLOCKS * block else 0):
-        floor = fit_noise_floor(*rows.at(quiet & selected), covariance, fade=fade)
-        half = _quieter_half(statistics(floor, *rows)[:, 0], block)
+    for _ in range(_CONCENTRATION_STEPS if n >= _MIN_NUM_BLOCKS * block else 0):
+        floor = fit_noise_floor(*rows.select_rows(quiet & selected), covariance, fade=fade)
+        half = _quieter_half_of_blocks(statistics_of_log(floor, *rows)[:, 0], block)
         if (half & selected).sum() < MIN_SAMPLES:
             break
         quiet = half
-    for attempt in range(_ROUNDS):
-        train = rows.at(quiet & selected)
+    for attempt in range(_NUM_FLOOR_ROUNDS):
+        train = rows.select_rows(quiet & selected)
         floor = fit_noise_floor(*train, covariance, fade=fade)
-        values = statistics(floor, *train)[:, statistic_index(statistic)]
-        reached = _extrapolated(values, block, n)
+        values = statistics_of_log(floor, *train)[:, statistic_index(statistic)]
+        reached = _extrapolated_maximum(values, block, n)
         if attempt > 0:
             reached = min(reached, float(values.max()))
         reached = max(_MIN_REACHED, reached)
-        detector = ContactDetector(floor, MARGIN * reached, statistic=statistic, hold=hold)
+        detector = ContactDetector(
+            floor, THRESHOLD_MARGIN * reached, statistic=statistic, hold=hold
+        )
         without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
-        if (selected & without_contact).sum() < MIN_SAMPLES or attempt == _ROUNDS - 1:
+        if (selected & without_contact).sum() < MIN_SAMPLES or attempt == _NUM_FLOOR_ROUNDS - 1:
             break
         quiet = without_contact
-    return floor, _RECORD_MARGIN * reached, rows.at(quiet)
+    return floor, _RECORD_MARGIN * reached, rows.select_rows(quiet)
 
 
-def _quieter_half(level: Array, block: int) -> NDArray[np.bool_]:
+def _quieter_half_of_blocks(level: Array, block: int) -> NDArray[np.bool_]:
     of = np.minimum(np.arange(len(level)) // block, len(level) // block - 1)
     power = np.bincount(of, level**2) / np.bincount(of)
     return np.asarray((power <= np.median(power))[of])
 
 
-def _extrapolated(values: Array, block: int, samples: int) -> float:
+def _extrapolated_maximum(values: Array, block: int, samples: int) -> float:
     """Return the expected maximum of `values` in free motion over `samples` samples, Eq. (T13)."""
     block = min(block, len(values) // 4)
     count = len(values) // block
@@ -188,18 +196,18 @@ def _extrapolated(values: Array, block: int, samples: int) -> float:
     return math.exp(lower + scale * (rare - _GUMBEL_QUARTILE))
 
 
-def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
+def _remove_hold_after_contact(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
     for _, stop in find_runs_of_true(touched):
         if stop < len(touched):
             touched[stop - hold : stop] = False
     return touched
 
 
-def _remove_marginal(
+def _remove_marginal_contacts(
     touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
     for start, stop in find_runs_of_true(touched):
-        if 2 * (stop - start) < hold and values[start:stop].max() < MARGIN * threshold:
+        if 2 * (stop - start) < hold and values[start:stop].max() < THRESHOLD_MARGIN * threshold:
             touched[start:stop] = False
 
 
@@ -257,24 +265,26 @@ def noise_floor(contact: Array) -> Array:
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
         before = quiet
-        quiet = _quiet(contact, np.maximum(floor, _RESOLUTION))
+        quiet = _is_below_noise_limit(contact, np.maximum(floor, _RESOLUTION))
         if np.array_equal(before, quiet) or not quiet.any():
             break
         floor = np.sqrt(np.mean(contact[quiet] ** 2, axis=0))
     return np.maximum(floor, _RESOLUTION)
 
 
-def _quiet(contact: Array, floor: Array) -> NDArray[np.bool_]:
+def _is_below_noise_limit(contact: Array, floor: Array) -> NDArray[np.bool_]:
     return np.asarray((np.abs(contact) <= _QUIET_DEVIATIONS * floor).all(axis=1))
 
 
-def contacts_of(t: Array, contact: Array, touched: NDArray[np.bool_]) -> list[dict[str, Any]]:
+def summarize_contacts(
+    t: Array, contact: Array, touched: NDArray[np.bool_]
+) -> list[dict[str, Any]]:
     """Return times [s], peaks [N, N m], direction and point (in S) of each contact."""
     rows = []
     for start, stop in find_runs_of_true(touched):
         wrench = contact[start:stop]
         forces = np.linalg.norm(wrench[:, :3], axis=1)
-        direction, point, _ = wrench_axis(wrench[np.argmax(forces)])
+        direction, point, _ = central_axis_of_wrenches(wrench[np.argmax(forces)])
         known = bool(np.isfinite(direction).all())
         rows.append(
             {

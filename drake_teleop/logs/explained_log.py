@@ -12,35 +12,40 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import yaml_data
+from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
-from drake_teleop.logs.causes.instants import Instants, instants
+from drake_teleop.logs.causes.instants import Instants, block_means_of_record
 from drake_teleop.logs.causes.intervals import attenuation_bias
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_share
-from drake_teleop.logs.read.alignment import undelayed
-from drake_teleop.logs.read.auto_frames import log_instants
+from drake_teleop.logs.read.alignment import remove_delay
+from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML, Description
-from drake_teleop.logs.read.description_fields import UNITS
-from drake_teleop.logs.read.table_files import FORMATS
+from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION, Description
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
+from drake_teleop.logs.read.table_files import TABLE_READERS
 
-Fields = dict[str, Any]
+DescriptionFields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
 _MAX_MASS_KG = 1000.0
-_SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
-_FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
-_FORCE_UNIT, _TORQUE_UNIT = "wrench.force.unit", "wrench.torque.unit"
+_SIGN_FIELD, _FRAME_FIELD, _WEIGHT_FIELD, _GRAVITY_FIELD = (
+    "wrench.sign",
+    "wrench.frame",
+    "wrench.weight",
+    "gravity",
+)
+_FORCE_SCALE_FIELD, _TORQUE_SCALE_FIELD = "wrench.force.scale", "wrench.torque.scale"
+_FORCE_UNIT_FIELD, _TORQUE_UNIT_FIELD = "wrench.force.unit", "wrench.torque.unit"
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
 _FORCE_UNITS = ("N", "kgf", "lbf")
 _TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
 _SAME_RATIO = 1e-3
-_POSITIONS = ("pose.position_in_sensor", "imu.position")
-_ROTATIONS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
-_DIGITS = {_GRAVITY: 4, _POSITIONS[0]: 5, _POSITIONS[1]: 5}
+_POSITION_FIELDS = ("pose.position_in_sensor", "imu.position")
+_ROTATION_FIELDS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
+_DIGITS = {_GRAVITY_FIELD: 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
 _OTHER_REMEDIES = {
     "axes": "correct the columns of wrench.force and wrench.torque",
     "sensor rotation": "correct the mounting or the frame of the pose",
@@ -62,34 +67,36 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
     if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
-    ratio = fields[_TORQUE] / fields[_FORCE]
-    text = _yaml_value(_TORQUE, ratio)
+    ratio = fields[_TORQUE_SCALE_FIELD] / fields[_FORCE_SCALE_FIELD]
+    text = _yaml_value(_TORQUE_SCALE_FIELD, ratio)
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
-        f" {log.described.wrench.force.unit}; set {_FORCE} to the value of one unit of the file"
-        f" (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE} to {text} times that{_no_yaml_note(log)}"
+        f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
+        " the file (a power of ten that gives a load of a few kg:"
+        f" {10.0 ** -round(np.log10(abs(mass))):g})"
+        f" and {_TORQUE_SCALE_FIELD} to {text} times that{_no_yaml_note(log)}"
     )
 
 
 def _correct_fields(
     causes: Sequence[Cause], log: Log, by_pose: bool
-) -> tuple[Fields, list[str], list[Fields]]:
-    """Return all corrected fields, and the remedy and the corrected fields of each cause."""
+) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
     assert log.described is not None
-    fields = _fields(log.described, by_pose)
-    column = _columns(fields[_FRAME])
+    fields = _described_fields(log.described, by_pose)
+    column = _column_of_each_axis(fields[_FRAME_FIELD])
     touched: list[list[str]] = []
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
         if cause.name == "gain":
-            _gain(fields, cause.values, column)
+            _correct_gain(fields, cause.values, column)
         elif cause.name in _CORRECTIONS:
             _CORRECTIONS[cause.name](fields, cause.values)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
     texts, corrected = [], []
     for cause, names in zip(causes, touched, strict=True):
-        corrected.append({name: yaml_data(_yaml_value(name, fields[name]), name) for name in names})
+        corrected.append(
+            {name: parse_yaml(_yaml_value(name, fields[name]), name) for name in names}
+        )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _OTHER_REMEDIES.get(cause.name, "")
         texts.append(f"set {lines}{_no_yaml_note(log)}" if lines else otherwise)
@@ -97,23 +104,23 @@ def _correct_fields(
 
 
 def _no_yaml_note(log: Log) -> str:
-    return f" ({NO_YAML})" if Path(log.source).suffix.lower() in FORMATS else ""
+    return f" ({ONLY_IN_DESCRIPTION})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 
-def _fields(description: Description, by_pose: bool) -> Fields:
+def _described_fields(description: Description, by_pose: bool) -> DescriptionFields:
     wrench, imu, pose = description.wrench, description.imu, description.pose
     assert wrench is not None
     frame: Any = np.eye(3) if wrench.frame == "sensor" else wrench.frame
     weight: Any = (0.0, 0.0, 0.0, 0.0) if wrench.weight is None else wrench.weight
-    out: Fields = {
-        _SIGN: wrench.sign,
-        _FRAME: frame if isinstance(frame, str) else np.array(frame),
-        _FORCE: np.array(wrench.force.scale),
-        _TORQUE: np.array(wrench.torque.scale),
-        _FORCE_UNIT: wrench.force.unit,
-        _TORQUE_UNIT: wrench.torque.unit,
-        _WEIGHT: weight if isinstance(weight, str) else np.array(weight),
-        _GRAVITY: description.gravity_W,
+    out: DescriptionFields = {
+        _SIGN_FIELD: wrench.sign,
+        _FRAME_FIELD: frame if isinstance(frame, str) else np.array(frame),
+        _FORCE_SCALE_FIELD: np.array(wrench.force.scale),
+        _TORQUE_SCALE_FIELD: np.array(wrench.torque.scale),
+        _FORCE_UNIT_FIELD: wrench.force.unit,
+        _TORQUE_UNIT_FIELD: wrench.torque.unit,
+        _WEIGHT_FIELD: weight if isinstance(weight, str) else np.array(weight),
+        _GRAVITY_FIELD: description.gravity_W,
     }
     if imu is not None and imu.specific_force is not None and not by_pose:
         out["imu.position"] = np.array(imu.position)
@@ -129,7 +136,7 @@ def _fields(description: Description, by_pose: bool) -> Fields:
     return out
 
 
-def _columns(frame: Any) -> list[int] | None:
+def _column_of_each_axis(frame: Any) -> list[int] | None:
     if isinstance(frame, str) or (np.abs(frame).max(axis=1) < 1.0 - 1e-6).any():
         return None
     return [int(j) for j in np.abs(frame).argmax(axis=1)]
@@ -138,74 +145,81 @@ def _columns(frame: Any) -> list[int] | None:
 def _yaml_value(name: str, value: Any) -> str:
     if isinstance(value, (str, int)):
         return str(value)
-    if name in (_FRAME, "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
+    if name in (_FRAME_FIELD, "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
         return "sensor"
-    if name in (_FORCE, _TORQUE):
+    if name in (_FORCE_SCALE_FIELD, _TORQUE_SCALE_FIELD):
         factors = [f"{x:.6g}" for x in value]
         return factors[0] if len(set(factors)) == 1 else f"[{', '.join(factors)}]"
     exact = np.round(value, _DIGITS.get(name, 6)) + 0.0
     return str((exact.astype(int) if (exact == np.round(exact)).all() else exact).tolist())
 
 
-def _axes(fields: Fields, values: dict[str, Any]) -> None:
+def _correct_axes(fields: DescriptionFields, values: dict[str, Any]) -> None:
     Q = np.array(values["matrix"])
     sign = 1 if np.linalg.det(Q) > 0.0 else -1
-    base = isinstance(fields[_FRAME], str)
+    base = isinstance(fields[_FRAME_FIELD], str)
     if base and not (sign * np.eye(3) == Q).all():
         return
-    fields[_SIGN] = sign * fields[_SIGN]
+    fields[_SIGN_FIELD] = sign * fields[_SIGN_FIELD]
     if not base:
-        fields[_FRAME] = sign * Q.T @ fields[_FRAME]
+        fields[_FRAME_FIELD] = sign * Q.T @ fields[_FRAME_FIELD]
 
 
-def _rotation(fields: Fields, values: dict[str, Any]) -> None:
+def _correct_sensor_rotation(fields: DescriptionFields, values: dict[str, Any]) -> None:
     R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
-    for name in {*_ROTATIONS, *_POSITIONS} & set(fields):
+    for name in {*_ROTATION_FIELDS, *_POSITION_FIELDS} & set(fields):
         fields[name] = R @ fields[name]
 
 
-def _gravity(fields: Fields, values: dict[str, Any]) -> None:
+def _correct_gravity(fields: DescriptionFields, values: dict[str, Any]) -> None:
     true = np.array(values["gravity"])
-    fields[_GRAVITY] = true * np.linalg.norm(fields[_GRAVITY]) / np.linalg.norm(true)
+    fields[_GRAVITY_FIELD] = true * np.linalg.norm(fields[_GRAVITY_FIELD]) / np.linalg.norm(true)
 
 
-def _weight(fields: Fields, values: dict[str, Any]) -> None:
-    fields[_WEIGHT] = "removed"
+def _correct_removed_weight(fields: DescriptionFields, values: dict[str, Any]) -> None:
+    fields[_WEIGHT_FIELD] = "removed"
 
 
-def _factor(fields: Fields, values: dict[str, Any]) -> None:
-    force, torque = UNITS[fields[_FORCE_UNIT]], UNITS[fields[_TORQUE_UNIT]]
-    ratios = [(torque / UNITS[unit], _TORQUE_UNIT, unit) for unit in _TORQUE_UNITS]
-    ratios += [(UNITS[unit] / force, _FORCE_UNIT, unit) for unit in _FORCE_UNITS]
+def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
+    force, torque = (
+        SI_VALUE_OF_UNIT[fields[_FORCE_UNIT_FIELD]],
+        SI_VALUE_OF_UNIT[fields[_TORQUE_UNIT_FIELD]],
+    )
+    ratios = [(torque / SI_VALUE_OF_UNIT[unit], _TORQUE_UNIT_FIELD, unit) for unit in _TORQUE_UNITS]
+    ratios += [(SI_VALUE_OF_UNIT[unit] / force, _FORCE_UNIT_FIELD, unit) for unit in _FORCE_UNITS]
     for ratio, name, unit in ratios:
         if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _SAME_RATIO:
             fields[name] = unit
             return
-    fields[_TORQUE] = fields[_TORQUE] / values["factor"]
+    fields[_TORQUE_SCALE_FIELD] = fields[_TORQUE_SCALE_FIELD] / values["factor"]
 
 
-def _gain(fields: Fields, values: dict[str, Any], column: list[int] | None) -> None:
+def _correct_gain(
+    fields: DescriptionFields, values: dict[str, Any], column: list[int] | None
+) -> None:
     if column is None:
         return
     c = CHANNELS.index(values["channel"])
-    scale = fields[_FORCE if c < 3 else _TORQUE] = fields[_FORCE if c < 3 else _TORQUE].copy()
+    scale = fields[_FORCE_SCALE_FIELD if c < 3 else _TORQUE_SCALE_FIELD] = fields[
+        _FORCE_SCALE_FIELD if c < 3 else _TORQUE_SCALE_FIELD
+    ].copy()
     scale[column[c % 3]] /= values["gain"]
 
 
-def _frame(fields: Fields, values: dict[str, Any]) -> None:
-    for name in _POSITIONS:
+def _correct_pose_frame(fields: DescriptionFields, values: dict[str, Any]) -> None:
+    for name in _POSITION_FIELDS:
         if name in fields:
             fields[name] = fields[name] + values["position_in_sensor"]
 
 
-_CORRECTIONS: dict[str, Callable[[Fields, dict[str, Any]], None]] = {
-    "axes": _axes,
-    "sensor rotation": _rotation,
-    "gravity direction": _gravity,
-    "weight removed": _weight,
-    "payload configured": _weight,  # an estimated payload would count as exact
-    "torque factor": _factor,
-    "pose frame": _frame,
+_CORRECTIONS: dict[str, Callable[[DescriptionFields, dict[str, Any]], None]] = {
+    "axes": _correct_axes,
+    "sensor rotation": _correct_sensor_rotation,
+    "gravity direction": _correct_gravity,
+    "weight removed": _correct_removed_weight,
+    "payload configured": _correct_removed_weight,  # an estimated payload would count as exact
+    "torque factor": _correct_units,
+    "pose frame": _correct_pose_frame,
 }
 
 
@@ -218,16 +232,16 @@ _BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
     """Search for causes why a rigid load does not explain the wrench; None for a short log."""
 
-    def with_delay(more: float) -> Instants:
+    def instants_at_delay(more: float) -> Instants:
         late = delay_s + more
         if found is not None:
             return _spline_instants(log, found, late)
-        return log_instants(undelayed(log, late))
+        return block_means_of_log(remove_delay(log, late))
 
-    data = with_delay(0.0)
+    data = instants_at_delay(0.0)
     if data.used.sum() < _MIN_ROWS:
         return None
-    why = explain(data, with_delay, log.free)
+    why = explain(data, instants_at_delay, log.free)
     if log.described is None:
         return why
     causes = add_description_lines(why.causes, log, by_pose=found is not None)
@@ -239,7 +253,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
     splines, gravity = found.splines, log.posed.gravity_W
     middle = np.mean(log.posed.poses.position, axis=0)
 
-    def motion(t: Array) -> tuple[Array, ...]:
+    def motion_at(t: Array) -> tuple[Array, ...]:
         q = splines.quaternion(t + late)
         q /= np.linalg.norm(q, axis=1, keepdims=True)
         p = splines.position(t + late) - middle
@@ -251,21 +265,25 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
-    return instants(log.t, log.wrench, motion, gravity, lost, _acceleration_noise(splines))
+    return block_means_of_record(
+        log.t, log.wrench, motion_at, gravity, lost, _acceleration_noise(splines)
+    )
 
 
 def _acceleration_noise(splines: PoseSplines) -> float:
     f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
     share = passed_noise_share(f, splines.spacing)
     if splines.imu_rows is not None:
-        share = share * splines.imu_rows.share(f)[0]
-    power = 2.0 * splines.noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
+        share = share * splines.imu_rows.remaining_noise_shares(f)[0]
+    power = (
+        2.0 * splines.estimate_pose_noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
+    )
     return float(np.sqrt(np.trapezoid(power, f)))
 
 
 def explained_load(load: Identification, why: Explanation) -> Identification:
     """Return the load of the model with causes; without any, `load` with wider intervals."""
-    load = _explained_load(load, why)
+    load = _load_with_wider_intervals(load, why)
     if why.state.data.gravity_W is not None:
         return load
     extra = attenuation_bias(why.state)
@@ -276,7 +294,7 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
     return replace(load, covariance=covariance, identifiable=known)
 
 
-def _explained_load(load: Identification, why: Explanation) -> Identification:
+def _load_with_wider_intervals(load: Identification, why: Explanation) -> Identification:
     if not why.causes and not why.given:
         if why.explained or not load.identifiable.any():
             return load
@@ -300,7 +318,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
         offsets=why.theta[:6],
         covariance=why.covariance,
         identifiable=identifiable,
-        residual_rms=why.state.rows.rms(why.state.fit.residual),
+        residual_rms=why.state.rows.residual_rms(why.state.fit.residual),
         weight_removed=any(cause.name == "weight removed" for cause in why.causes)
         or "weight" in why.given,
         prior_dominated=np.zeros(16, bool),
@@ -331,7 +349,7 @@ def removed_weight_note(why: Explanation) -> str:
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
-    deviation = float(np.sqrt(why.state.extension("weight")[1][0, 0]))
+    deviation = float(np.sqrt(why.state.parameters_of_extension("weight")[1][0, 0]))
     com = ", ".join(f"{1e3 * x / mass:.3g}" for x in moment) if mass else "0, 0, 0"
     return (
         f"the weight that is removed from the wrench is that of {mass:.4g} kg"

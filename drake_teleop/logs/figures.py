@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import (
-    PARAMETERS,
-    SIGNIFICANT,
+    PARAMETER_NAMES,
+    SIGNIFICANT_DEVIATIONS,
     Identification,
     com_deviations,
     consistency_margin,
 )
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.cause import Stretch
-from drake_teleop.logs.contact import contacts_of, noise_floor
+from drake_teleop.logs.causes.cause import RecordPartWithLoad
+from drake_teleop.logs.contact import noise_floor, summarize_contacts
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 
 
@@ -41,7 +41,7 @@ def common_figures(
     }
 
 
-def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
+def figures_of_record_part(stretch: RecordPartWithLoad) -> dict[str, Any]:
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -58,7 +58,7 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 def load_figures(load: Identification) -> dict[str, Any]:
     deviations = load.standard_deviations
-    ends = intervals(load)
+    ends = confidence_intervals(load)
     return {
         "mass": load.mass,
         "mass_std": deviations[6],
@@ -68,24 +68,24 @@ def load_figures(load: Identification) -> dict[str, Any]:
         "phi": load.phi,
         "phi_std": deviations[6:],
         "phi_interval": np.stack(ends, axis=1)[6:],
-        "verdicts": dict(zip(PARAMETERS, load.verdicts, strict=True)),
-        "identifiable": _named(load, True),
-        "not_identifiable": _named(load, False),
+        "verdicts": dict(zip(PARAMETER_NAMES, load.verdicts, strict=True)),
+        "identifiable": _parameter_names(load, True),
+        "not_identifiable": _parameter_names(load, False),
         "physically_consistent": load.physically_consistent,
     }
 
 
-def object_figures(alone: Identification) -> dict[str, Any]:
+def figures_of_object_alone(alone: Identification) -> dict[str, Any]:
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
-        figures[name] = [entry for entry in figures[name] if entry in PARAMETERS[6:]]
+        figures[name] = [entry for entry in figures[name] if entry in PARAMETER_NAMES[6:]]
     return figures | {"consistency_margin": margin, "consistency_margin_std": deviation}
 
 
-def object_notes(alone: Identification) -> list[str]:
+def notes_on_object_alone(alone: Identification) -> list[str]:
     deviation = float(alone.standard_deviations[6])
-    if alone.mass < SIGNIFICANT * deviation:
+    if alone.mass < SIGNIFICANT_DEVIATIONS * deviation:
         return [
             f"no object: the total mass exceeds the gripper's by {alone.mass:.4g}"
             f" ± {deviation:.2g} kg"
@@ -93,7 +93,7 @@ def object_notes(alone: Identification) -> list[str]:
     if not alone.identifiable[6:].all() or alone.physically_consistent:
         return []
     margin, deviation = consistency_margin(alone)
-    if margin < -SIGNIFICANT * deviation:
+    if margin < -SIGNIFICANT_DEVIATIONS * deviation:
         return [
             "the object's parameters are physically impossible; check that gripper and total were"
             " identified in the same sensor frame, with the same gripper"
@@ -101,26 +101,31 @@ def object_notes(alone: Identification) -> list[str]:
     return ["the object's parameters are physically consistent only within their uncertainty"]
 
 
-def _named(result: Identification, identifiable: bool) -> list[str]:
-    pairs = zip(PARAMETERS, result.identifiable, strict=True)
+def _parameter_names(result: Identification, identifiable: bool) -> list[str]:
+    pairs = zip(PARAMETER_NAMES, result.identifiable, strict=True)
     return [name for name, flag in pairs if bool(flag) == identifiable]
 
 
 def rms_figures(found: EliminatedLog) -> dict[str, Any]:
     """Return RMS and peak values of the wrenches, without samples near ends and gaps."""
 
-    def rms(x: Array) -> Array:
+    def rms_over_samples(x: Array) -> Array:
         return np.sqrt(np.mean(x**2, axis=0))
 
-    def peak(x: Array) -> Array:
+    def peak_over_samples(x: Array) -> Array:
         return np.abs(x).max(axis=0)
 
     inner, weightless = ~found.edge, found.gravity_only
     return (
-        _reduced("raw", "rms", found.measured[inner], rms)
-        | _reduced("gravity_only", "rms", None if weightless is None else weightless[inner], rms)
-        | _reduced("residual", "rms", found.contact[inner], rms)
-        | _reduced("residual", "peak", found.contact[inner], peak)
+        _force_and_torque_figures("raw", "rms", found.measured[inner], rms_over_samples)
+        | _force_and_torque_figures(
+            "gravity_only",
+            "rms",
+            None if weightless is None else weightless[inner],
+            rms_over_samples,
+        )
+        | _force_and_torque_figures("residual", "rms", found.contact[inner], rms_over_samples)
+        | _force_and_torque_figures("residual", "peak", found.contact[inner], peak_over_samples)
     )
 
 
@@ -135,12 +140,12 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     }
     if found.detection is not None:
         figures["threshold"] = found.detection.threshold
-        figures["contacts"] = contacts_of(found.log.t, found.contact, found.touched)
+        figures["contacts"] = summarize_contacts(found.log.t, found.contact, found.touched)
         figures["in_contact"] = found.touched.mean()
     if found.causal is not None:
         late, contact = found.causal.contact[~found.edge], found.contact[~found.edge]
 
-        def rms(name: str, wrench: Array) -> dict[str, float]:
+        def rms_of_wrench(name: str, wrench: Array) -> dict[str, float]:
             force, torque = np.sqrt(np.mean(wrench**2, axis=0).reshape(2, 3).sum(axis=1))
             return {f"{name}_rms": float(force), f"{name}_torque_rms": float(torque)}
 
@@ -149,9 +154,9 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
             "lag_s": found.causal.lag_s,
             "tare_s": causal_tare_s,
             "offsets": found.causal.offsets,
-            **rms("residual", late),
+            **rms_of_wrench("residual", late),
             "noise_floor": noise_floor(late),
-            **rms("difference", late - contact),
+            **rms_of_wrench("difference", late - contact),
         }
     return figures
 
@@ -171,7 +176,7 @@ def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
     }
 
 
-def _reduced(
+def _force_and_torque_figures(
     name: str, suffix: str, wrench: Array | None, reduce: Callable[[Array], Array]
 ) -> dict[str, Any]:
     keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
@@ -181,12 +186,12 @@ def _reduced(
     return dict(zip(keys, [*norms, reduce(wrench)], strict=True))
 
 
-def plain(value: Any) -> Any:
+def to_plain_values(value: Any) -> Any:
     """Convert NumPy values to plain Python values, and infinity to None."""
     if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
+        return {key: to_plain_values(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
+        return [to_plain_values(entry) for entry in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
+        return to_plain_values(value.tolist())
     return None if value in (float("inf"), float("-inf")) else value

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, one_line
+from drake_teleop.common.errors import DrakeTeleopError, to_one_line
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.check.conventions import check_conventions
@@ -19,9 +19,9 @@ from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.alignment import white_noise
-from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
+from drake_teleop.logs.read.bags import draft_of_bag, is_bag, list_topics, read_stream
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import shortest_gap, time_stamps_s
+from drake_teleop.logs.read.clocks import min_gap_length, time_stamps_s
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.logs.read.tables import Table
@@ -53,18 +53,18 @@ def inspect_command(
     summary |= {"findings": [], "fit": None, "mounting": None, "delay_s": None, "draft": None}
     make_folder(out)
     if not others and log.suffix.lower() in (".yaml", ".yml"):
-        _inspect(load_description(log), str(log), {}, summary)
+        _inspect_described_log(load_description(log), str(log), {}, summary)
     elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _CANONICAL:
         summary["kind"] = "canonical"
-        _inspect(_describe_canonical(log, table), str(log), {log: table}, summary)
+        _inspect_described_log(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
-        drafts = [_draft(path, out, summary) for path in (log, *others)]
+        drafts = [_draft_of_recording(path, out, summary) for path in (log, *others)]
         with output_folder(out):
             _write_draft(join_drafts(drafts), out / "draft.yaml", summary)
     with output_folder(out):
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(summary)
+        _print_summary(summary)
     return summary
 
 
@@ -73,12 +73,12 @@ def _describe_canonical(log: Path, table: Table) -> Description:
         return describe_canonical(log, table)
     except DrakeTeleopError:
         # A canonical log with NaN or a missing column gets the specific message.
-        return describe_canonical(log, _finite(table, list(table.columns)))
+        return describe_canonical(log, _remove_nonfinite_rows(table, list(table.columns)))
 
 
-def _draft(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
+def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
     if is_bag(path):
-        topics = topics_of(path)
+        topics = list_topics(path)
         summary["kind"] = "bag"
         summary["topics"] |= {
             topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
@@ -107,7 +107,6 @@ def _are_numbers(names: Sequence[str]) -> bool:
 
 
 def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
-    """Write a draft description, corrected by the data; missing fields become comments."""
     write_text(path, draft.text())
     summary["draft"] = str(path)
     lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft.text() else []
@@ -116,23 +115,19 @@ def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
     except DrakeTeleopError as error:
         lacking.append(str(error).removeprefix(f"{path}: "))
     if not lacking:
-        write_text(path, _fitted_draft(draft, path, summary).text())
+        write_text(path, _correct_draft_by_data(draft, path, summary).text())
         return
     text = draft.text()
     for message in lacking:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
-        text += f"# {one_line(f'INCOMPLETE, this has {message}')}\n"
+        text += f"# {to_one_line(f'INCOMPLETE, this has {message}')}\n"
     write_text(path, text)
 
 
-def _fitted_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
-    """Inspect a draft description, and return it corrected by its data.
-
-    Each round applies the first finding with corrected fields.
-    """
+def _correct_draft_by_data(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
     tables: dict[Path, Table] = {}
     for _ in range(_MAX_CORRECTIONS):
-        found = _inspect(load_description(path), str(path), dict(tables), summary)
+        found = _inspect_described_log(load_description(path), str(path), dict(tables), summary)
         finding = next((finding for finding in found if finding.fields), None)
         if finding is None:
             break
@@ -141,10 +136,9 @@ def _fitted_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
     return draft
 
 
-def _inspect(
+def _inspect_described_log(
     description: Description, source: str, tables: dict[Path, Table], summary: dict[str, Any]
 ) -> list[Finding]:
-    """Write figures and findings to the summary, and return the findings."""
     findings: list[Finding] = []
     bad: dict[Path, list[NDArray[np.intp]]] = {}
     for name in ("wrench", "imu", "pose", "static"):
@@ -153,12 +147,12 @@ def _inspect(
             continue
         if stream.source not in tables:
             tables[stream.source] = read_stream(stream)
-        table = tables[stream.source].filled(stream.columns)
-        figures, more, rows = _stream(name, stream, table, description, source)
+        table = tables[stream.source].rows_with_numbers(stream.columns)
+        figures, more, rows = _inspect_stream(name, stream, table, description, source)
         summary["streams"][name] = figures
         findings += more
         bad.setdefault(stream.source, []).append(rows)
-    clean = {path: _without(tables[path], np.concatenate(rows)) for path, rows in bad.items()}
+    clean = {path: _remove_rows(tables[path], np.concatenate(rows)) for path, rows in bad.items()}
     try:
         found = check_log(Path(source), check_conventions(description, source, clean))
     except DrakeTeleopError as error:
@@ -170,7 +164,7 @@ def _inspect(
         if found.mounting is not None:
             summary["mounting"] = {
                 "R_SI": found.mounting.R_SI.tolist(),
-                "angle_deg": found.mounting.angle_deg,
+                "angle_deg": found.mounting.rotation_angle_deg,
                 "right_angled": found.mounting.is_right_angled,
                 "lag_s": found.mounting.lag_s,
                 "drift": found.mounting.drift,
@@ -180,27 +174,26 @@ def _inspect(
     return findings
 
 
-def _stream(
+def _inspect_stream(
     name: str, stream: Any, table: Table, description: Description, source: str
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
-    """Return figures and findings of a stream, and the rows of its file that cannot be used."""
     columns = [
         str(column)
         for field in _QUANTITIES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
-    values = table.all_raw(columns, f"{source}:{name}")
+    values = table.raw_side_by_side(columns, f"{source}:{name}")
     good = np.asarray(np.isfinite(values).all(axis=1))
     findings: list[Finding] = []
     figures: dict[str, Any] = {"rows": len(values)}
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
     if time is not None:
-        more, usable = _clock(at, time, table, len(values), figures)
+        more, usable = _inspect_clock(at, time, table, len(values), figures)
         findings += more
-    figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest(~good)
+    figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest_run(~good)
     if not good.all():
-        first = table.line(int(np.argmin(good)))
+        first = table.line_in_file(int(np.argmin(good)))
         text = (
             f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
             f" the longest block {figures['nan_longest']} rows; cut or repair them"
@@ -211,13 +204,13 @@ def _stream(
     figures["repeated_rows"] = int(same.sum())
     moving = name in ("wrench", "imu") and not same[1:].all()
     if moving:
-        findings += _repeated(at, values, same, figures.get("rate_hz"), time)
+        findings += _repeated_rows_findings(at, values, same, figures.get("rate_hz"), time)
     figures["columns"] = {}
-    for column, x in zip(_labels(columns, table), values.T, strict=True):
+    for column, x in zip(_channel_labels(columns, table), values.T, strict=True):
         finite = x[np.isfinite(x)]
         if not len(finite):
             continue
-        saturated = 0 if time is None or not moving else _saturated(x, same)
+        saturated = 0 if time is None or not moving else _count_saturated_samples(x, same)
         figures["columns"][column] = {
             "min": float(finite.min()),
             "max": float(finite.max()),
@@ -235,18 +228,17 @@ def _stream(
     return figures, findings, rows if table.kept is None else table.kept[rows]
 
 
-def _repeated(
+def _repeated_rows_findings(
     at: str, values: Array, same: NDArray[np.bool_], rate: float | None, time: Any
 ) -> list[Finding]:
-    """Return a finding if the recorder repeated rows, unlike a coarse sensor at rest."""
     held = int(same.sum())
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = same.mean() > MIN_REPEATED_SHARE or _longest(same) >= MIN_REPEATED_BLOCK
+    enough = same.mean() > MIN_REPEATED_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
-    longest = _longest(same)
+    longest = _longest_run(same)
     fresh = np.flatnonzero(~same)
     period = int(np.median(np.diff(fresh)))
     news = "" if rate is None else f": new values come at {rate * len(fresh) / len(same):.4g} Hz"
@@ -260,10 +252,9 @@ def _repeated(
     return [Finding("repeated rows", f"{at}: {what}; {remedy}")]
 
 
-def _clock(
+def _inspect_clock(
     at: str, time: Any, table: Table, rows: int, figures: dict[str, Any]
 ) -> tuple[list[Finding], NDArray[np.bool_]]:
-    """Return findings of the clock, and (N,) booleans: True for rows with increasing stamps."""
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
         return [], np.ones(rows, bool)
@@ -280,7 +271,7 @@ def _clock(
         )
     median = float(np.median(forward))
     between = figures["episodes"] - 1
-    gaps = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()) - between
+    gaps = int((steps > min_gap_length(median, BANDWIDTH_HZ)).sum()) - between
     back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
@@ -298,7 +289,9 @@ def _clock(
         )
         findings.append(Finding("gap", text))
     if back:
-        row = table.line(np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1])
+        row = table.line_in_file(
+            np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1]
+        )
         text = (
             f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
             " rows with equal stamps are omitted or spread evenly; a log with decreasing"
@@ -308,7 +301,7 @@ def _clock(
     return findings, usable
 
 
-def _labels(columns: Sequence[str], table: Table) -> list[str]:
+def _channel_labels(columns: Sequence[str], table: Table) -> list[str]:
     labels: list[str] = []
     for column in columns:
         width = table.raw(column, column).shape[1]
@@ -316,19 +309,19 @@ def _labels(columns: Sequence[str], table: Table) -> list[str]:
     return labels
 
 
-def _longest(flags: NDArray[np.bool_]) -> int:
+def _longest_run(flags: NDArray[np.bool_]) -> int:
     return int(np.diff(find_runs_of_true(flags)).max(initial=0))
 
 
-def _saturated(x: Array, same: NDArray[np.bool_]) -> int:
+def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
     held = np.zeros(len(x), bool)
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
-    inside, outside = _longest(held & ends), _longest(held & ~ends)
+    inside, outside = _longest_run(held & ends), _longest_run(held & ~ends)
     return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK and inside > 2 * outside else 0
 
 
-def _finite(table: Table, names: Sequence[str]) -> Table:
+def _remove_nonfinite_rows(table: Table, names: Sequence[str]) -> Table:
     if len({len(table.raw(name, name)) for name in names}) != 1:
         return table
     good = np.all([np.isfinite(table.raw(n, n)).all(axis=1) for n in names], axis=0)
@@ -339,7 +332,7 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
     return replace(table, columns=kept)
 
 
-def _without(table: Table, rows: NDArray[np.intp]) -> Table:
+def _remove_rows(table: Table, rows: NDArray[np.intp]) -> Table:
     if not len(rows):
         return table
     kept = np.setdiff1d(np.arange(table.rows), rows)
@@ -347,7 +340,7 @@ def _without(table: Table, rows: NDArray[np.intp]) -> Table:
     return replace(table, columns=whole)
 
 
-def _print(summary: dict[str, Any]) -> None:
+def _print_summary(summary: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table as Grid

@@ -25,9 +25,9 @@ from drake_teleop.common.style import (
     plot_style,
     shade_contact,
 )
-from drake_teleop.load.batch.uncertainty import intervals
-from drake_teleop.load.contact.noise_floor import STATISTICS
-from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
+from drake_teleop.load.batch.uncertainty import confidence_intervals
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES
+from drake_teleop.load.identification import VERDICT_NAMES, Identification, natural_scales
 from drake_teleop.logs.processing import DetectedLog, EliminatedLog, IdentifiedLog
 from drake_teleop.logs.read.canonical import Log
 
@@ -38,32 +38,32 @@ _SYMBOLS = (
     *("$m$", "$m c_x$", "$m c_y$", "$m c_z$"),
     *(f"$I_{{{axes}}}$" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
-VERDICT_COLOURS = dict(zip(VERDICTS, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
+VERDICT_COLOURS = dict(zip(VERDICT_NAMES, (GREEN, ORANGE, VERMILION, PURPLE), strict=True))
 VERDICT_WORDS = dict(
     zip(
-        VERDICTS,
+        VERDICT_NAMES,
         ("identified", "weakly identified", "not identified", "mostly the prior's"),
         strict=True,
     )
 )
-_MAX_POINTS, _MAX_WINDOW = 4000, 2**14
+_MAX_POINTS, _MAX_WELCH_WINDOW = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
-_MEASURED = "#A3AAB5"
+_MEASURED_COLOUR = "#A3AAB5"
 
 
 def draw_fit(found: IdentifiedLog) -> Figure:
     """Draw measured wrench, load's wrench and residual without offsets; shade rejected samples."""
     with plot_style():
         figure = Picture(figsize=(10, 7))
-        _fit_into(figure, found)
+        _draw_fit_into(figure, found)
     return figure
 
 
-def draw_knowledge(found: IdentifiedLog) -> Figure:
+def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
     """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
     with plot_style():
         figure = Picture(figsize=(10, 7.4))
-        _knowledge_into(figure, found)
+        _draw_knowledge_into(figure, found)
     return figure
 
 
@@ -82,15 +82,15 @@ def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
     """
     from scipy.signal import welch
 
-    length = min(len(x), max(16, len(x) // 8), _MAX_WINDOW)
+    length = min(len(x), max(16, len(x) // 8), _MAX_WELCH_WINDOW)
     rates, power = welch(x, 1.0 / dt, nperseg=length, axis=0)
     return rates[1:], np.sqrt(power[1:])
 
 
-def _fit_into(figure: Any, found: IdentifiedLog) -> None:
+def _draw_fit_into(figure: Any, found: IdentifiedLog) -> None:
     log, result = found.log, found.identification
     curves = [
-        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED),
+        ("measured, offsets removed", log.wrench - result.offsets, _MEASURED_COLOUR),
         (r"$V\,\varphi$", found.predicted - result.offsets, BLUE),
         ("residual", log.wrench - found.predicted, VERMILION),
     ]
@@ -99,15 +99,15 @@ def _fit_into(figure: Any, found: IdentifiedLog) -> None:
     title = f"{result.mass:.4f} kg, centre of mass ({com}) mm"
     axes = _channel_axes(figure)
     for i, axis in enumerate(axes):
-        _draw(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
+        _draw_curves(axis, log.t, [(n, w[:, i], c) for n, w, c in curves], log.static)
         unit = "N" if i < 3 else "N m"
         axis.set_title(f"{_CHANNELS[i]}: residual {rms[i]:.3g} {unit} rms")
         if not log.static:
             shade_contact(axis, log.t, found.rejected)
-    _finish(figure, axes, title, log, result.delay_s)
+    _add_labels_and_title(figure, axes, title, log, result.delay_s)
 
 
-def _knowledge_into(figure: Any, found: IdentifiedLog) -> None:
+def _draw_knowledge_into(figure: Any, found: IdentifiedLog) -> None:
     log, result = found.log, found.identification
     residual = log.wrench - found.predicted
     if log.static:
@@ -135,9 +135,9 @@ def _knowledge_into(figure: Any, found: IdentifiedLog) -> None:
 
 
 def _draw_parameters(figure: Any, result: Identification) -> None:
-    natural = natural_scale(result.phi)
+    natural = natural_scales(result.phi)
     theta = np.concatenate([result.offsets, result.phi]) / natural
-    low, high = (end / natural for end in intervals(result))
+    low, high = (end / natural for end in confidence_intervals(result))
     deviations = result.standard_deviations / natural
     rows = np.arange(16)
     colours = [VERDICT_COLOURS[verdict] for verdict in result.verdicts]
@@ -165,7 +165,7 @@ def _draw_parameters(figure: Any, result: Identification) -> None:
     right.set_title("Standard deviation over the natural scale", pad=16)
     handles = [
         Patch(color=VERDICT_COLOURS[verdict], label=VERDICT_WORDS[verdict])
-        for verdict in VERDICTS
+        for verdict in VERDICT_NAMES
         if verdict in result.verdicts
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
@@ -173,7 +173,7 @@ def _draw_parameters(figure: Any, result: Identification) -> None:
 
 def draw_elimination(found: EliminatedLog) -> Figure:
     """Draw force magnitude and the six channels of each wrench; shade contacts."""
-    curves = [("measured, offsets removed", found.measured, _MEASURED)]
+    curves = [("measured, offsets removed", found.measured, _MEASURED_COLOUR)]
     if found.gravity_only is not None:
         curves.append(("static weight removed", found.gravity_only, ORANGE))
     if found.causal is not None:
@@ -189,21 +189,21 @@ def draw_elimination(found: EliminatedLog) -> Figure:
         top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 2.6])[:, 0]
         magnitude = top.subplots()
         norms = [(n, np.linalg.norm(w[:, :3], axis=1), c) for n, w, c in curves]
-        _draw(magnitude, t, norms, static)
+        _draw_curves(magnitude, t, norms, static)
         magnitude.set_ylim(bottom=0)
         torques = [(n, np.linalg.norm(w[:, 3:], axis=1), c) for n, w, c in curves]
         magnitude.set_title(
-            f"$|F|$, rms in N: {_rms_words(norms)}\n$|\\tau|$, rms in N m: {_rms_words(torques)}",
+            f"$|F|$, rms in N: {_rms_text(norms)}\n$|\\tau|$, rms in N m: {_rms_text(torques)}",
             fontsize=8.5,
         )
         magnitude.set_ylabel("force [N]")
         shade_contact(magnitude, t, touched)
         axes = _channel_axes(below)
         for i, axis in enumerate(axes):
-            _draw(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
+            _draw_curves(axis, t, [(n, w[:, i], c) for n, w, c in curves], static)
             axis.set_title(_CHANNELS[i])
             shade_contact(axis, t, touched)
-        _finish(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
+        _add_labels_and_title(figure, axes, Path(found.log.source).name, found.log, found.delay_s)
     return figure
 
 
@@ -216,7 +216,7 @@ def draw_detection(found: DetectedLog) -> Any:
         figure = Picture(figsize=(10, 6))
         top, below = figure.subplots(2, 1, sharex=True)
         raw = np.linalg.norm((eliminated.measured - eliminated.measured[0])[inner, :3], axis=1)
-        top.plot(t, raw, color=_MEASURED, label="measured, tared at the start")
+        top.plot(t, raw, color=_MEASURED_COLOUR, label="measured, tared at the start")
         if eliminated.gravity_only is not None:
             weightless = np.linalg.norm(eliminated.gravity_only[inner, :3], axis=1)
             top.plot(t, weightless, color=ORANGE, label="static weight removed")
@@ -227,11 +227,13 @@ def draw_detection(found: DetectedLog) -> Any:
         top.set_ylim(bottom=0.0)
         top.set_ylabel("$|F|$ [N]")
         top.set_title("dotted: the same threshold for all motions")
-        below.plot(t, found.statistics[inner, STATISTICS.index(found.statistic)], color=BLUE)
+        below.plot(t, found.statistics[inner, STATISTIC_NAMES.index(found.statistic)], color=BLUE)
         below.axhline(found.threshold, color=BLACK, linewidth=0.8, linestyle="--")
         below.set_ylabel(f"{found.statistic} [standard deviations]")
         below.set_xlabel("time [s]")
-        below.set_title(f"above the threshold {100 * found.above.mean():.2g} % of the time")
+        below.set_title(
+            f"above the threshold {100 * found.is_above_threshold.mean():.2g} % of the time"
+        )
         for axis in (top, below):
             shade_contact(axis, t, found.touched[inner])
         figure.legend(loc="outside lower center", ncols=3)
@@ -239,7 +241,7 @@ def draw_detection(found: DetectedLog) -> Any:
     return figure
 
 
-def _rms_words(norms: Sequence[tuple[str, Array, str]]) -> str:
+def _rms_text(norms: Sequence[tuple[str, Array, str]]) -> str:
     return ", ".join(f"{name} {np.sqrt(np.mean(values**2)):.3g}" for name, values, _ in norms)
 
 
@@ -250,7 +252,9 @@ def _channel_axes(figure: Any) -> list[Axes]:
     return list(grid.T.ravel())
 
 
-def _draw(axes: Axes, t: Array, curves: Sequence[tuple[str, Array, str]], static: bool) -> None:
+def _draw_curves(
+    axes: Axes, t: Array, curves: Sequence[tuple[str, Array, str]], static: bool
+) -> None:
     # More points than pixels only make the drawing slow.
     every = max(1, len(t) // _MAX_POINTS)
     for order, (name, values, colour) in enumerate(curves):
@@ -262,7 +266,9 @@ def _draw(axes: Axes, t: Array, curves: Sequence[tuple[str, Array, str]], static
             axes.plot(t[::every], values[::every], color=colour, linewidth=width, label=name)
 
 
-def _finish(figure: Any, axes: Sequence[Axes], title: str, log: Log, delay_s: float) -> None:
+def _add_labels_and_title(
+    figure: Any, axes: Sequence[Axes], title: str, log: Log, delay_s: float
+) -> None:
     for bottom in (axes[2], axes[5]):
         bottom.set_xlabel("pose" if log.static else "time [s]")
     if not log.static:

@@ -14,21 +14,25 @@ from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.aligned_log import clock_note, motion_and_load, use_spline_motion
+from drake_teleop.logs.aligned_log import (
+    clock_rate_notes,
+    estimate_motion_and_load,
+    use_spline_motion,
+)
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
-from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_passed, widened
+from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML
-from drake_teleop.logs.read.table_files import FORMATS
+from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION
+from drake_teleop.logs.read.table_files import TABLE_READERS
 
-ROBUST = ("robust", "consistent")
+METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
 _SMALLEST_NOISE = 1e-9
 # Fewest kept samples, and their rate over the cut-off of the low-pass.
 _MIN_KEPT_SAMPLES, _RATE_OVER_CUTOFF = 400_000, 0.25
-_CHUNK, _NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
+_CHUNK, _FILTER_NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
 
 
 @dataclass(frozen=True)
@@ -55,9 +59,9 @@ def fit_posed(
     The load is None for a method without splines, a log without usable poses, or an IMU that
     contradicts the poses.
     """
-    if log.posed is None or method not in ROBUST or not has_usable_poses(log):
+    if log.posed is None or method not in METHODS_WITH_SPLINES or not has_usable_poses(log):
         return None, ()
-    found, source = motion_and_load(log, delay)
+    found, source = estimate_motion_and_load(log, delay)
     finding = None if log.free else pose_finding(found, log)
     if log.posed.imu is not None:
         rotated = found.frame.turned and not found.frame.shifted
@@ -65,17 +69,17 @@ def fit_posed(
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
     moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
-    shown = low_passed(moved, cutoff_hz).only(far_from_gaps(moved, cutoff_hz) & ~one_sided)
+    shown = low_pass_log(moved, cutoff_hz).select_rows(far_from_gaps(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
-    fit = _fit(shown, found, found.rejected[at], method, log.gain_std)
+    fit = _batch_result_of_estimate(shown, found, found.rejected[at], method, log.gain_std)
     # Errors of gains beyond the stated ones make the load uncertain.
-    if finding is not None or not found.fit.explained:
+    if finding is not None or not found.fit.is_explained_by_gains:
         flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
         fit = replace(fit, note="")
-        if Path(log.source).suffix.lower() in FORMATS:
-            finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
+        if Path(log.source).suffix.lower() in TABLE_READERS:
+            finding = replace(finding, message=f"{finding.message} ({ONLY_IN_DESCRIPTION})")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 
@@ -86,21 +90,21 @@ def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
         stride = min(stride, int(_RATE_OVER_CUTOFF / (cutoff_hz * log.dt)))
     if stride < 2:
         return log
-    few = log.only(slice(None, None, stride))
+    few = log.select_rows(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
     for start in range(0, len(few), _CHUNK):  # in chunks, to save memory
-        before, stop = max(0, start - _NEIGHBOURS), start + _CHUNK + _NEIGHBOURS
+        before, stop = max(0, start - _FILTER_NEIGHBOURS), start + _CHUNK + _FILTER_NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
-    bridged = None if log.bridged is None else widened(log.bridged, stride)[::stride]
+    bridged = None if log.bridged is None else widen_flags(log.bridged, stride)[::stride]
     return replace(few, wrench=wrench, bridged=bridged)
 
 
-def _fit(
+def _batch_result_of_estimate(
     log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
 ) -> BatchResult:
     kept = ~rejected
-    theta = _consistent(found) if method == "consistent" else found.theta
+    theta = _make_consistent(found) if method == "consistent" else found.theta
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
@@ -120,10 +124,10 @@ def _fit(
         residual_rms=noise,
         method=METHODS[method].name,
     )
-    return BatchResult(load, noise, rejected, _note(found, gain_std), equations)
+    return BatchResult(load, noise, rejected, _note_on_estimate(found, gain_std), equations)
 
 
-def _consistent(found: PoseEstimate) -> Array:
+def _make_consistent(found: PoseEstimate) -> Array:
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta
@@ -133,12 +137,12 @@ def _consistent(found: PoseEstimate) -> Array:
     return consistent_least_squares(gram, gram @ theta, theta)
 
 
-def _note(found: PoseEstimate, stated: float) -> str:
-    notes = [*([found.note] if found.note else []), *clock_note(found)]
-    if not found.fit.explained:
+def _note_on_estimate(found: PoseEstimate, stated: float) -> str:
+    notes = [*([found.note] if found.note else []), *clock_rate_notes(found)]
+    if not found.fit.is_explained_by_gains:
         gains = "gains (state wrench.gain_std), " if stated == 0.0 else f"gains beyond {stated:g}, "
         notes.append(
             f"the wrench is not that of a rigid load alone: {gains}bending, or a frame that is not"
-            f" S; deviations are {found.fit.inflation:.2g} times as large as by noise"
+            f" S; deviations are {found.fit.deviation_inflation:.2g} times as large as by noise"
         )
     return "; ".join(notes)

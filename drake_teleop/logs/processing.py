@@ -19,32 +19,32 @@ from drake_teleop.load.compensation import (
     contact_wrench,
     scaled_wrench,
     scales_from_eta,
-    unknown_gravity,
+    unknown_gravity_error,
     weight_and_inertia_scales,
 )
-from drake_teleop.load.contact.noise_floor import finite_covariance, statistic_index
-from drake_teleop.load.identification import PARAMETERS, Identification, identified_object
+from drake_teleop.load.contact.noise_floor import limit_covariance, statistic_index
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.causes.cause import EVENTS, Cause, Stretch
+from drake_teleop.logs.causes.cause import TEMPORARY_CAUSES, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     Conventions,
     check_file,
-    errors_of_motion,
-    question_fit,
+    check_suspicious_load,
+    findings_about_motion,
 )
-from drake_teleop.logs.check.corrections import EFFECTS, Finding
+from drake_teleop.logs.check.corrections import POSSIBLE_EFFECTS_OF_CAUSES, Finding
 from drake_teleop.logs.contact import (
     MIN_SAMPLES,
     Detection,
     detect_contact,
-    detector_samples,
     noise_floor,
     offset_shift_note,
     robust_offsets,
+    samples_for_detector,
 )
 from drake_teleop.logs.explained_log import (
     explain_log,
@@ -54,24 +54,24 @@ from drake_teleop.logs.explained_log import (
     replace_frame_causes,
     unexplained_finding,
 )
-from drake_teleop.logs.posed_fit import ROBUST, fit_posed
+from drake_teleop.logs.posed_fit import METHODS_WITH_SPLINES, fit_posed
 from drake_teleop.logs.read.alignment import (
-    delay_of,
+    choose_delay,
     far_from_gaps,
     low_pass,
-    low_passed,
-    undelayed,
+    low_pass_log,
+    remove_delay,
 )
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.reading import read_log
 
-_GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
+_CAUSES_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
 _CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
 _SIGNIFICANT_DELAY = 5.0  # standard deviations
 _LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
-_NOT_WITH_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
+_SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
 
 @dataclass(frozen=True, repr=False)
@@ -98,7 +98,7 @@ class IdentifiedLog:
     base: BaseParameters
     findings: tuple[Finding, ...] = ()
     causes: tuple[Cause, ...] = ()
-    loads: tuple[Stretch, ...] = ()
+    loads: tuple[RecordPartWithLoad, ...] = ()
     delay_deviation_s: float = float("nan")
 
     def __repr__(self) -> str:
@@ -181,17 +181,17 @@ def identify_log(
     METHODS.check(method, "method")
     with one_blas_thread():
         check = partial(check_file, Path(path)) if checks is None else lambda: checks
-        return _identified(path, method, cutoff_hz, delay, check)
+        return _identify_read_log(path, method, cutoff_hz, delay, check)
 
 
-def _identified(
+def _identify_read_log(
     path: str | Path,
     method: str,
     cutoff_hz: float | None,
     delay: str | float,
     check: Callable[[], Conventions],
 ) -> IdentifiedLog:
-    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
+    log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in METHODS_WITH_SPLINES)
     posed, other = fit_posed(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
@@ -199,9 +199,9 @@ def _identified(
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
     else:
-        delay_s, source = delay_of(log, cutoff_hz, delay)
-        log = undelayed(log, delay_s)
-        log = low_passed(log, cutoff_hz).only(far_from_gaps(log, cutoff_hz))
+        delay_s, source = choose_delay(log, cutoff_hz, delay)
+        log = remove_delay(log, delay_s)
+        log = low_pass_log(log, cutoff_hz).select_rows(far_from_gaps(log, cutoff_hz))
         fit = identify_batch(
             log.wrench,
             *log.motion,
@@ -213,13 +213,21 @@ def _identified(
         )
     result = fit.identification
     motion = None if posed is None else posed.motion
-    why = explain_log(raw, delay_s, motion) if _can_be_explained(raw, posed is not None) else None
-    if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _GAIN_CAUSES:
+    why = (
+        explain_log(raw, delay_s, motion)
+        if _is_explanation_possible(raw, posed is not None)
+        else None
+    )
+    if (
+        why is not None
+        and log.gain_std > 0.0
+        and {x.name for x in why.causes} <= _CAUSES_BY_GAIN_ERRORS
+    ):
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
     if not errors and why is not None and why.causes and why.misfit:
-        errors = errors_of_motion(check)
+        errors = findings_about_motion(check)
     if errors:
         why = None
         known = result.identifiable & np.repeat([True, False], [6, 10])
@@ -237,7 +245,7 @@ def _identified(
     if errors:
         findings = errors
     elif not causes and not raw.free:
-        findings = question_fit(log, result, predicted, known_delay, check) or other
+        findings = check_suspicious_load(log, result, predicted, known_delay, check) or other
         if why is not None and why.misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
     mass_message = implausible_mass_message(result.mass, causes, raw)
@@ -263,7 +271,7 @@ def _identified(
     )
 
 
-def _can_be_explained(log: Log, by_splines: bool) -> bool:
+def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
     if log.static or (high - low <= _CONSTANT_SHARE * np.maximum(high, -low)).any():
         return False
@@ -283,7 +291,9 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
         return checks
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
-    if identified.causes and all(finding.name in EFFECTS for finding in findings):
+    if identified.causes and all(
+        finding.name in POSSIBLE_EFFECTS_OF_CAUSES for finding in findings
+    ):
         causes = tuple(
             Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
         )
@@ -352,16 +362,16 @@ def eliminate_log(
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
     separate = {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
-    scales = _scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
+    scales = _check_scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
     if gripper is not None:
         alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
-        identified_object(identification, alone)  # raises an error for exchanged files
+        load_of_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = usable_phi(alone)[0]
     eliminated = partial(
-        _eliminated,
+        _eliminate_read_log,
         identification=identification,
         phi_gripper=phi_gripper,
         scales=scales,
@@ -386,12 +396,12 @@ def eliminate_log(
         )
     if found.log.static:
         return found
-    samples = detector_samples(found.log, found.contact, cutoff_hz)
+    samples = samples_for_detector(found.log, found.contact, cutoff_hz)
     reference = None
     if free_motion is not None:
-        free_samples = detector_samples(free_motion.log, free_motion.contact, cutoff_hz)
-        reference = free_samples.at(~free_motion.edge), free_motion.log.dt
-    covariance = finite_covariance(found.phi, identification.covariance, tared=tare)
+        free_samples = samples_for_detector(free_motion.log, free_motion.contact, cutoff_hz)
+        reference = free_samples.select_rows(~free_motion.edge), free_motion.log.dt
+    covariance = limit_covariance(found.phi, identification.covariance, tared=tare)
     options: dict[str, Any] = {"edge": found.edge, "free": reference, "statistic": statistic}
     usual = identification.residual_rms
     detection = detect_contact(samples, found.log.dt, cutoff_hz, covariance, usual, **options)
@@ -401,7 +411,7 @@ def eliminate_log(
     return replace(found, detection=detection)
 
 
-def _eliminated(
+def _eliminate_read_log(
     path: str | Path,
     identification: Identification,
     phi_gripper: Array,
@@ -439,18 +449,20 @@ def _eliminated(
     known = far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
 
-    def smooth(wrench: Array) -> Array:
+    def low_pass_wrench(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
-    span = slice(None) if untouched_s is None else _rows_between(log.only(known), *untouched_s)
+    span = (
+        slice(None) if untouched_s is None else _rows_between(log.select_rows(known), *untouched_s)
+    )
 
-    def offsets_of(residual: Array) -> tuple[Array, float]:
+    def choose_offsets(residual: Array) -> tuple[Array, float]:
         if untouched_s is not None:
             return residual[span].mean(axis=0), 1.0
         return robust_offsets(residual) if tare else (identification.offsets, 1.0)
 
     residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
-    offsets, fraction = offsets_of(smooth(residual))
+    offsets, fraction = choose_offsets(low_pass_wrench(residual))
     motion = log.motion
     gravity_only = None
     removed = identification.weight_removed or "weight" in log.free
@@ -459,8 +471,8 @@ def _eliminated(
         rest = np.zeros_like(log.gravity)
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
-        weightless = smooth(weightless)
-        gravity_only = weightless - offsets_of(weightless)[0]
+        weightless = low_pass_wrench(weightless)
+        gravity_only = weightless - choose_offsets(weightless)[0]
     contact = contact_wrench(log.wrench, offsets, *motion, phi)
     parts = phi_gripper, phi_object
     scales = scales | {"gravity": log.gravity}
@@ -470,7 +482,9 @@ def _eliminated(
         causal_offsets, motion = identification.offsets, aligned.differentiated.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            causal_offsets = _start_samples(log, causal_tare_s, untouched).mean(axis=0)
+            causal_offsets = _samples_of_contact_free_start(log, causal_tare_s, untouched).mean(
+                axis=0
+            )
         causal_wrench = causal_wrenches(
             contact_wrench(log.wrench, causal_offsets, *motion, phi),
             scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
@@ -485,19 +499,19 @@ def _eliminated(
             contact=causal_wrench.contact[known],
             scaled=causal_wrench.scaled[known],
         )
-    contact = smooth(contact)
+    contact = low_pass_wrench(contact)
     return EliminatedLog(
-        log=log.only(known),
+        log=log.select_rows(known),
         phi=phi,
         point_mass=point_mass,
         offsets=offsets,
         tare_fraction=fraction,
         delay_s=delay_s,
         delay_source=source,
-        measured=smooth(log.wrench - offsets),
-        non_contact=smooth(non_contact_wrench(*log.motion, phi)),
+        measured=low_pass_wrench(log.wrench - offsets),
+        non_contact=low_pass_wrench(non_contact_wrench(*log.motion, phi)),
         contact=contact,
-        scaled=smooth(scaled),
+        scaled=low_pass_wrench(scaled),
         gravity_only=gravity_only,
         noise_floor=noise_floor(contact[~edge]),
         causal=causal_wrench,
@@ -519,7 +533,7 @@ def _rows_between(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     return rows
 
 
-def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
+def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> Array:
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
@@ -536,7 +550,7 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     replaced = np.flatnonzero(np.isin(identification.verdicts[10:], ("not", "prior")))
     point = phi_from_mass_com_inertia(identification.mass, identification.com, np.zeros((3, 3)))
     phi[4 + replaced] = point[4 + replaced]
-    return phi, tuple(PARAMETERS[10 + i] for i in replaced)
+    return phi, tuple(PARAMETER_NAMES[10 + i] for i in replaced)
 
 
 def _suspected_errors(
@@ -545,7 +559,7 @@ def _suspected_errors(
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
     if sizes[1] < 0.3 * sizes[0]:
         return ()
-    ignored = {"lag", "payload", *EVENTS}
+    ignored = {"lag", "payload", *TEMPORARY_CAUSES}
     if load.weight_removed:
         ignored |= {"weight removed", "payload configured"}
     return tuple(x for x in check_log(path).findings if x.name not in ignored)
@@ -567,12 +581,12 @@ def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
     if removed:
         raise weight_scale_error(log.source)
     if log.gravity is None:
-        raise unknown_gravity(
+        raise unknown_gravity_error(
             f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
         )
 
 
-def _scales(
+def _check_scales(
     sigma: float,
     sigma_object: float | None,
     gamma: float,
@@ -597,7 +611,7 @@ def _scales(
     if eta is None:
         kept = sigma if sigma_object is None else sigma_object
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
-    if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _NOT_WITH_ETA):
+    if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
         raise DrakeTeleopError(
             "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
             where="eta",

@@ -11,20 +11,20 @@ import numpy as np
 
 from drake_teleop.common.files import write_text
 from drake_teleop.common.html import png_data_url, render_page
-from drake_teleop.load.batch.uncertainty import intervals
+from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
 
 # Eq. (7): symbol, index, printed unit, and its factor from SI.
-_PARAMETERS = (
+_PARAMETER_LABELS = (
     *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
     *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
     ("m", "", "kg", 1.0),
     *(("m c", axis, "g m", 1e3) for axis in "xyz"),
     *(("I", axes, "g m²", 1e3) for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 )
-_PILLS = {"identified": "agrees", "not": "differs"}
+_STYLE_OF_VERDICT = {"identified": "agrees", "not": "differs"}
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class ParameterRow:
 def parameter_rows(load: Identification) -> list[ParameterRow]:
     """Return the 16 rows of [offsets; phi], Eq. (7), without values of unidentified parameters."""
     theta = np.concatenate([load.offsets, load.phi])
-    columns = np.stack([theta, load.standard_deviations, *intervals(load)], axis=1)
+    columns = np.stack([theta, load.standard_deviations, *confidence_intervals(load)], axis=1)
     rows = []
     for (symbol, index, unit, scale), values, verdict in zip(
-        _PARAMETERS, columns, load.verdicts, strict=True
+        _PARAMETER_LABELS, columns, load.verdicts, strict=True
     ):
-        words, pill = VERDICT_WORDS[verdict], _PILLS.get(verdict, "")
+        words, pill = VERDICT_WORDS[verdict], _STYLE_OF_VERDICT.get(verdict, "")
         texts = ("–", "", "")
         if verdict != "not" and np.isfinite(values).all():
             value, deviation, low, high = scale * values
@@ -107,10 +107,10 @@ def write_report(
         "report.html.j2",
         name=Path(summary["log"]).name,
         setting=f"{samples}. Method: {result.method}.",
-        tiles=_tiles(result),
+        tiles=_summary_tiles(result),
         notes=summary["notes"],
         tables=tables,
-        determined=found.base.lines(),
+        determined=found.base.text_lines(),
         figures=[
             (
                 "Fit",
@@ -130,7 +130,7 @@ def write_report(
     write_text(path, page)
 
 
-def _tiles(load: Identification) -> list[tuple[str, str, str]]:
+def _summary_tiles(load: Identification) -> list[tuple[str, str, str]]:
     deviation = load.standard_deviations[6]
     mass = f"{load.mass:.4g}" if load.identifiable[6] else "–"
     com = ", ".join(

@@ -14,23 +14,25 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.files import output_folder, write_json, write_table, write_text
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.logs.figures import plain
-from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY, UNITS
+from drake_teleop.logs.figures import to_plain_values
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT, STANDARD_GRAVITY
 
-MASS, COM = 0.95, np.array([0.004, -0.011, 0.058])
-INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])
+TRUE_MASS_KG, TRUE_COM_S = 0.95, np.array([0.004, -0.011, 0.058])
+TRUE_INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])
 """Mass [kg], centre of mass [m] and inertia [kg m^2] of the gripper in S, similar to a Robotiq
 2F-85."""
 TIP_S = np.array([0.0, 0.0, 0.17])
-OFFSETS = np.array([[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]])
+TRUE_OFFSETS = np.array(
+    [[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]]
+)
 """(2, 6) offsets of the sensor in the two records [N, N m], with drift between them."""
-NOISE = np.repeat([0.08, 0.003], 3)
+NOISE_STD = np.repeat([0.08, 0.003], 3)
 POSE_DELAY_S = 0.013
-CLOCK_S = 48213.4
+CLOCK_START_S = 48213.4
 """Time of the controller's clock at the sensor's time 0 [s]."""
 
 WRENCH_HZ, POSE_HZ = 500.0, 125.0
@@ -38,7 +40,7 @@ PERIOD_S, REST_S = 8.0, 0.5
 _JITTER_S = 5e-5
 
 # UR5e, Denavit-Hartenberg parameters of the manufacturer: d, a [m], alpha [rad].
-_DH = np.array(
+_DH_PARAMETERS = np.array(
     [
         [0.1625, 0.0, np.pi / 2],
         [0.0, -0.425, 0.0],
@@ -48,15 +50,15 @@ _DH = np.array(
         [0.0996, 0.0, 0.0],
     ]
 )
-HOME = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
-_SIZE = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # amplitudes of the joints [rad]
-_HARMONICS = 6
-PHI = phi_from_mass_com_inertia(MASS, COM, INERTIA_COM)
+HOME_ANGLES_RAD = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
+_JOINT_AMPLITUDES_RAD = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # amplitudes of the joints [rad]
+_NUM_HARMONICS = 6
+TRUE_PHI = phi_from_mass_com_inertia(TRUE_MASS_KG, TRUE_COM_S, TRUE_INERTIA_COM)
 """Load phi (10,) of the gripper."""
 
 
 @dataclass(frozen=True)
-class Touch:
+class FingertipPush:
     """Push at the fingertips, a half sine over time.
 
     Args:
@@ -74,10 +76,10 @@ class Touch:
         return np.outer(np.sin(np.pi * share), self.push_W)
 
 
-TOUCHES = (
-    Touch(2.1, 2.2, (0.0, 9.0, 0.0)),
-    Touch(4.4, 4.9, (-3.0, 0.0, 6.0)),
-    Touch(6.9, 6.98, (4.0, -2.0, 0.0)),
+FINGERTIP_PUSHES = (
+    FingertipPush(2.1, 2.2, (0.0, 9.0, 0.0)),
+    FingertipPush(4.4, 4.9, (-3.0, 0.0, 6.0)),
+    FingertipPush(6.9, 6.98, (4.0, -2.0, 0.0)),
 )
 """A tap, a push and a light tap, smaller than the wrench of weight and inertia."""
 
@@ -90,7 +92,7 @@ _COMMENTS = {
 }
 
 
-def _description(name: str) -> dict[str, Any]:
+def _description_of_record(name: str) -> dict[str, Any]:
     wrench = {
         "file": f"{name}_wrench.csv",
         "time": {"column": "time", "unit": "ms"},
@@ -100,7 +102,7 @@ def _description(name: str) -> dict[str, Any]:
     }
     pose = {
         "file": f"{name}_pose.csv",
-        "time": {"column": "uptime", "offset": -CLOCK_S},
+        "time": {"column": "uptime", "offset": -CLOCK_START_S},
         "orientation": {"columns": ["rx", "ry", "rz"], "form": "rotation_vector", "unit": "deg"},
         "position": {"columns": ["x", "y", "z"], "unit": "mm"},
     }
@@ -113,17 +115,19 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     The same seed of the noise gives identical files.
     """
     random = np.random.default_rng(seed)
-    records = {"free": ((), "in free motion"), "touched": (TOUCHES, "touched three times")}
+    records = {"free": ((), "in free motion"), "touched": (FINGERTIP_PUSHES, "touched three times")}
     files = []
     with output_folder(out):
         for row, (name, (touches, what)) in enumerate(records.items()):
             head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
-            text = yaml_text(_description(name), head=head, comments=_COMMENTS)
+            text = to_yaml_text(_description_of_record(name), head=head, comments=_COMMENTS)
             write_text(out / f"{name}.yaml", text)
-            _write_wrench(out / f"{name}_wrench.csv", _motion(row), touches, OFFSETS[row], random)
-            _write_pose(out / f"{name}_pose.csv", _motion(row), random)
+            _write_wrench(
+                out / f"{name}_wrench.csv", _random_motion(row), touches, TRUE_OFFSETS[row], random
+            )
+            _write_pose(out / f"{name}_pose.csv", _random_motion(row), random)
             files += [f"{name}.yaml", f"{name}_wrench.csv", f"{name}_pose.csv"]
-        write_json(out / "truth.json", plain(_truth()))
+        write_json(out / "truth.json", to_plain_values(_true_values()))
         summary = {
             "seed": seed,
             "files": [*files, "truth.json"],
@@ -133,32 +137,32 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
         }
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(out)
+        _print_summary(out)
     return summary
 
 
-def _truth() -> dict[str, Any]:
+def _true_values() -> dict[str, Any]:
     return {
-        "mass": MASS,
-        "com": COM,
-        "inertia_com": INERTIA_COM,
-        "phi": PHI,
-        "offsets": OFFSETS[0],
-        "offsets_touched": OFFSETS[1],
+        "mass": TRUE_MASS_KG,
+        "com": TRUE_COM_S,
+        "inertia_com": TRUE_INERTIA_COM,
+        "phi": TRUE_PHI,
+        "offsets": TRUE_OFFSETS[0],
+        "offsets_touched": TRUE_OFFSETS[1],
         "delay_s": POSE_DELAY_S,
-        "contacts": [_contact(touch) for touch in TOUCHES],
+        "contacts": [_true_contact(touch) for touch in FINGERTIP_PUSHES],
     }
 
 
-def _contact(touch: Touch) -> dict[str, Any]:
+def _true_contact(touch: FingertipPush) -> dict[str, Any]:
     middle = np.array([(touch.start_s + touch.stop_s) / 2])
-    R_WS = _motion(1).at(middle)[3][0]
+    R_WS = _random_motion(1).motion_at(middle)[3][0]
     peak = np.linalg.norm(touch.push_W)
     push = R_WS.T @ touch.push_W / peak
     return {"start_s": touch.start_s, "stop_s": touch.stop_s, "peak_N": peak, "push": push}
 
 
-def _print(out: Path) -> None:
+def _print_summary(out: Path) -> None:
     from rich.console import Console
 
     load = "out/load/identification.json"
@@ -175,18 +179,20 @@ def _print(out: Path) -> None:
 
 
 @dataclass(frozen=True)
-class _Motion:
+class _SensorMotion:
     trajectory: FourierTrajectory
 
-    def at(self, t: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def motion_at(self, t: Array) -> tuple[Array, Array, Array, Array, Array]:
         moving = np.clip(t - REST_S, 0, PERIOD_S)
         return sensor_motion(*self.trajectory.evaluate(moving))
 
 
-def _motion(number: int) -> _Motion:
+def _random_motion(number: int) -> _SensorMotion:
     random = np.random.default_rng([2009, number])
-    sine, cosine = random.normal(size=(2, 6, _HARMONICS - 1)) * _SIZE[:, np.newaxis] / 2
-    return _Motion(FourierTrajectory.at_rest(HOME, sine, cosine, 1 / PERIOD_S))
+    sine, cosine = (
+        random.normal(size=(2, 6, _NUM_HARMONICS - 1)) * _JOINT_AMPLITUDES_RAD[:, np.newaxis] / 2
+    )
+    return _SensorMotion(FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / PERIOD_S))
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -194,19 +200,19 @@ def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array,
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
     s = p + np.array([0.0, 0.0, STANDARD_GRAVITY])
-    for j, (d, a, twist) in enumerate(_DH):
+    for j, (d, a, twist) in enumerate(_DH_PARAMETERS):
         z, rate = R[:, :, 2], qd[:, j, np.newaxis]
         alpha = alpha + qdd[:, j, np.newaxis] * z + np.cross(omega, rate * z)
         omega = omega + rate * z
-        turned = R @ _turns(q[:, j], 2)
+        turned = R @ _axis_rotations(q[:, j], 2)
         r = turned @ [a, 0.0, d]
         p, s = p + r, s + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
-        R = turned @ _turns(np.array([twist]), 0)
+        R = turned @ _axis_rotations(np.array([twist]), 0)
     in_S = (np.einsum("nji,nj->ni", R, x) for x in (s, omega, alpha))
     return *in_S, R, p
 
 
-def _turns(angle: Array, axis: int) -> Array:
+def _axis_rotations(angle: Array, axis: int) -> Array:
     first, second = (axis + 1) % 3, (axis + 2) % 3
     R = np.tile(np.eye(3), (len(angle), 1, 1))
     R[:, first, first] = R[:, second, second] = np.cos(angle)
@@ -215,40 +221,40 @@ def _turns(angle: Array, axis: int) -> Array:
     return R
 
 
-def _clock(rate_hz: float, random: np.random.Generator) -> Array:
+def _jittered_clock(rate_hz: float, random: np.random.Generator) -> Array:
     t = np.arange(round((PERIOD_S + 2 * REST_S) * rate_hz)) / rate_hz
     return t + _JITTER_S * random.uniform(0, 1, len(t))
 
 
 def _write_wrench(
     path: Path,
-    motion: _Motion,
-    touches: tuple[Touch, ...],
+    motion: _SensorMotion,
+    touches: tuple[FingertipPush, ...],
     offsets: Array,
     random: np.random.Generator,
 ) -> None:
-    t = _clock(WRENCH_HZ, random)
-    s, omega, alpha, R_WS, _ = motion.at(t)
-    wrench = non_contact_wrench(s, omega, alpha, PHI) + offsets
+    t = _jittered_clock(WRENCH_HZ, random)
+    s, omega, alpha, R_WS, _ = motion.motion_at(t)
+    wrench = non_contact_wrench(s, omega, alpha, TRUE_PHI) + offsets
     for touch in touches:
         push_S = np.einsum("nji,nj->ni", R_WS, touch.force(t))
         # The push reduces the wrench of the sensor on the load.
         wrench -= np.hstack([push_S, np.cross(TIP_S, push_S)])
-    wrench += NOISE * random.normal(size=wrench.shape)
-    reading = -wrench / np.repeat([UNITS["lbf"], UNITS["lbf in"]], 3)
-    _write(path, "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading], 4)
+    wrench += NOISE_STD * random.normal(size=wrench.shape)
+    reading = -wrench / np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
+    _write_columns(path, "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading], 4)
 
 
-def _write_pose(path: Path, motion: _Motion, random: np.random.Generator) -> None:
+def _write_pose(path: Path, motion: _SensorMotion, random: np.random.Generator) -> None:
     from scipy.spatial.transform import Rotation
 
-    t = _clock(POSE_HZ, random)
-    _, _, _, R_WS, p_WS = motion.at(t - POSE_DELAY_S)
+    t = _jittered_clock(POSE_HZ, random)
+    _, _, _, R_WS, p_WS = motion.motion_at(t - POSE_DELAY_S)
     turn = Rotation.from_matrix(R_WS).as_rotvec(degrees=True)
-    _write(path, "uptime x y z rx ry rz", [t + CLOCK_S, 1e3 * p_WS, turn], 4)
+    _write_columns(path, "uptime x y z rx ry rz", [t + CLOCK_START_S, 1e3 * p_WS, turn], 4)
 
 
-def _write(path: Path, names: str, columns: list[Array], digits: int) -> None:
+def _write_columns(path: Path, names: str, columns: list[Array], digits: int) -> None:
     import polars as pl
 
     table = np.round(np.column_stack(columns), digits)
@@ -277,7 +283,7 @@ def sample_episode(
     fps: float = 30.0,
     duration_s: float = 6.0,
     seed: int = 0,
-    phi: Array = PHI,
+    phi: Array = TRUE_PHI,
     contacts: int = 2,
     lag_frames: float = 0.0,
 ) -> SampleEpisode:
@@ -290,25 +296,29 @@ def sample_episode(
     random = np.random.default_rng([2026, seed, number])
     t = np.arange(round(duration_s * fps)) / fps
     period = duration_s - 2 * _EPISODE_REST_S
-    sine, cosine = random.normal(size=(2, 6, _EPISODE_HARMONICS - 1)) * 0.35 * _SIZE[:, np.newaxis]
-    path = FourierTrajectory.at_rest(HOME, sine, cosine, 1 / period)
+    sine, cosine = (
+        random.normal(size=(2, 6, _EPISODE_HARMONICS - 1))
+        * 0.35
+        * _JOINT_AMPLITUDES_RAD[:, np.newaxis]
+    )
+    path = FourierTrajectory.at_rest(HOME_ANGLES_RAD, sine, cosine, 1 / period)
 
-    def motion(at: Array) -> tuple[Array, ...]:
+    def motion_at(at: Array) -> tuple[Array, ...]:
         return sensor_motion(*path.evaluate(np.clip(at - _EPISODE_REST_S, 0, period)))
 
-    s, omega, alpha, R_WS, _ = motion(t)
+    s, omega, alpha, R_WS, _ = motion_at(t)
     contact = np.zeros((len(t), 6))
     starts = np.sort(random.uniform(0.15, 0.75, contacts)) * duration_s
     for start in starts:
         push = random.normal(size=3)
         push *= random.uniform(5, 15) / np.linalg.norm(push)
-        touch = Touch(start, start + random.uniform(0.4, 0.9), tuple(push))
+        touch = FingertipPush(start, start + random.uniform(0.4, 0.9), tuple(push))
         f = np.einsum("nji,nj->ni", R_WS, -touch.force(t))
         contact += np.hstack([f, np.cross(TIP_S, f)])
-    offsets = OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
+    offsets = TRUE_OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
     wrench = non_contact_wrench(s, omega, alpha, phi) + contact + offsets
-    wrench += NOISE * random.normal(size=wrench.shape)
-    *_, R_late, p_late = motion(t - lag_frames / fps)
+    wrench += NOISE_STD * random.normal(size=wrench.shape)
+    *_, R_late, p_late = motion_at(t - lag_frames / fps)
     noise = _POSE_NOISE * random.normal(size=(len(t), 6))
     turned = Rotation.from_matrix(R_late) * Rotation.from_rotvec(noise[:, 3:])
     quaternion = turned.as_quat()[:, [3, 0, 1, 2]]

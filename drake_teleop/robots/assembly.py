@@ -18,7 +18,11 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, skew_parts, smoother
+from drake_teleop.logs.read.alignment import (
+    SMOOTHER_WINDOW_OVER_PERIOD,
+    smoother_weights,
+    vectors_of_skew_parts,
+)
 from drake_teleop.robots.compensator import CLOCK_DRIFT, JUMP_S, MAX_OFFSET_DRIFT, STALE_S
 from drake_teleop.robots.streams import (
     IMU,
@@ -230,7 +234,7 @@ class MotionWindow:
         self._steps.append(step)
         if len(self._steps) == _PERIOD_SAMPLES:
             self._dt = float(np.median(self._steps))
-            self._weights = smoother(10**9, self._dt, self._cutoff_hz)[:3]
+            self._weights = smoother_weights(10**9, self._dt, self._cutoff_hz)[:3]
             self._size = self._weights.shape[1]
             self.reset()
 
@@ -280,7 +284,9 @@ class MotionWindow:
         R_WS = rows[self._size // 2, :9].reshape(3, 3)
         omega, alpha = R_WS.T @ first[:9].reshape(3, 3), R_WS.T @ (2.0 * second[:9]).reshape(3, 3)
         s = R_WS.T @ (2.0 * second[9:] - self._gravity_W)
-        return np.concatenate([s, *skew_parts(np.stack([omega, alpha])), R_WS.T @ self._gravity_W])
+        return np.concatenate(
+            [s, *vectors_of_skew_parts(np.stack([omega, alpha])), R_WS.T @ self._gravity_W]
+        )
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
@@ -331,7 +337,7 @@ class Assembly:
         self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY)
         self.lag_s = max(0.0, delay_s)
         if cutoff_hz is not None:
-            self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW / cutoff_hz + delay_s)
+            self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / cutoff_hz + delay_s)
         self._clocks = _ClockOffset(), _ClockOffset()
         self._motions: deque[tuple[float, Array]] = deque()
         self._pending: deque[Part] = deque(maxlen=round(_BUFFER_S / self.dt))

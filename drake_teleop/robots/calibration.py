@@ -15,14 +15,18 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import move_earlier_recordings
-from drake_teleop.common.interruption import INTERRUPTED
+from drake_teleop.common.interruption import INTERRUPTED_EVENT
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
-from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
-from drake_teleop.logs.causes.cause import CHANGES
+from drake_teleop.load.tolerance import (
+    Tolerance,
+    derivatives_over_tolerances,
+    deviations_over_tolerances,
+)
+from drake_teleop.logs.causes.cause import CHANGE_CAUSES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
-from drake_teleop.logs.read.alignment import low_passed
+from drake_teleop.logs.read.alignment import low_pass_log
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.recording import SampleRecorder
 from drake_teleop.robots.streams import Source
@@ -83,7 +87,7 @@ def evaluate_record(
     delay: str | float,
 ) -> Evaluation:
     """Identify a record's load; compare its uncertainty with the tolerance."""
-    count, found, why = len(tolerance.entries), None, ""
+    count, found, why = len(tolerance.required_entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
     except DrakeTeleopError as error:
@@ -99,9 +103,9 @@ def evaluate_record(
         if load.mass > 0.0:
             phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _INITIAL_NOISE)
     known = sure & (previous is not None and previous.sure)
-    changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGES] if found else []
+    changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGE_CAUSES] if found else []
     with suppress(DrakeTeleopError):  # too few samples
-        log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
+        log = log or low_pass_log(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
     if log is None:
         advice = _MOTIONS[0][0].format(axis="x")
     elif sure.all():
@@ -109,7 +113,9 @@ def evaluate_record(
     elif changes:
         advice = _START_AGAIN.format(t=min(changes))
     else:
-        advice = best_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
+        advice = best_motion(
+            log.motion, log.dt, cutoff_hz, derivatives_over_tolerances(tolerance, phi), noise
+        )
     t = 0.0 if log is None else float(log.t[-1])
     return Evaluation(t, found, why, half, sure, known, doubts, advice)
 
@@ -117,8 +123,8 @@ def evaluate_record(
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
     """Return half-widths (k,) of both intervals over the tolerances, and degrees of freedom."""
     load = found.identification
-    errors = errors_of(tolerance, load.phi)
-    deviations = deviations_of(errors, load.covariance)
+    errors = derivatives_over_tolerances(tolerance, load.phi)
+    deviations = deviations_over_tolerances(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
     half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, CONFIDENCE))
@@ -154,7 +160,7 @@ def best_motion(
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
     for words, of_motion in _candidate_motions(last, noise, rate):
-        left = deviations_of(errors, np.linalg.inv(gram + of_motion))
+        left = deviations_over_tolerances(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
             best, least = words, cost
@@ -224,7 +230,7 @@ def calibrate(
     done = False
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
-            while not (done or INTERRUPTED.is_set()):
+            while not (done or INTERRUPTED_EVENT.is_set()):
                 if (samples := source.read(_IDLE_S)) is None:
                     break
                 for sample in samples:

@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.cause import CHANGES, Cause, causes_of
+from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Cause, causes_of_fit
 from drake_teleop.logs.causes.explain import explain
-from drake_teleop.logs.causes.instants import S, instants
+from drake_teleop.logs.causes.instants import S, block_means_of_record
 from drake_teleop.logs.causes.model import Step
 from drake_teleop.logs.causes.state import State
 from drake_teleop.robots.compensator import JUMP_S
@@ -121,11 +121,11 @@ def find_changes(rows: Array, dt: float) -> list[Report]:
         return []
     wrench, *motion = np.split(rows[at, 1:], [6, 9, 12], axis=1)
     lost = np.abs(rows[at, 0] - t) > dt
-    state = explain(instants(t, wrench, tuple(motion), None, lost)).state
+    state = explain(block_means_of_record(t, wrench, tuple(motion), None, lost)).state
     return [
         (cause.start_s, _change_text(cause))
-        for cause in causes_of(state)
-        if cause.name in CHANGES
+        for cause in causes_of_fit(state)
+        if cause.name in CHANGE_CAUSES
         and cause.start_s is not None
         and _is_decisive(state, cause.start_s)
     ]
@@ -141,9 +141,7 @@ def _is_decisive(state: State, time: float) -> bool:
     model = replace(state.model, steps=(*(step for step in steps if step != own), other))
     start = np.zeros(model.size)
     start[:17] = state.x[:17]
-    return (
-        2.0 * (state.likelihood - state.extended(model, start).likelihood) > _MIN_LIKELIHOOD_RATIO
-    )
+    return 2.0 * (state.likelihood - state.refit(model, start).likelihood) > _MIN_LIKELIHOOD_RATIO
 
 
 def _change_text(cause: Cause) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.files import move_earlier_recordings
-from drake_teleop.common.interruption import INTERRUPTED, handled_sigint
+from drake_teleop.common.interruption import INTERRUPTED_EVENT, handled_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import ChangeMonitor
@@ -77,7 +77,10 @@ def compensate_stream(
         return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
 
     with suppress(KeyboardInterrupt), handled_sigint():
-        while not INTERRUPTED.is_set() and (readings := source.read(longest_wait_s())) is not None:
+        while (
+            not INTERRUPTED_EVENT.is_set()
+            and (readings := source.read(longest_wait_s())) is not None
+        ):
             if (
                 source.live
                 and (stale := compensator.stale_output(time.monotonic()))

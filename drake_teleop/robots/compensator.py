@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.compensation import unknown_gravity
+from drake_teleop.load.compensation import unknown_gravity_error
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi, weight_scale_error
@@ -291,7 +291,7 @@ class Compensator:
         if gravity is None:
             if self._scales[3] != 0.0:
                 remedy = "use a source with poses or joint positions, or --sigma alone"
-                raise unknown_gravity("gravity in the sensor frame", remedy)
+                raise unknown_gravity_error("gravity in the sensor frame", remedy)
             gravity = _NO_GRAVITY
         out = np.empty(12)
         at = self.good_count % len(self._tare_rows)

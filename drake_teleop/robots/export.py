@@ -14,8 +14,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import yaml_text
-from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.common.texts import to_yaml_text
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
 STANDARD_GRAVITY = 9.80665  #: m/s^2
@@ -115,12 +115,14 @@ def refuse_removed_weight(found: Identification, to: str) -> None:
 
 
 def _warnings(found: Identification, to: str, format: Format) -> list[str]:
-    written = {name: name.startswith(("m", "I")) for name in PARAMETERS}
-    written |= {name: format.inertia for name in PARAMETERS if name.startswith("I")}
-    written |= {name: format.offsets for name in PARAMETERS if name.endswith(("_ox", "_oy", "_oz"))}
+    written = {name: name.startswith(("m", "I")) for name in PARAMETER_NAMES}
+    written |= {name: format.inertia for name in PARAMETER_NAMES if name.startswith("I")}
+    written |= {
+        name: format.offsets for name in PARAMETER_NAMES if name.endswith(("_ox", "_oy", "_oz"))
+    }
     warnings = [
         f"{name} is not identified ({verdict}): do not use values that depend on it"
-        for name, verdict in zip(PARAMETERS, found.verdicts, strict=True)
+        for name, verdict in zip(PARAMETER_NAMES, found.verdicts, strict=True)
         if written[name] and verdict != "identified"
     ]
     if not format.inertia:
@@ -161,7 +163,7 @@ def _xarm(load: ExportedLoad) -> str:
 
 
 def _kth(load: ExportedLoad) -> str:
-    return yaml_text(
+    return to_yaml_text(
         {
             "bias": _float_list(load.offsets),
             "gripper_com_frame_id": "ft_sensor",
@@ -172,7 +174,7 @@ def _kth(load: ExportedLoad) -> str:
 
 
 def _ft_tools(load: ExportedLoad) -> str:
-    return yaml_text(
+    return to_yaml_text(
         {
             "mass": float(load.mass),
             "sensor_frame_to_com": _float_list(load.com),
@@ -186,7 +188,7 @@ def _admittance(load: ExportedLoad) -> str:
     centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
     compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
     parameters = {"gravity_compensation": compensation}
-    return yaml_text({"admittance_controller": {"ros__parameters": parameters}})
+    return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
 
 
 def _bota(load: ExportedLoad) -> str:

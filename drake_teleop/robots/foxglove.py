@@ -8,14 +8,14 @@ from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.files import make_folder, wrap_write_errors
-from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import Compensated
 from drake_teleop.robots.udp import host_and_port
 
 PORT = 8765
 TOPIC = "/wrench"
-_VECTOR = {"type": "object", "properties": {name: {"type": "number"} for name in WRENCH}}
+_VECTOR = {"type": "object", "properties": {name: {"type": "number"} for name in WRENCH_COLUMNS}}
 _SCHEMA = {
     "title": "drake_teleop.Wrench",
     "type": "object",
@@ -40,7 +40,7 @@ class _Channel:
     def log_wrench(self, out: Compensated, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
-            data[name] = dict(zip(WRENCH, wrench.tolist(), strict=True))
+            data[name] = dict(zip(WRENCH_COLUMNS, wrench.tolist(), strict=True))
         self._channel.log(json.dumps(data).encode(), log_time=ns)
 
     def close(self) -> None:

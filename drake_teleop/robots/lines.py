@@ -23,7 +23,7 @@ from drake_teleop.common.files import (
     wrap_write_errors,
     write_table,
 )
-from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.streams import (
     DAMAGED,
     VALUES,
@@ -163,5 +163,5 @@ class TableSink:
         }
         for name, i in (("contact", 2), ("scaled", 3)):
             values = np.array([row[i] for row in rows], float).reshape(-1, 6)
-            columns |= {f"{name}_{c}": values[:, k] for k, c in enumerate(WRENCH)}
+            columns |= {f"{name}_{c}": values[:, k] for k, c in enumerate(WRENCH_COLUMNS)}
         return columns | {"flags": np.array([row.flags for row in rows], np.uint32)}

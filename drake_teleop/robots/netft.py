@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.read.description_fields import UNITS
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Part, ReadingFlag
 
@@ -28,7 +28,7 @@ _SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
 _REQUEST_PERIOD_S, _MAX_UNCHANGED_S = 0.1, 0.05
 _MAX_RECORDS = 256  # records per call
 _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
-_UNITS = UNITS | {"klbf": 1e3 * UNITS["lbf"]}
+_UNITS = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
 class RdtRecord(NamedTuple):

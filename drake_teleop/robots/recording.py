@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_table, write_text
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import Parts
@@ -28,11 +28,11 @@ _INVALID_FLAGS = (
     | ReadingFlag.GAP
 )
 _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
-    WRENCH: {"force": canonical.WRENCH[:3], "torque": canonical.WRENCH[3:]},
-    POSE: {"orientation": canonical.ORIENTATION, "position": canonical.POSITION},
+    WRENCH: {"force": canonical.WRENCH_COLUMNS[:3], "torque": canonical.WRENCH_COLUMNS[3:]},
+    POSE: {"orientation": canonical.QUATERNION_COLUMNS, "position": canonical.POSITION_COLUMNS},
     IMU: {
-        "specific_force": canonical.SPECIFIC_FORCE,
-        "angular_velocity": canonical.ANGULAR_VELOCITY,
+        "specific_force": canonical.SPECIFIC_FORCE_COLUMNS,
+        "angular_velocity": canonical.ANGULAR_VELOCITY_COLUMNS,
     },
 }
 _GRAVITY = 9.81  # as in `compensate`
@@ -154,7 +154,7 @@ class PartRecorder(SampleRecorder[tuple[Part, float]]):
             t, values = samples.times_and_values(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
-        write_text(path, yaml_text(self._log_description()))
+        write_text(path, to_yaml_text(self._log_description()))
 
     def _log_description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY}

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import replace_force_by_acceleration
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.logs.read.alignment import delay_of, far_from_gaps, undelayed
+from drake_teleop.logs.read.alignment import choose_delay, far_from_gaps, remove_delay
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots.streams import Reading, ReadingFlag, Source
 
@@ -44,10 +44,10 @@ class ReplayLogSource(Source[Reading]):
         delay_s = 0.0
         if load is not None:
             log = replace_force_by_acceleration(log) if load.weight_removed else log
-            delay_s, source = delay_of(log, cutoff_hz, delay, usable_phi(load)[0])
+            delay_s, source = choose_delay(log, cutoff_hz, delay, usable_phi(load)[0])
             if source == "undetermined":
                 delay_s = load.delay_s
-            log = undelayed(log, delay_s)
+            log = remove_delay(log, delay_s)
         self.dt, self.live = log.dt, real_time
         self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
         self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])

@@ -14,17 +14,17 @@ from drake_teleop.load.contact.detection import (
     MAX_NOISE_LEVEL,
     ContactDetector,
     fit_noise_floor,
-    flag_update,
+    update_contact_flag,
 )
-from drake_teleop.load.contact.noise_floor import finite_covariance
+from drake_teleop.load.contact.noise_floor import limit_covariance
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.online.change import change_parameters
+from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.watched import (
-    DISTURBED,
-    OTHER_LOAD,
-    watched_memory,
-    watched_state,
-    watched_update,
+    STATE_DISTURBED,
+    STATE_OTHER_LOAD,
+    initial_monitor_memory,
+    monitor_load,
+    monitor_state,
 )
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import low_pass_coefficients
@@ -54,11 +54,11 @@ class ContactAndLoadMonitor:
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = unfiltered_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
-        self._parameters = change_parameters(
+        self._parameters = change_detector_parameters(
             noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER_REPLACED
         )
         self._phi = usable_phi(load)[0]
-        self._covariance = finite_covariance(self._phi, load.covariance)
+        self._covariance = limit_covariance(self._phi, load.covariance)
         self._fallback, self._dt = np.zeros(10), dt
         self.restart(load.offsets)
         self.reading_flags(np.concatenate([load.offsets, np.zeros(9)]))  # loads compiled code
@@ -67,15 +67,15 @@ class ContactAndLoadMonitor:
     def restart(self, offsets: Array) -> None:
         """Reset all but the identified load."""
         self._out = np.concatenate([offsets, self._phi])
-        self._memory = watched_memory(self._out, self._covariance)
+        self._memory = initial_monitor_memory(self._out, self._covariance)
 
     def reading_flags(self, values: Array) -> int:
         """Return the `ReadingFlag` bits of a valid reading (15,): contact, another load, or 0."""
-        watched_update(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
-        state = watched_state(self._memory)
-        if state == OTHER_LOAD:
+        monitor_load(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
+        state = monitor_state(self._memory)
+        if state == STATE_OTHER_LOAD:
             return int(ReadingFlag.OTHER_LOAD)
-        return int(ReadingFlag.IN_CONTACT) if state == DISTURBED else 0
+        return int(ReadingFlag.IN_CONTACT) if state == STATE_DISTURBED else 0
 
 
 MEAN_TIME_S = 3.0
@@ -118,7 +118,7 @@ class StreamContactDetector:
         settled = rows[round(0.5 / (_GRAVITY_CUTOFF_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))
-        covariance = finite_covariance(phi, load.covariance, tared=True)
+        covariance = limit_covariance(phi, load.covariance, tared=True)
         contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
         threshold = max(MAX_NOISE_LEVEL, floor.threshold(_STATISTIC))
@@ -165,4 +165,4 @@ def _detect(memory, values, contact, fast, slow, filters, settings):
     filtered = np.empty(12)
     _filter_motion_into(values, fast, slow, filters, filtered)
     s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
-    return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
+    return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)

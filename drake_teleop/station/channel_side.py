@@ -16,7 +16,7 @@ from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.joint_control import servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
-from drake_teleop.station.wiring import export
+from drake_teleop.station.wiring import export_outputs
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _limit_to_device(scenario, passivity_with_arm_mass(scenario)),
+            _limit_method_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             _contact_scale(scenario),
@@ -72,8 +72,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         builder.ExportInput(channel.GetInputPort(name), name)
     if scenario.contact_detection is not None:
         builder.ExportInput(channel.GetInputPort("contact"), "contact")
-        export(builder, channel, "contact_at_hand")
-    export(
+        export_outputs(builder, channel, "contact_at_hand")
+    export_outputs(
         builder,
         channel,
         "pose_received",
@@ -84,8 +84,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
-    """Limit the method's wrench to the device, so that its balance counts displayed wrenches."""
+def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
         passivity,
@@ -118,7 +117,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     )
 
 
-def power_scale(scenario: Scenario) -> Array:
+def power_scale_of_scenario(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)

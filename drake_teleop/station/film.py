@@ -28,7 +28,7 @@ from drake_teleop.common.files import make_folder, write_text
 from drake_teleop.common.html import content_security_policy, render_page
 
 Array = NDArray[np.float64]
-Show = Callable[[float, int], None]
+ShowFrame = Callable[[float, int], None]
 """Function that shows a frame (index) at a time of the recording [s]."""
 
 FRAMES_PER_SECOND = 50
@@ -42,8 +42,10 @@ _ARROW_M_PER_N = 0.003
 _DEFAULT_COLOUR = Rgba(0.9, 0.9, 0.9)  # Drake's own default
 _R_FLIPPED = RotationMatrix.MakeXRotation(np.pi)
 # Meshcat's page has no viewport: a telephone would use a width of 980 pixels.
-_POLICY = '<meta http-equiv="Content-Security-Policy" content="{}">'
-_TITLE = '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
+_POLICY_TAG = '<meta http-equiv="Content-Security-Policy" content="{}">'
+_TITLE_TAG = (
+    '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
+)
 
 
 class Canvas(Protocol):
@@ -57,7 +59,7 @@ class Canvas(Protocol):
 
 
 @dataclass(frozen=True)
-class Reading:
+class DisplayedNumber:
     """Number displayed beside the replay.
 
     Args:
@@ -72,7 +74,7 @@ class Reading:
     colour: str = ""
     arrow: bool = False
 
-    def for_page(self) -> dict[str, object]:
+    def data_for_page(self) -> dict[str, object]:
         largest = float(np.nanmax(np.abs(self.values), initial=0.0))
         return {
             "name": self.name,
@@ -85,7 +87,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Film:
+class ReplayFile:
     """Contents of a 3D replay, except the scene.
 
     Args:
@@ -99,13 +101,13 @@ class Film:
     title: str
     times: Array
     slow_motion: float
-    readings: Sequence[Reading] = ()
+    readings: Sequence[DisplayedNumber] = ()
     shaded: Sequence[tuple[float, float]] = ()
     notes: Sequence[str] = ()
     clock: str = "simulated time"
     curves: str = ""
 
-    def write(self, path: Path, make_scene: Callable[[Meshcat], Show]) -> None:
+    def write(self, path: Path, make_scene: Callable[[Meshcat], ShowFrame]) -> None:
         """Write the replay to an HTML file.
 
         `make_scene` adds the objects to Meshcat and returns the function that shows one frame.
@@ -123,11 +125,11 @@ class Film:
         make_folder(path.parent)
         write_text(path, self._add_player(page))
 
-    def _record_scene(self, make_scene: Callable[[Meshcat], Show]) -> str:
-        with quiet_drake():  # no client connects to its server
+    def _record_scene(self, make_scene: Callable[[Meshcat], ShowFrame]) -> str:
+        with silence_drake_log():  # no client connects to its server
             meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
         show = make_scene(meshcat)
-        interval = self._span / (len(self.times) - 1)
+        interval = self._duration_s / (len(self.times) - 1)
         meshcat.StartRecording(1 / interval, set_visualizations_while_recording=False)
         for frame in range(len(self.times)):
             # Meshcat counts whole intervals: 29 x 0.02 rounds to less than 29 of them.
@@ -137,7 +139,7 @@ class Film:
         return meshcat.StaticHtml()
 
     @property
-    def _span(self) -> float:
+    def _duration_s(self) -> float:
         return max(float(self.times[-1] - self.times[0]), 1e-3)
 
     def _add_player(self, page: str) -> str:
@@ -145,10 +147,10 @@ class Film:
         film = {
             "title": self.title,
             "start": start,
-            "span": self._span,
+            "span": self._duration_s,
             "frames": len(self.times),
             "slow_motion": self.slow_motion,
-            "readings": [reading.for_page() for reading in self.readings],
+            "readings": [reading.data_for_page() for reading in self.readings],
             "shaded": [(a - start, b - start) for a, b in self.shaded],
             "notes": list(self.notes),
             "clock": self.clock,
@@ -156,9 +158,9 @@ class Film:
         }
         player = render_page("drake_teleop.common", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
-        whole = head.replace("<title>Drake MeshCat<", _TITLE, 1) + player + body + tail
+        whole = head.replace("<title>Drake MeshCat<", _TITLE_TAG, 1) + player + body + tail
         return whole.replace(
-            "<title>", _POLICY.format(content_security_policy(whole)) + "<title>", 1
+            "<title>", _POLICY_TAG.format(content_security_policy(whole)) + "<title>", 1
         )
 
 
@@ -200,23 +202,23 @@ def add_shapes(
         meshcat.SetTransform(name, inspector.GetPoseInFrame(shape))
 
 
-def rgba(colour: str) -> Rgba:
+def colour_to_rgba(colour: str) -> Rgba:
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
 
 
-class Arrow:
+class ForceArrow:
     """Arrow in Meshcat that represents a force, 3 mm long per newton."""
 
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
         self._path = f"/forces/{name}"
         meshcat.SetObject(
-            f"{self._path}/shaft/scaled", Cylinder(_SHAFT_RADIUS_M, 1.0), rgba(colour)
+            f"{self._path}/shaft/scaled", Cylinder(_SHAFT_RADIUS_M, 1.0), colour_to_rgba(colour)
         )
         # The cone's tip is at its origin; its axis is z.
         head = MeshcatCone(_HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M)
-        meshcat.SetObject(f"{self._path}/head/scaled", head, rgba(colour))
+        meshcat.SetObject(f"{self._path}/head/scaled", head, colour_to_rgba(colour))
 
-    def show(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
+    def show_force(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
         """Show `force` (3,) [N] at the point `place` (3,) [m], both in W, at `film_time` [s]."""
         length = _ARROW_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _HEAD_LENGTH_M, 1e-3)
@@ -234,7 +236,7 @@ class Arrow:
 
 
 @contextmanager
-def quiet_drake() -> Iterator[None]:
+def silence_drake_log() -> Iterator[None]:
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

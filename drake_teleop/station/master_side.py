@@ -12,16 +12,16 @@ from drake_teleop.station.master.device import AddDevice
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.electronics import Encoders, SampleHold
 from drake_teleop.station.master.leader import LeaderDevice
-from drake_teleop.station.operator.decision import Training
+from drake_teleop.station.operator.decision import OperatorTraining
 from drake_teleop.station.operator.operator import Operator
 from drake_teleop.station.scaling.joint_coupling import JointCoupling
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
-from drake_teleop.station.wiring import export
+from drake_teleop.station.wiring import export_outputs
 
 #: Sampling period of the clutch [s]; 2 kHz events would cost time.
-CLUTCH_PERIOD = 0.01
+CLUTCH_PERIOD_S = 0.01
 
 
 def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diagram:
@@ -69,43 +69,43 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
             builder.ExportInput(operator.GetInputPort(name), name)
     if scenario.operator.task is not None:
         builder.ExportInput(operator.GetInputPort("slave_state"), "slave_state")
-        export(builder, operator, "task_state")
-    export(builder, operator, "intent", "hand_wrench_E")
-    export(builder, device, "pose_master", "twist_master", master_state="state")
+        export_outputs(builder, operator, "task_state")
+    export_outputs(builder, operator, "intent", "hand_wrench_E")
+    export_outputs(builder, device, "pose_master", "twist_master", master_state="state")
 
-    if isinstance(model, LeaderDevice) and scenario.master.leads_joints:
+    if isinstance(model, LeaderDevice) and scenario.master.is_joint_leader:
         slave = NominalSlave(scenario.slave)
         kinematic_scaling = builder.AddNamedSystem(
-            "kinematic_scaling", JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD)
+            "kinematic_scaling", JointCoupling(slave.arm, slave.start, model.home, CLUTCH_PERIOD_S)
         )
     else:
         kinematic_scaling = builder.AddNamedSystem(
-            "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD, start_W)
+            "kinematic_scaling", KinematicScaling(scaling, CLUTCH_PERIOD_S, start_W)
         )
     read, command = device.GetOutputPort("pose_master"), display.GetInputPort("wrench_command")
-    if scenario.master.steps().any() and isinstance(model, HapticDevice):
-        encoders = Encoders(model, q_start, scenario.master.steps())
+    if scenario.master.encoder_steps().any() and isinstance(model, HapticDevice):
+        encoders = Encoders(model, q_start, scenario.master.encoder_steps())
         builder.AddNamedSystem("encoders", encoders)
         builder.Connect(device.GetOutputPort("state"), encoders.get_input_port())
         read = encoders.get_output_port()
-    own_period = scenario.master.own_period(scenario.rates.hand_hz)
+    own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
     if own_period is not None:
         held_pose = builder.AddNamedSystem("held_pose", SampleHold(own_period, start_B))
         held_wrench = builder.AddNamedSystem("held_wrench", SampleHold(own_period, np.zeros(6)))
         builder.Connect(read, held_pose.get_input_port())
         builder.Connect(held_wrench.get_output_port(), command)
         read, command = held_pose.get_output_port(), held_wrench.get_input_port()
-    if scenario.master.leads_joints:
+    if scenario.master.is_joint_leader:
         state = device.GetOutputPort("state")
         builder.Connect(state, kinematic_scaling.GetInputPort("master_state"))
-        export(builder, kinematic_scaling, "leader_joints")
+        export_outputs(builder, kinematic_scaling, "leader_joints")
     else:
         builder.Connect(read, kinematic_scaling.GetInputPort("pose_master"))
     builder.ExportInput(kinematic_scaling.GetInputPort("clutch"), "clutch")
-    export(builder, kinematic_scaling, "pose_command")
+    export_outputs(builder, kinematic_scaling, "pose_command")
 
     builder.ExportInput(command, "wrench_command")
-    export(builder, display, "force_to_master", "fault_at_hand", "displayed_and_fault")
+    export_outputs(builder, display, "force_to_master", "fault_at_hand", "displayed_and_fault")
     return builder.Build()
 
 
@@ -113,8 +113,8 @@ def _make_operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator
     if scenario.operator.task is None:
         return Operator(scenario.operator, start_B)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling
-    forward, backward = (mean_delay(line) for line in scenario.channel.lines())
-    training = Training(
+    forward, backward = (mean_delay(line) for line in scenario.channel.networks_of_directions())
+    training = OperatorTraining(
         RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
         scaling.translation_scale,
         forces.scales().gamma * forces.force_scale,

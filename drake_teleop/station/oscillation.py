@@ -13,7 +13,7 @@ Flags = NDArray[np.bool_]
 _MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
 REVERSAL_WINDOW_S = 0.25
 """Largest time between a reversal of the command and the reversal that it explains [s]."""
-MAX_FAST_FORCE_N = 0.05
+MAX_HIGH_FREQUENCY_FORCE_N = 0.05
 """Largest rms of the rendered force above 5 Hz while the hand rests [N]."""
 # Smallest number of reversals of an oscillation, and longest time between two of them [s].
 _MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
@@ -37,7 +37,7 @@ def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
     return np.array(found, dtype=np.intp)
 
 
-def oscillates(
+def find_unexplained_oscillation(
     t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_WINDOW_S
 ) -> Flags:
     """Return (N,) booleans: True while the actual motion oscillates and the command does not.
@@ -52,28 +52,30 @@ def oscillates(
     commanded = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        times = remove_explained(t[find_reversals(x, swing)], commanded, near)
+        times = remove_explained_times(t[find_reversals(x, swing)], commanded, near)
         for series in split_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
             if len(series) >= _MIN_REVERSALS:
                 oscillating |= (t >= series[0]) & (t <= series[-1])
     return oscillating
 
 
-def pose_oscillates(t: Array, command: Array, actual: Array, near: float) -> Flags:
+def find_unexplained_pose_oscillation(
+    t: Array, command: Array, actual: Array, near: float
+) -> Flags:
     """Return (N,) booleans as `oscillates`, of position or orientation, for poses (N, 7)."""
-    turned, wanted = (rotation_near(pose, command) for pose in (actual, command))
-    swaying = oscillates(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
-    return swaying | oscillates(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
+    turned, wanted = (doubled_quaternions_near(pose, command) for pose in (actual, command))
+    swaying = find_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
+    return swaying | find_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
 
 
 def pose_reversals(t: Array, pose: Array) -> Array:
     """Return the sorted times [s] at which a component of the pose (N, 7) reverses."""
     rows = [find_reversals(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
-    rows += [find_reversals(x, _MIN_AMPLITUDE_RAD) for x in rotation_near(pose, pose).T]
+    rows += [find_reversals(x, _MIN_AMPLITUDE_RAD) for x in doubled_quaternions_near(pose, pose).T]
     return np.sort(t[np.concatenate(rows)])
 
 
-def rotation_near(pose: Array, reference: Array) -> Array:
+def doubled_quaternions_near(pose: Array, reference: Array) -> Array:
     """Return (N, 4) twice the quaternions of poses (N, 7): small changes equal the rotation [rad].
 
     The quaternions take the sign of the first one of `reference`.
@@ -82,7 +84,7 @@ def rotation_near(pose: Array, reference: Array) -> Array:
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
-def remove_explained(times: Array, causes: Array, near: float) -> Array:
+def remove_explained_times(times: Array, causes: Array, near: float) -> Array:
     """Return event times [s] without the nearest one to each cause within `near` [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
@@ -96,7 +98,7 @@ def split_at_gaps(times: Array, longest: float) -> list[Array]:
     return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
 
 
-def fast_part(t: Array, signal: Array) -> Array:
+def high_pass(t: Array, signal: Array) -> Array:
     """Return the part of `signal` (N, k) above 5 Hz, for evenly spaced times `t` (N,) [s]."""
     rows = max(round(0.2 / (t[1] - t[0])), 1) if len(t) > 1 else 1
     return signal - uniform_filter1d(signal, rows, axis=0, mode="nearest")

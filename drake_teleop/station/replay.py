@@ -21,43 +21,47 @@ from drake_teleop.common.files import models_dir, output_folder, write_json
 from drake_teleop.common.numeric import contact_spans
 from drake_teleop.common.style import BLUE, VERMILION
 from drake_teleop.station.film import (
-    Arrow,
     Canvas,
-    Film,
-    Reading,
-    Show,
+    DisplayedNumber,
+    ForceArrow,
+    ReplayFile,
+    ShowFrame,
     add_shapes,
     frame_times,
     set_plain_background,
 )
-from drake_teleop.station.master.data_sheets import PHANTOM
+from drake_teleop.station.master.data_sheets import PHANTOM_NAME
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.signals import POSE_OF
+from drake_teleop.station.signals import POSE_SIGNAL_PREFIX
 from drake_teleop.station.slave.model.meshes import AddSkeleton
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import (
+    AddedEnvironment,
     AddEnvironment,
     MovingBodies,
-    Touched,
-    positions_of,
+    joint_positions_of_pose,
 )
 
 Array = NDArray[np.float64]
 Signals = Mapping[str, Array]
 
-_TABLE_TOP = 0.60
+_TABLE_HEIGHT_M = 0.60
 # Origin of the haptic device's base frame B in W [m].
-_P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # B is 0.28 m above the foot
-_CAMERA, _TARGET = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
+_MASTER_BASE_P_WB = np.array([1.15, -0.10, _TABLE_HEIGHT_M + 0.28])  # B is 0.28 m above the foot
+_CAMERA_P_W, _CAMERA_TARGET_W = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
 _CAMERA_SHIFT_W = np.array([-0.3, 0.0, 0.0])  # offset of camera and target without a haptic device
 
 
-_FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.40, 0.43, 0.47)
-_P_EGRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_P_SWRIST_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
+_FLOOR_COLOUR, _WOOD_COLOUR, _STEEL_COLOUR = (
+    Rgba(0.93, 0.94, 0.95),
+    Rgba(0.78, 0.66, 0.50),
+    Rgba(0.40, 0.43, 0.47),
+)
+_GRIP_P_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
+_WRIST_P_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.
 _WRIST_ARROW_OFFSET_W = np.array([0.07, -0.09, 0.0])
 _TIP_ARROW_OFFSET_W = np.array([-0.06, 0.0, 0.0])
@@ -113,25 +117,25 @@ def write_replay(
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
     rows = _nearest_rows(result.t, times)
     # Read each signal of a log on disk once, and keep only the displayed rows.
-    moving = [name for name in result.signals if name.startswith(POSE_OF)]
+    moving = [name for name in result.signals if name.startswith(POSE_SIGNAL_PREFIX)]
     shown = [name for name in (*_REQUIRED_SIGNALS, *_OPTIONAL_SIGNALS, *moving) if name in result]
     signals = {name: result[name][rows] for name in shown}
     contact = np.zeros(len(result.t), dtype=bool)
     if "true_contact_wrench_W" in result:
         contact = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    film = Film(
+    film = ReplayFile(
         scenario.description or "A run of the station",
         times,
         slow_motion,
-        readings=_readings(signals),
+        readings=_displayed_numbers(signals),
         shaded=contact_spans(result.t, contact),
         notes=("Arrows: 3 mm a newton, as large as at the slave.",),
         curves="forces, 0 to {top} N" + ("; contact shaded" if contact.any() else ""),
     )
 
-    def make_scene(meshcat: Meshcat) -> Show:
+    def make_scene(meshcat: Meshcat) -> ShowFrame:
         scene = ReplayScene(meshcat, scenario, signals)
-        return lambda film_time, frame: scene.show(film_time, signals, frame)
+        return lambda film_time, frame: scene.show_sample(film_time, signals, frame)
 
     film.write(path, make_scene)
 
@@ -143,15 +147,17 @@ def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
     return np.where(times - t[before] <= t[after] - times, before, after)
 
 
-def _readings(signals: Signals) -> list[Reading]:
+def _displayed_numbers(signals: Signals) -> list[DisplayedNumber]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
-    readings = [Reading("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)]
+    readings = [
+        DisplayedNumber("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)
+    ]
     if "contact_wrench_S" in signals:
         contact = _row_norms(signals["contact_wrench_S"][:, :3])
-        readings.append(Reading("Contact, calculated", "N", contact, VERMILION, arrow=True))
+        readings.append(DisplayedNumber("Contact, calculated", "N", contact, VERMILION, arrow=True))
     if "force_to_master" in signals:
         readings.append(
-            Reading("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
+            DisplayedNumber("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
         )
     return readings
 
@@ -206,16 +212,16 @@ class ReplayScene:
         nominal = NominalSlave(scenario.slave)
         self._joints, self._tip = nominal.arm.num_joints, nominal.tip
         AddSkeleton(self.plant, self._sensor)
-        touched = Touched([], None)
+        touched = AddedEnvironment([], None)
         if scenario.surroundings is not None:
             touched = AddEnvironment(self.plant, scenario.surroundings)
         self._sheet = touched.sheet
         self._master = None
         if "master_state" in recorded:
             self._master = _add_master(self.plant, scenario)
-        finalize(self.plant)
+        finalize_plant(self.plant)
         self._moving_bodies = {
-            POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()
+            POSE_SIGNAL_PREFIX + k: body for k, body in MovingBodies(self.plant, touched).items()
         }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._add_bodies(meshcat))
@@ -225,7 +231,7 @@ class ReplayScene:
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
         kinds = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
         self._arrows = [
-            (force, place, Arrow(meshcat, f"{force}_at_{place}", colour))
+            (force, place, ForceArrow(meshcat, f"{force}_at_{place}", colour))
             for force, at_slave, colour in kinds
             if f"{force}_wrench_S" in recorded
             for place in ((at_slave,) if self._master is None else (at_slave, "stylus"))
@@ -242,7 +248,7 @@ class ReplayScene:
             elif shapes:
                 yield path, body
 
-    def show(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
+    def show_sample(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
         """Show row `sample` of the signals at a time of the recording [s]."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
@@ -263,17 +269,16 @@ class ReplayScene:
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
-            arrow.show(self.canvas, film_time, places[place], f_W)
+            arrow.show_force(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
-        """Set the pose (7,) of a moving body, after those of its parents."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
         X_WF = joint.frame_on_parent().CalcPoseInWorld(self.context)
         X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
         q, first = self.plant.GetPositions(self.context), joint.position_start()
-        moved = positions_of(joint, X_WF.inverse() @ X_WBody @ X_BM)
+        moved = joint_positions_of_pose(joint, X_WF.inverse() @ X_WBody @ X_BM)
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 
@@ -288,7 +293,7 @@ class ReplayScene:
     def _arrow_positions_W(self) -> dict[str, Array]:
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": X_WS @ _P_SWRIST_S + _WRIST_ARROW_OFFSET_W,
+            "wrist": X_WS @ _WRIST_P_S + _WRIST_ARROW_OFFSET_W,
             "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W,
         }
         if self._master is not None:
@@ -312,47 +317,51 @@ class _ReplayDevice(NamedTuple):
 def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if scenario.master.leader is not None:
         return _add_leader(plant, scenario.master.leader)
-    is_phantom = scenario.master.model == PHANTOM
+    is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
     base = plant.GetFrameByName("base", master)
-    plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
+    plant.WeldFrames(plant.world_frame(), base, RigidTransform(_MASTER_BASE_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
-    return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _P_EGRIP_E, positions)
+    return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _GRIP_P_E, positions)
 
 
 def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
-    parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
+    parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
 
-    def positions(q: Array) -> Array:
+    def plant_positions(q: Array) -> Array:
         ordered = np.empty(len(q))
         ordered[order] = q
         return ordered
 
     return _ReplayDevice(
-        parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder
+        parsed.instance, parsed.sensor_frame, np.zeros(3), plant_positions, parsed.folder
     )
 
 
 def _draw_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
-    def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
+    def draw_box(
+        name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba
+    ):
         meshcat.SetObject(f"/room/{name}", Box(*size), colour)
         meshcat.SetTransform(f"/room/{name}", RigidTransform(np.array(centre)))
 
-    box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR)
+    draw_box("floor", (8.0, 8.0, 0.02), (0.6, 0.5, -0.011), _FLOOR_COLOUR)
     if with_table:
-        x, y, _ = _P_WB
-        box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_TOP - 0.015), _WOOD)
-        height = _TABLE_TOP - 0.03
+        x, y, _ = _MASTER_BASE_P_WB
+        draw_box("table", (0.50, 0.60, 0.03), (x - 0.09, y, _TABLE_HEIGHT_M - 0.015), _WOOD_COLOUR)
+        height = _TABLE_HEIGHT_M - 0.03
         for i, (dx, dy) in enumerate(((-0.31, -0.27), (-0.31, 0.27), (0.13, -0.27), (0.13, 0.27))):
-            box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL)
+            draw_box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL_COLOUR)
     surroundings = scenario.surroundings
     for k, part in enumerate(() if surroundings is None else surroundings.parts):
         stand = part.stand
         if stand is not None and stand.height > 0:
             size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
-            box(f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL)
+            draw_box(
+                f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL_COLOUR
+            )
     set_plain_background(meshcat)
     aside = np.zeros(3) if with_table else _CAMERA_SHIFT_W
-    meshcat.SetCameraPose(_CAMERA + aside, _TARGET + aside)
+    meshcat.SetCameraPose(_CAMERA_P_W + aside, _CAMERA_TARGET_W + aside)

@@ -20,7 +20,7 @@ from drake_teleop.common.errors import (
     remedy_to_install_extra,
     wrap_read_errors,
 )
-from drake_teleop.common.files import PARTS_OF_LOG, make_folder, part_of_log, write_table
+from drake_teleop.common.files import LOG_PARTS_PATTERN, make_folder, part_of_log, write_table
 from drake_teleop.common.numeric import float_array
 from drake_teleop.common.parquet_sizes import check_parquet
 
@@ -239,9 +239,9 @@ class SimulationResult:
 
         Equal data give equal bytes.
         """
-        self._write(Path(path))
+        self._write_parquet_file(Path(path))
 
-    def _write(self, path: Path, aside: Path | None = None) -> None:
+    def _write_parquet_file(self, path: Path, aside: Path | None = None) -> None:
         specs = [asdict(spec) for spec in self.specs]
         # Fixed row groups: polars' default may depend on the number of threads.
         metadata = {_METADATA_KEY: json.dumps(specs)}
@@ -260,7 +260,7 @@ class SimulationResult:
         part = part_of_log(folder, first_row)
         if len(self.t) or not part.exists():
             make_folder(folder)
-            self._write(part, aside=folder)
+            self._write_parquet_file(part, aside=folder)
 
     @classmethod
     def read_parquet(cls, path: str | Path) -> SimulationResult:
@@ -309,7 +309,7 @@ class SimulationResult:
         """
         from drake_teleop.common.style import Picture, plot_style, shade_contact
 
-        panels = [panel for name in names or self.signals for panel in self._panels(name)]
+        panels = [panel for name in names or self.signals for panel in self._plot_panels(name)]
         with plot_style():
             figure = Picture(figsize=(8.0, 0.6 + 1.9 * len(panels)))
             rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -326,7 +326,7 @@ class SimulationResult:
             rows[-1].set_xlabel("t [s]")
         return figure
 
-    def _panels(self, name: str) -> list[tuple[str, str, list[int]]]:
+    def _plot_panels(self, name: str) -> list[tuple[str, str, list[int]]]:
         if (found := self._column(name)) is not None:
             signal, index = found
             return [(signal, self._specs[signal].units[index], [index])]
@@ -406,7 +406,7 @@ def _signal_text(spec: Signal) -> str:
 
 
 def _log_parts(path: Path) -> list[Path]:
-    return sorted(path.glob(PARTS_OF_LOG)) or [path]
+    return sorted(path.glob(LOG_PARTS_PATTERN)) or [path]
 
 
 def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:

@@ -9,27 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from drake_teleop.common.blocks import MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.numeric import contact_spans
-from drake_teleop.load.regressor import LOST
+from drake_teleop.load.regressor import LOST_SAMPLE_FLAG
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
-from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale
+from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale_of_scenario
 from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.oscillation import (
-    MAX_FAST_FORCE_N,
+    MAX_HIGH_FREQUENCY_FORCE_N,
     REVERSAL_WINDOW_S,
-    fast_part,
-    oscillates,
-    pose_oscillates,
+    doubled_quaternions_near,
+    find_unexplained_oscillation,
+    find_unexplained_pose_oscillation,
+    high_pass,
     pose_reversals,
-    rotation_near,
 )
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.slave.arm import SLIDES, ArmModel
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.posture_shapes import start_overlaps
 
@@ -42,7 +42,7 @@ _MIN_DURATION_S = 0.2
 # Gaps between time spans that are shorter are closed [s].
 _MAX_GAP_S = 0.05
 # Share of a limit from which the limit counts as reached (rounding).
-_LIMIT_SHARE = 1 - 1e-9
+_SHARE_AT_LIMIT = 1 - 1e-9
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
 # Settling time of the command of `ledger` with sufficient energy [s].
@@ -55,7 +55,7 @@ _SETTLING_TIME_CONSTANTS = 6.0
 # Time in which an intent at rest moves by less than a distance.
 _REST_S, _MAX_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
-_MIN_CYCLES = 4
+_MIN_OSCILLATION_CYCLES = 4
 # Largest number of time spans that a warning lists; further ones are counted.
 _MAX_LISTED_TIMES = 3
 
@@ -107,14 +107,13 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
 
 
 def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
-    """Yield faults and their time spans; a fault at the hand counts while the slave has none."""
     t = result.t
     slave = hand = np.zeros(len(t))
     if "fault" in result:
         slave = result["fault"][:, 0]
     if "fault_at_hand" in result:
         hand = result["fault_at_hand"][:, 0]
-    for fault, meaning in MEANINGS.items():
+    for fault, meaning in FAULT_MEANINGS.items():
         if fault != Fault.RESUMING:
             happened = (slave == fault) | ((hand == fault) & (slave == 0))
             yield f"a fault: {meaning},", find_spans(t, happened)
@@ -125,7 +124,7 @@ def _check_limits(
 ) -> Iterator[tuple[str, Spans]]:
     t = result.t
     flag = result["saturated"][:, 0]
-    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST))
+    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST_SAMPLE_FLAG))
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
@@ -138,21 +137,21 @@ def _check_limits(
         ("speed", asked, fastest),
         ("torque", result["joint_torque"], arm.effort_limit),
     ):
-        clipped = np.abs(values) >= _LIMIT_SHARE * limit
+        clipped = np.abs(values) >= _SHARE_AT_LIMIT * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
             yield f"joint {joint + 1} is at its largest {what}", find_spans(t, clipped[:, joint])
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _LIMIT_SHARE * device.peak_force
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _SHARE_AT_LIMIT * device.peak_force
         if isinstance(device, LeaderDevice):
-            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _LIMIT_SHARE * device.peak_torque[0]
+            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _SHARE_AT_LIMIT * device.peak_torque[0]
         elif device.peak_torque.all():
             full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
         yield (
             "the device displays its largest force or torque",
             find_spans(t, full, _MIN_DURATION_S),
         )
-        ended = device.at_an_end(result["master_state"][:, : device.num_joints])
+        ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", find_spans(t, ended)
     if scenario.leaf is not None and "sheet_state" in result:
         bent = scenario.leaf.largest_small_deflection
@@ -165,7 +164,7 @@ def _check_limits(
 def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
     if "ports" not in result:
         return
-    t, timeout = result.t, scenario.channel.silent_after(1.0 / scenario.rates.hand_hz)
+    t, timeout = result.t, scenario.channel.timeout_s(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
         silent = result[f"ports.{end}_silent"] > timeout
         yield (
@@ -173,10 +172,10 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             find_spans(t, silent, _MIN_DURATION_S),
         )
     # An end without new packets uses the last one until `timeout`.
-    window = longest_delay(scenario.channel.lines()[0]) + timeout
+    window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
-    for command, actual, least, unit, scale in _pose_parts(sent, received):
+    for command, actual, least, unit, scale in _position_and_rotation_parts(sent, received):
         lag = lag_beyond_delay(t, command, actual, window)
         spans = find_spans(t, lag > least, _MIN_DURATION_S)
         largest = _maximum_within(t, lag, spans)
@@ -186,7 +185,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             spans,
         )
     yield from _check_reserve(result, scenario)
-    oscillating = pose_oscillates(t, sent, received, REVERSAL_WINDOW_S + window)
+    oscillating = find_unexplained_pose_oscillation(t, sent, received, REVERSAL_WINDOW_S + window)
     yield (
         f"the channel ({by}) makes the slave's command oscillate",
         find_spans(t, oscillating, _MIN_DURATION_S),
@@ -199,11 +198,15 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.method_config(), t[1] - t[0]
-    mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale(scenario)
+    mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale_of_scenario(
+        scenario
+    )
     limit = speed_limit(config, mass)
     then = t - _packet_ages(t, scenario)
-    window = longest_delay(scenario.channel.lines()[0]) + _SETTLING_TIME_S
-    for g, (command, actual, least, unit, scale) in enumerate(_pose_parts(sent, received)):
+    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _SETTLING_TIME_S
+    for g, (command, actual, least, unit, scale) in enumerate(
+        _position_and_rotation_parts(sent, received)
+    ):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
         far = lag_beyond_delay(t, asked, actual, _SETTLING_TIME_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
@@ -220,16 +223,18 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
             " pose (move more slowly, or increase the energy:"
             f" passivity.{scenario.passivity.method}.reserve"
-            f" {_list_text(enough)} and initial {_list_text(enough + config.hand_reserve)}),",
+            f" {_join_values(enough)} and initial {_join_values(enough + config.hand_reserve)}),",
             find_spans(t, held),
         )
 
 
-def _pose_parts(
+def _position_and_rotation_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    """Return command, motion, smallest lag, display unit and factor, for position and rotation."""
-    rotations = rotation_near(command, command), rotation_near(actual, command)
+    rotations = (
+        doubled_quaternions_near(command, command),
+        doubled_quaternions_near(actual, command),
+    )
     return (
         (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
         (*rotations, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
@@ -240,11 +245,11 @@ def _packet_ages(t: Array, scenario: Scenario) -> Array:
     """Return (N,) age of the newest packet at the slave's end [s], from the network model."""
     period = 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
-    line, seed = scenario.channel.lines()[0], scenario.simulation.seed
+    line, seed = scenario.channel.networks_of_directions()[0], scenario.simulation.seed
     return (step - newest_packets(line, seed, FORWARD, step[-1] + 1, period)[step]) * period
 
 
-def _list_text(values: Array) -> str:
+def _join_values(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
@@ -256,16 +261,17 @@ def _check_joints(
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
     window = (
-        _SETTLING_TIME_CONSTANTS * scenario.joint_control.lag + 1 / scenario.rates.joint_control_hz
+        _SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+        + 1 / scenario.rates.joint_control_hz
     )
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
-        slides = arm.table[k, SLIDES] != 0.0
+        slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
         spans = find_spans(t, far > (_MIN_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_DURATION_S)
         largest = _maximum_within(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
-    oscillating = oscillates(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
+    oscillating = find_unexplained_oscillation(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
     yield (
         "the slave oscillates while its command does not,",
         find_spans(t, oscillating, _MIN_DURATION_S),
@@ -274,7 +280,7 @@ def _check_joints(
 
 def _check_hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     if "intent" in result and "pose_master" in result:
-        oscillating = pose_oscillates(
+        oscillating = find_unexplained_pose_oscillation(
             result.t, result["intent"], result["pose_master"], REVERSAL_WINDOW_S
         )
         yield (
@@ -304,20 +310,20 @@ def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans
     if not {"ports", "intent", "force_to_master"} <= set(result.signals):
         return
     t, intent = result.t, result["intent"][:, 4:]
-    force = fast_part(t, result["force_to_master"][:, :3])
+    force = high_pass(t, result["force_to_master"][:, :3])
     rows = round(_REST_S / (t[1] - t[0])) if len(t) > 1 else 1
     largest, least = _running_maximum(intent, rows), -_running_maximum(-intent, rows)
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans(t, rests & (rms > MAX_FAST_FORCE_N), _MIN_DURATION_S)
+    spans = find_spans(t, rests & (rms > MAX_HIGH_FREQUENCY_FORCE_N), _MIN_DURATION_S)
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])
     part = force[(t >= start) & (t <= stop)]
     strongest = part[:, part.std(axis=0).argmax()]
     crossings = np.count_nonzero(np.diff(np.signbit(strongest)))
-    if crossings < 2 * _MIN_CYCLES:  # a step is no oscillation
+    if crossings < 2 * _MIN_OSCILLATION_CYCLES:  # a step is no oscillation
         return
     yield (
         f"the rendered force oscillates at {crossings / (2 * (stop - start)):.2g} Hz with up to"
@@ -335,7 +341,7 @@ def _joint_error(result: SimulationResult) -> Array:
 
 
 def _torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    full, peak = np.zeros(len(torque), dtype=bool), _LIMIT_SHARE * device.peak_torque
+    full, peak = np.zeros(len(torque), dtype=bool), _SHARE_AT_LIMIT * device.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
         turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])

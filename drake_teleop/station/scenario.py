@@ -24,22 +24,22 @@ from drake_teleop.common.errors import DrakeTeleopError, expect, suggest_name
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.station.channel.channel import LONGEST_TIMEOUT, Channel
+from drake_teleop.station.channel.channel import MAX_TIMEOUT_S, Channel
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.environment.environment import Environment, Several
+from drake_teleop.station.environment.environment import Environment, SeveralObjects
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.environment.solids import Block, Box, Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
-from drake_teleop.station.master.data_sheets import Master, figures_of
+from drake_teleop.station.master.data_sheets import Master, data_sheet_of
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.operator.task import check_task
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
-from drake_teleop.station.sensor.presets import preset_of
+from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.joint_control import JointControlConfig, default_interface
 from drake_teleop.station.slave.scene import Scene
@@ -51,7 +51,7 @@ ENVIRONMENTS: Registry[type[Environment]] = Registry(
 )
 """Classes of the objects in `environment` by the tag in a file, without its `!`."""
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
-_CONTACT_STEP_S = 1.25e-4
+_MAX_CONTACT_STEP_S = 1.25e-4
 
 
 @settings
@@ -129,7 +129,7 @@ class Scenario:
         things = self._objects
         if not things:
             return None
-        return things[0] if len(things) == 1 else Several(things)
+        return things[0] if len(things) == 1 else SeveralObjects(things)
 
     @property
     def leaf(self) -> SheetSpring | None:
@@ -148,7 +148,10 @@ class Scenario:
     @property
     def is_direct(self) -> bool:
         """True if no network and no passivity method are between master and slave."""
-        return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
+        return (
+            self.passivity.method == "none"
+            and self.channel.networks_of_directions() == (NetworkConfig(),) * 2
+        )
 
     def check(self, where: str = "scenario") -> None:
         """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
@@ -248,8 +251,8 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     """
     check_structure(Scenario, data, where)  # before the presets are read
     defaults = Scenario(
-        wrist_sensor=preset_of(data.get("wrist_sensor")),
-        master=Master(figures=figures_of(data.get("master"))),
+        wrist_sensor=preset_of_block(data.get("wrist_sensor")),
+        master=Master(figures=data_sheet_of(data.get("master"))),
         joint_control=JointControlConfig(interface=default_interface(data.get("joint_control"))),
     )
     scenario = settings_from_data(Scenario, data, where, defaults)
@@ -302,26 +305,26 @@ def _check_steps(scenario: Scenario, where: str) -> None:
     if (
         scenario.surroundings is not None
         and not controlled
-        and simulation.max_step > _CONTACT_STEP_S
+        and simulation.max_step > _MAX_CONTACT_STEP_S
     ):
         raise DrakeTeleopError(
             f"steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",
-            remedy=f"set it to {_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
+            remedy=f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
         )
 
 
 def _check_channel(scenario: Scenario, where: str) -> None:
-    for line in scenario.channel.lines(f"{where}:channel"):
+    for line in scenario.channel.networks_of_directions(f"{where}:channel"):
         line.check(f"{where}:channel")
-        timeout = scenario.channel.timeout or LONGEST_TIMEOUT
+        timeout = scenario.channel.timeout or MAX_TIMEOUT_S
         if line.rate_hz is not None and timeout < 2 / line.rate_hz:
             raise DrakeTeleopError(
                 f"{timeout:g} s are shorter than two packet intervals at {line.rate_hz:g} Hz",
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
-    if scenario.master.leads_joints and not (
+    if scenario.master.is_joint_leader and not (
         scenario.is_direct and scenario.contact_detection is None
     ):
         raise DrakeTeleopError(

@@ -12,20 +12,20 @@ from typing import Any
 from drake_teleop.common.config import FieldInfo, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
-from drake_teleop.common.texts import yaml_data, yaml_scalar
+from drake_teleop.common.texts import parse_yaml, yaml_scalar
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
-from drake_teleop.station.sensor.presets import preset_of
+from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 _COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
-_HEAD = """\
+_FILE_HEAD = """\
 # Each field has its value, [the permitted values] and its meaning. Omitted fields have their
 # defaults. Lines that begin with # are fields and blocks that this scenario does not use; remove
 # the # to use them.
 """
 
-_REFERENCE = """\
+_REFERENCE_HEAD = """\
 # Every field of a scenario
 
 A scenario is a YAML file; what it leaves out keeps the default that stands here. This page is made
@@ -46,9 +46,9 @@ and sections are those of the paper; (E) marks an estimate of ours, where the pa
 """
 
 
-def commented(scenario: Scenario) -> str:
+def to_commented_yaml(scenario: Scenario) -> str:
     """Return the scenario as YAML text; a comment explains each field."""
-    return _HEAD + "\n".join(_block_lines(scenario)) + "\n"
+    return _FILE_HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
 def _all_texts(value: Any) -> list[str]:
@@ -66,8 +66,11 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
 
     A DrakeTeleopError is raised if reading the file would not give the same scenario.
     """
-    text, where = "".join(f"# {line}\n" for line in heading) + commented(scenario), str(path)
-    found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
+    text, where = (
+        "".join(f"# {line}\n" for line in heading) + to_commented_yaml(scenario),
+        str(path),
+    )
+    found = ScenarioFromData(parse_yaml(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
     if found != scenario and _all_texts(found) != _all_texts(scenario):
@@ -83,9 +86,9 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
     write_text(path, text)
 
 
-def reference() -> str:
+def reference_page() -> str:
     """Return the reference in Markdown: a table per block with field, default, range, meaning."""
-    return _REFERENCE + "".join(_sections(Scenario(), ""))
+    return _REFERENCE_HEAD + "".join(_sections_of_page(Scenario(), ""))
 
 
 def json_schema() -> str:
@@ -102,7 +105,7 @@ def _allowed_values(entry: FieldInfo) -> str:
     return f"{words}, or null" if entry.optional else words
 
 
-def _comment(entry: FieldInfo) -> str:
+def _comment_of_field(entry: FieldInfo) -> str:
     return f"[{_allowed_values(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
 
 
@@ -111,13 +114,17 @@ def _block_lines(config: Any) -> list[str]:
     starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
     column = min(_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
-    preset = preset_of({"preset": config.preset}) if isinstance(config, WristSensorConfig) else None
+    preset = (
+        preset_of_block({"preset": config.preset})
+        if isinstance(config, WristSensorConfig)
+        else None
+    )
     lines = []
     for entry in entries:
         if entry.kind == "block":
             lines += _inner_lines(entry)
             continue
-        line = f"{starts[entry.name]:{column}}  # {_comment(entry)}"
+        line = f"{starts[entry.name]:{column}}  # {_comment_of_field(entry)}"
         of_preset = preset is not None and entry.default == getattr(preset, entry.name)
         lines.append(f"# {line}" if of_preset and entry.name != "preset" else line)
     return lines
@@ -134,15 +141,15 @@ def _inner_lines(entry: FieldInfo) -> list[str]:
 
 def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
     if not entry.lists:
-        head = f"{entry.name}:{_tag(entry, value)}  # {entry.meaning}"
+        head = f"{entry.name}:{_tag_of_block(entry, value)}  # {entry.meaning}"
         return [head, *_indent(_block_lines(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_tag(entry, item)}", *_indent(_indent(_block_lines(item)))]
+        lines += [f"  -{_tag_of_block(entry, item)}", *_indent(_indent(_block_lines(item)))]
     return lines
 
 
-def _tag(entry: FieldInfo, config: Any) -> str:
+def _tag_of_block(entry: FieldInfo, config: Any) -> str:
     return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
 
 
@@ -154,23 +161,23 @@ def _commented_out(lines: list[str]) -> list[str]:
     return [f"# {line}" for line in lines]
 
 
-def _sections(config: Any, path: str) -> Iterator[str]:
+def _sections_of_page(config: Any, path: str) -> Iterator[str]:
     entries = fields_of(config)
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
         default = yaml_scalar(entry.default) if entry.kind != "block" or not entry.default else ""
-        takes = _links(entry, path) if entry.kind == "block" else _allowed_values(entry)
+        takes = _links_to_blocks(entry, path) if entry.kind == "block" else _allowed_values(entry)
         cells = (f"`{entry.name}`", default, takes, entry.meaning)
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
     for entry in entries:
-        for title, block in _titles(entry, path):
+        for title, block in _titles_of_blocks(entry, path):
             yield f"\n## {title}\n"
             inner = entry.default if isinstance(entry.default, block) else block()
             yield f"\n{_first_paragraph(inner)}\n"
-            yield from _sections(inner, f"{path}{entry.name}.")
+            yield from _sections_of_page(inner, f"{path}{entry.name}.")
 
 
-def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
+def _titles_of_blocks(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
     several = len(entry.blocks) > 1
     return [
         (f"{path}{entry.name}{f': !{block.__name__}' if several else ''}", block)
@@ -178,16 +185,16 @@ def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
     ]
 
 
-def _links(entry: FieldInfo, path: str) -> str:
+def _links_to_blocks(entry: FieldInfo, path: str) -> str:
     several = len(entry.blocks) > 1
     links = [
-        f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor(title)})"
-        for title, block in _titles(entry, path)
+        f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor_of_title(title)})"
+        for title, block in _titles_of_blocks(entry, path)
     ]
     return f"{'list of ' * entry.lists}{', '.join(links)}{', or null' * entry.optional}"
 
 
-def _anchor(title: str) -> str:
+def _anchor_of_title(title: str) -> str:
     return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
@@ -211,7 +218,7 @@ def _field_schema(entry: FieldInfo) -> dict[str, Any]:
         schema |= {"minItems": entry.length, "maxItems": entry.length}
     if entry.optional:
         schema = {"anyOf": [schema, {"type": "null"}]}
-    schema["description"] = _comment(entry)
+    schema["description"] = _comment_of_field(entry)
     if entry.kind != "block":
         schema["default"] = entry.default
     return schema

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drake_teleop.station.result import Signal
 
 #: Name of the station's log sink; its rows are the output ports in one vector.
-LOG = "log"
+LOG_BLOCK_NAME = "log"
 
 
 def _signal(name: str, components: str, units: str, description: str) -> Signal:
@@ -14,14 +14,14 @@ def _signal(name: str, components: str, units: str, description: str) -> Signal:
 
 
 #: Prefix of the pose signals of moving bodies of the surroundings.
-POSE_OF = "pose_of_"
+POSE_SIGNAL_PREFIX = "pose_of_"
 
 _WRENCH_AXES_AND_UNITS = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
 _POSE_AXES_AND_UNITS = ("q_w q_x q_y q_z p_x p_y p_z", "1,1,1,1,m,m,m")
 _TWIST_AXES_AND_UNITS = ("v_x v_y v_z omega_x omega_y omega_z", "m/s,m/s,m/s,rad/s,rad/s,rad/s")
 
 
-def _state(joints: int) -> tuple[str, str]:
+def _state_components_and_units(joints: int) -> tuple[str, str]:
     names = [f"{letter}_{i + 1}" for letter in "qv" for i in range(joints)]
     return " ".join(names), ",".join(joints * ["rad"] + joints * ["rad/s"])
 
@@ -30,7 +30,7 @@ def _joint_names(joints: int) -> str:
     return " ".join(f"joint_{i + 1}" for i in range(joints))
 
 
-_STATE, _STATE_UNITS = _state(6)
+_STATE, _STATE_UNITS = _state_components_and_units(6)
 _JOINTS = _joint_names(6)
 # Signals with one component per joint.
 _JOINT_SIGNALS = ("joint_position", "joint_torque", "joint_command")
@@ -131,11 +131,11 @@ SIGNALS = {
 
 def signal_of(name: str, size: int) -> Signal:
     """Return the description of a signal for `size` components; SI units of revolute joints."""
-    if name.startswith(POSE_OF):
+    if name.startswith(POSE_SIGNAL_PREFIX):
         return _signal(
             name,
             *_POSE_AXES_AND_UNITS,
-            f"where the body {name.removeprefix(POSE_OF)} is, in W, at t",
+            f"where the body {name.removeprefix(POSE_SIGNAL_PREFIX)} is, in W, at t",
         )
     signal = SIGNALS[name]
     if size == len(signal.components):
@@ -143,5 +143,5 @@ def signal_of(name: str, size: int) -> Signal:
     if name in _JOINT_SIGNALS:
         return _signal(name, _joint_names(size), signal.units[0], signal.description)
     if name in ("slave_state", "master_state"):
-        return _signal(name, *_state(size // 2), signal.description)
+        return _signal(name, *_state_components_and_units(size // 2), signal.description)
     return signal

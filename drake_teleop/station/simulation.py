@@ -11,27 +11,27 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.blocks import MEANINGS, Fault
+from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.files import remove_log
-from drake_teleop.common.progress import Progress, show_progress
-from drake_teleop.station.operator.decision import DONE
+from drake_teleop.common.progress import UpdateProgress, show_progress
+from drake_teleop.station.operator.decision import OUTCOME_INDEX
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation
-from drake_teleop.station.signals import LOG, signal_of
+from drake_teleop.station.signals import LOG_BLOCK_NAME, signal_of
 
 # Interval of progress updates [ms].
 _PROGRESS_INTERVAL_MS = 20
 # Rows of a part of a log on disk: some seconds, some MB.
-_PART_ROWS = 8192
+_ROWS_PER_PART = 8192
 
 
 def simulate(
     diagram: Diagram,
     simulation: Simulation | None = None,
     *,
-    progress: bool | Progress = True,
+    progress: bool | UpdateProgress = True,
     log: str | Path | None = None,
 ) -> SimulationResult:
     """Simulate a station for its settling time and duration.
@@ -70,10 +70,10 @@ def simulate(
         # Products, as Drake's event times are: a rounding difference would be a step of 1e-17 s.
         milliseconds = np.arange(_PROGRESS_INTERVAL_MS, 1e3 * end - 1, _PROGRESS_INTERVAL_MS)
         for time in np.append(1e-3 * milliseconds, end):
-            advance(simulator, time)
+            advance_without_garbage_collection(simulator, time)
             if stops:
                 rows = _stop_at_fault(simulator, simulation.settle, rows)
-            if on_disk is not None and on_disk.num_unwritten_rows() >= _PART_ROWS:
+            if on_disk is not None and on_disk.num_unwritten_rows() >= _ROWS_PER_PART:
                 on_disk.write_and_clear()
                 rows = 0
             over = simulation.end_with_task and _task_is_over(simulator)
@@ -85,25 +85,26 @@ def simulate(
             on_disk.write_and_clear()
     if log is not None:
         return SimulationResult.scan_parquet(log)
-    return read_log(simulator, simulation.settle)
+    return read_recorded_signals(simulator, simulation.settle)
 
 
 def _task_is_over(simulator: Simulator) -> bool:
     station = simulator.get_system()
     if not station.HasOutputPort("task_state"):
         return False
-    return bool(station.GetOutputPort("task_state").Eval(simulator.get_context())[DONE] != 0.0)
+    return bool(
+        station.GetOutputPort("task_state").Eval(simulator.get_context())[OUTCOME_INDEX] != 0.0
+    )
 
 
 def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
-    """Raise DrakeTeleopError for a fault in the log from row `rows` on; return its length."""
     station = simulator.get_system()
-    log = station.GetSubsystemByName(LOG).FindLog(simulator.get_context())
+    log = station.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     for name, column in log_columns(station).items():
         if name not in ("fault", "fault_at_hand"):
             continue
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
-            what = MEANINGS[Fault(int(log.data()[column][0, k]))]
+            what = FAULT_MEANINGS[Fault(int(log.data()[column][0, k]))]
             raise DrakeTeleopError(
                 f"at {log.sample_times()[k] - start:.3f} s {what}",
                 where="simulation.on_fault",
@@ -141,7 +142,7 @@ class LogOnDisk:
 
     def continue_with(self, simulator: Simulator) -> None:
         self._simulator = simulator
-        sink = simulator.get_system().GetSubsystemByName(LOG)
+        sink = simulator.get_system().GetSubsystemByName(LOG_BLOCK_NAME)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
 
     def num_unwritten_rows(self) -> int:
@@ -149,20 +150,20 @@ class LogOnDisk:
 
     def write_and_clear(self) -> None:
         """Write the rows in memory as the next part and clear them; repeatable if interrupted."""
-        part = self._read()
-        self._write(part)
+        part = self._read_rows()
+        self._write_part(part)
         self._sink.Clear()
         self._rows += len(part.t)
 
     def write_and_keep(self) -> None:
         """Write the rows in memory but keep them; a later part replaces them."""
-        self._write(self._read())
+        self._write_part(self._read_rows())
 
-    def _write(self, part: SimulationResult) -> None:
+    def _write_part(self, part: SimulationResult) -> None:
         part.write_part(self._folder, self._rows)
 
-    def _read(self) -> SimulationResult:
-        return self._form(read_log(self._simulator, self._start))
+    def _read_rows(self) -> SimulationResult:
+        return self._form(read_recorded_signals(self._simulator, self._start))
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
@@ -175,7 +176,7 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
     return simulator
 
 
-def advance(simulator: Simulator, time: float) -> None:
+def advance_without_garbage_collection(simulator: Simulator, time: float) -> None:
     """Advance the simulator to `time` [s] without garbage collection, which saves time."""
     was_enabled = gc.isenabled()
     gc.disable()
@@ -186,10 +187,10 @@ def advance(simulator: Simulator, time: float) -> None:
             gc.enable()
 
 
-def read_log(simulator: Simulator, start: float) -> SimulationResult:
+def read_recorded_signals(simulator: Simulator, start: float) -> SimulationResult:
     """Return the recorded signals from time `start` [s] on; `start` becomes t = 0."""
     diagram = simulator.get_system()
-    log = diagram.GetSubsystemByName(LOG).FindLog(simulator.get_context())
+    log = diagram.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     t = log.sample_times() - start
     kept = t > -1e-9
     data = log.data().T[kept]

@@ -19,7 +19,7 @@ from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE, ForceScal
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
-from drake_teleop.station.signals import POSE_OF
+from drake_teleop.station.signals import POSE_SIGNAL_PREFIX
 from drake_teleop.station.slave.arm import ForwardKinematics
 from drake_teleop.station.slave.drake_contact import DrakeContact
 from drake_teleop.station.slave.joint_commands import (
@@ -35,12 +35,12 @@ from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
 from drake_teleop.station.slave.surroundings import MovingPose
-from drake_teleop.station.wiring import export, wire
+from drake_teleop.station.wiring import connect_ports, export_outputs
 
 Array = NDArray[np.float64]
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
-MONITOR_PERIOD = 0.01
+MONITOR_PERIOD_S = 0.01
 # See `_check_friction`.
 _MAX_FRICTION_STEP = 2.0
 
@@ -91,7 +91,7 @@ def MakeSlaveSide(
     if load_covariance is not None:
         finite_array("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    led, torques = scenario.master.leads_joints, _gives_torques(controller, scenario)
+    led, torques = scenario.master.is_joint_leader, _is_torque_controller(controller, scenario)
     body = _add_slave_blocks(
         builder, scenario, load_estimate, load_covariance, custom_torque=torques
     )
@@ -100,13 +100,13 @@ def MakeSlaveSide(
         builder.AddNamedSystem("controller", controller)
     setpoint = "leader_joints" if led else "pose_command"
     if torques:
-        wire(builder, controller, "joint_torque", body.joint_control, "requested_torque")
+        connect_ports(builder, controller, "joint_torque", body.joint_control, "requested_torque")
     else:
         ik = _add_inverse_kinematics(builder, scenario, body, led)
         if controller is None:
             builder.ExportInput(ik.GetInputPort(setpoint), setpoint)
         else:
-            wire(builder, controller, "pose_command", ik, "pose_command")
+            connect_ports(builder, controller, "pose_command", ik, "pose_command")
     if controller is not None:
         builder.ExportInput(controller.GetInputPort("pose_command"), "pose_command")
 
@@ -124,14 +124,14 @@ def MakeSlaveSide(
     estimate = body.load_estimator.GetOutputPort("load_estimate")
     builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
-    export(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
+    export_outputs(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
     if _has_load_estimate(scenario, load_estimate):
-        export(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
+        export_outputs(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
     kinematics = builder.AddNamedSystem("forward_kinematics", ForwardKinematics(arm))
     state = body.slave.plant.get_state_output_port(body.slave.instance)
     builder.Connect(state, kinematics.GetInputPort("slave_state"))
-    export(builder, kinematics, "pose_slave")
+    export_outputs(builder, kinematics, "pose_slave")
     if controller is not None:
         inputs = body.sample | {
             "slave_state": state,
@@ -158,12 +158,11 @@ def MakeSlaveSide(
         )
         builder.Connect(body.sample["sample"], detection.GetInputPort("sample"))
         builder.Connect(estimate, detection.GetInputPort("load_estimate"))
-        export(builder, detection, "contact")
+        export_outputs(builder, detection, "contact")
     return builder.Build()
 
 
-def _gives_torques(controller: System | None, scenario: Scenario) -> bool:
-    """Check a custom controller's ports; return whether it replaces the joint control."""
+def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool:
     if controller is None:
         return False
     expect(System, controller, "controller", "make a Drake system: docs/station.md")
@@ -194,8 +193,8 @@ def _add_inverse_kinematics(
         ik.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
     )
     builder.Connect(ik.GetOutputPort("ik_status"), body.monitor.GetInputPort("ik_status"))
-    export(builder, ik, "joint_command")
-    export(builder, body.monitor, "ik_status")
+    export_outputs(builder, ik, "joint_command")
+    export_outputs(builder, body.monitor, "ik_status")
     return ik
 
 
@@ -214,7 +213,7 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     builder.Connect(
         command.GetOutputPort("joint_command"), body.joint_control.GetInputPort("joint_command")
     )
-    export(builder, command, "joint_command")
+    export_outputs(builder, command, "joint_command")
     return builder.Build()
 
 
@@ -258,9 +257,9 @@ def _add_slave_blocks(
     torque = control.GetOutputPort("joint_torque")
     builder.Connect(state, control.GetInputPort("slave_state"))
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
-    export(builder, control, "joint_torque")
+    export_outputs(builder, control, "joint_torque")
 
-    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, MONITOR_PERIOD))
+    monitor = builder.AddNamedSystem("monitor", SlaveMonitor(arm, MONITOR_PERIOD_S))
     builder.Connect(state, monitor.GetInputPort("slave_state"))
 
     sample = AddCompiledWristSensor(
@@ -306,9 +305,9 @@ def _add_slave_blocks(
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         builder.Connect(sample["sample"], estimator.GetInputPort("sample"))
     if _has_load_estimate(scenario, load_estimate):
-        export(builder, estimator, "load_estimate")
+        export_outputs(builder, estimator, "load_estimate")
     if scenario.load_estimator.watch:
-        export(builder, estimator, "load_state")
+        export_outputs(builder, estimator, "load_state")
 
     if slave.can_touch:
         _add_tool_contact(builder, slave, state)
@@ -324,10 +323,10 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
     """Raise DrakeTeleopError for dry friction that stops a joint within one step [s]."""
-    if not slave.friction.any():
+    if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
-    slope = np.diag(slave.friction / FRICTION_SPEED)
+    slope = np.diag(slave.joint_friction / FRICTION_SPEED)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
     if rate * step > _MAX_FRICTION_STEP:
         shorter = 0.9 * _MAX_FRICTION_STEP / rate
@@ -352,16 +351,16 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
         builder.Connect(state, contact.GetInputPort("slave_state"))
         if slave.contact.plant_size:
             builder.Connect(plant.get_state_output_port(), contact.GetInputPort("plant_state"))
-    export(builder, contact, "true_contact_wrench_W")
-    if slave.sheet is not None:
-        sheet = plant.get_state_output_port(slave.sheet)
+    export_outputs(builder, contact, "true_contact_wrench_W")
+    if slave.sheet_instance is not None:
+        sheet = plant.get_state_output_port(slave.sheet_instance)
         builder.ExportOutput(sheet, "sheet_state")
         if slave.sensed_sheet is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))
     for name, body in slave.contact.moving.items():
-        pose = builder.AddNamedSystem(POSE_OF + name, MovingPose(plant, body))
+        pose = builder.AddNamedSystem(POSE_SIGNAL_PREFIX + name, MovingPose(plant, body))
         builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
-        export(builder, pose, **{POSE_OF + name: "pose"})
+        export_outputs(builder, pose, **{POSE_SIGNAL_PREFIX + name: "pose"})
 
 
 def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
@@ -376,7 +375,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         if not scenario.load_estimator.enabled:
             check_identified("load_estimate", estimate[6:])
     scales = scenario.force_scaling.scales()
-    needed = {*scales.shares} != {scales.gamma}
+    needed = {*scales.as_array} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
             "sigma and gamma differ, but there is no load estimate",

@@ -16,7 +16,7 @@ from drake_teleop.station.channel_side import MakeChannel
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave_side import MakeSlaveOnTrajectory, MakeSlaveSide
-from drake_teleop.station.wiring import record, wire
+from drake_teleop.station.wiring import connect_ports, record_signals
 
 
 def MakeTeleopStation(
@@ -70,16 +70,16 @@ def MakeTeleopStation(
     sides = [master, slave]
     if channel is None and scenario.is_direct and scenario.contact_detection is None:
         # A Diagram of two wires would cost 3 % of the time.
-        setpoint = "leader_joints" if scenario.master.leads_joints else "pose_command"
-        wire(builder, master, setpoint, slave, setpoint)
-        wire(builder, slave, "wrench_B", master, "wrench_command")
+        setpoint = "leader_joints" if scenario.master.is_joint_leader else "pose_command"
+        connect_ports(builder, master, setpoint, slave, setpoint)
+        connect_ports(builder, slave, "wrench_B", master, "wrench_command")
     else:
         channel = builder.AddNamedSystem("channel", channel or MakeChannel(scenario))
         sides.append(channel)
-        wire(builder, master, "pose_command", channel, "pose_command")
-        wire(builder, channel, "pose_to_slave", slave, "pose_command")
-        wire(builder, slave, "wrench_B", channel, "wrench_B")
-        wire(builder, channel, "wrench_to_master", master, "wrench_command")
+        connect_ports(builder, master, "pose_command", channel, "pose_command")
+        connect_ports(builder, channel, "pose_to_slave", slave, "pose_command")
+        connect_ports(builder, slave, "wrench_B", channel, "wrench_B")
+        connect_ports(builder, channel, "wrench_to_master", master, "wrench_command")
         # Inputs of network methods and of contact detection.
         for source, name in (
             (master, "hand_wrench_E"),
@@ -88,16 +88,16 @@ def MakeTeleopStation(
             (slave, "contact"),
         ):
             if channel.HasInputPort(name):
-                wire(builder, source, name, channel, name)
+                connect_ports(builder, source, name, channel, name)
         # Optional for a custom slave: without this port the whole wrench counts as contact.
         if channel.HasInputPort("load_wrench_B") and slave.HasOutputPort("load_wrench_B"):
-            wire(builder, slave, "load_wrench_B", channel, "load_wrench_B")
+            connect_ports(builder, slave, "load_wrench_B", channel, "load_wrench_B")
     if master.HasInputPort("slave_state"):  # for the view of the tool by an operator with a task
-        wire(builder, slave, "slave_state", master, "slave_state")
+        connect_ports(builder, slave, "slave_state", master, "slave_state")
     for name in ("clutch", "intended_pose", "intended_twist"):
         if master.HasInputPort(name):
             builder.ExportInput(master.GetInputPort(name), name)
-    return record(builder, "teleop_station", sides, scenario.rates.log_hz)
+    return record_signals(builder, "teleop_station", sides, scenario.rates.log_hz)
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
@@ -106,7 +106,7 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
     expect(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
     slave = builder.AddNamedSystem("slave_side", MakeSlaveOnTrajectory(scenario, trajectory))
-    return record(builder, "identification_station", (slave,), scenario.rates.log_hz)
+    return record_signals(builder, "identification_station", (slave,), scenario.rates.log_hz)
 
 
 def GetBlock(station: Diagram, name: str) -> System:

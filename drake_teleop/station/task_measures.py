@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.operator.decision import (
-    DONE,
-    FEELING,
-    FELT,
-    MOVING,
-    PHASE,
-    PRESSING,
-    SEEKING,
-    STOPPING,
-    WAITING,
+    CONTACT_PERCEIVED_INDEX,
+    OUTCOME_INDEX,
+    PHASE_APPROACHING,
+    PHASE_INDEX,
+    PHASE_MOVING,
+    PHASE_PRESSING,
+    PHASE_SEARCHING_SLOT,
+    PHASE_STOPPING,
+    PHASE_WAITING,
 )
 from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Task, Touch
 from drake_teleop.station.result import SimulationResult
@@ -29,11 +29,11 @@ Array = NDArray[np.float64]
 
 _FLOOR_TOLERANCE_M = 2e-3  # m
 _PHASE_TEXTS = {
-    MOVING: "moving to the target",
-    FEELING: "approaching the contact",
-    STOPPING: "stopped after contact",
-    PRESSING: "pressing",
-    SEEKING: "searching for the slot",
+    PHASE_MOVING: "moving to the target",
+    PHASE_APPROACHING: "approaching the contact",
+    PHASE_STOPPING: "stopped after contact",
+    PHASE_PRESSING: "pressing",
+    PHASE_SEARCHING_SLOT: "searching for the slot",
 }
 
 
@@ -50,15 +50,19 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
             remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
         )
     state, t, ended = result["task_state"], result.t, _end_sample(result)
-    begun = int(np.argmax(state[:, PHASE] != WAITING))
+    begun = int(np.argmax(state[:, PHASE_INDEX] != PHASE_WAITING))
     span = slice(begun, ended + 1)
-    done = state[ended, DONE] > 0.0
+    done = state[ended, OUTCOME_INDEX] > 0.0
     force = contact_force(result)
-    held = _held_force(t, force, task, ended) if done and isinstance(task, Press) else np.empty(0)
+    held = (
+        _forces_during_hold(t, force, task, ended)
+        if done and isinstance(task, Press)
+        else np.empty(0)
+    )
     wanted = _required_force(task)
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
-    noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
+    noticed, touching = state[span, CONTACT_PERCEIVED_INDEX] > 0.0, force[span] > 0.0
     # The log may start after the start of the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
     success = done and not _failed_criterion(result, scenario, task, ended)
@@ -83,12 +87,12 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     """Return the reason why the task failed (timeout, given up, not achieved); "" after success."""
     task, state, ended = scenario.operator.task, result["task_state"], _end_sample(result)
     assert task is not None
-    at, outcome = float(result.t[ended]), state[ended, DONE]
+    at, outcome = float(result.t[ended]), state[ended, OUTCOME_INDEX]
     if outcome > 0.0:
         wrong = _failed_criterion(result, scenario, task, ended)
         return f"the operator finished at {at:.2f} s, but {wrong}" if wrong else ""
-    phase = int(state[ended if outcome == 0.0 else max(ended - 1, 0), PHASE])
-    if phase == WAITING:
+    phase = int(state[ended if outcome == 0.0 else max(ended - 1, 0), PHASE_INDEX])
+    if phase == PHASE_WAITING:
         return f"the task begins at {task.t_start:g} s, when the simulation has ended"
     taken = at + scenario.simulation.settle - task.t_start
     found = f"{_PHASE_TEXTS[phase]}, {_force_and_position_text(result, scenario, task, ended)}"
@@ -109,7 +113,7 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
 
 
 def _end_sample(result: SimulationResult) -> int:
-    outcome = result["task_state"][:, DONE]
+    outcome = result["task_state"][:, OUTCOME_INDEX]
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 
 
@@ -140,14 +144,14 @@ def _count_false_detections(touching: NDArray[np.bool_], noticed: NDArray[np.boo
     return int(np.count_nonzero(np.diff(noticed[:before].astype(int), prepend=0) == 1))
 
 
-def _held_force(t: Array, force: Array, task: Press, ended: int) -> Array:
+def _forces_during_hold(t: Array, force: Array, task: Press, ended: int) -> Array:
     return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
 
 
 def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
     force = contact_force(result)
     if isinstance(task, Press):
-        held = float(_held_force(result.t, force, task, ended).mean())
+        held = float(_forces_during_hold(result.t, force, task, ended).mean())
         if abs(held - task.force) <= task.tolerance:
             return ""
         return f"the tool pressed with {held:.2f} N, not {task.force:g} ± {task.tolerance:g} N"

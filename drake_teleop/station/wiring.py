@@ -9,32 +9,34 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.regressor import sample_parts
-from drake_teleop.station.signals import LOG, POSE_OF, SIGNALS
+from drake_teleop.load.regressor import signals_of_sample
+from drake_teleop.station.signals import LOG_BLOCK_NAME, POSE_SIGNAL_PREFIX, SIGNALS
 
 #: Ports with several signals, in the order of `SIGNALS`: reading one port is faster than its parts.
 COMBINED_PORTS = {
-    "sample": (*sample_parts(0), "sample_time"),
+    "sample": (*signals_of_sample(0), "sample_time"),
     "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
     "displayed_and_fault": ("force_to_master", "fault_at_hand"),
 }
 
 
-def export(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
+def export_outputs(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
     """Export output ports of a block under their own names, or as `new_name="port"`."""
     for name, port in (dict(zip(names, names, strict=True)) | renamed).items():
         builder.ExportOutput(block.GetOutputPort(port), name)
 
 
-def wire(builder: DiagramBuilder, source: System, name: str, target: System, entry: str) -> None:
+def connect_ports(
+    builder: DiagramBuilder, source: System, name: str, target: System, entry: str
+) -> None:
     """Connect output port `name` of one side to input port `entry` of another.
 
     A DrakeTeleopError is raised if a side lacks the port or the sizes differ.
     """
     output = source.HasOutputPort(name) and source.GetOutputPort(name)
     port = target.HasInputPort(entry) and target.GetInputPort(entry)
-    _check(output, source, f"output port '{name}'")
-    _check(port, target, f"input port '{entry}'")
+    _check_port_size(output, source, f"output port '{name}'")
+    _check_port_size(port, target, f"input port '{entry}'")
     if output.size() != port.size():
         raise DrakeTeleopError(
             f"its output port '{name}' has {output.size()} numbers, {target.get_name()} expects "
@@ -45,7 +47,9 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
     builder.Connect(output, port)
 
 
-def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
+def record_signals(
+    builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float
+) -> Diagram:
     """Export and record the sides' signals at `log_hz`; build the diagram."""
     outputs = {
         port.get_name(): port
@@ -53,7 +57,7 @@ def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz:
         for port in (side.get_output_port(i) for i in range(side.num_output_ports()))
     }
     signals = [name for name in SIGNALS if name in outputs]
-    signals += [name for name in outputs if name.startswith(POSE_OF)]
+    signals += [name for name in outputs if name.startswith(POSE_SIGNAL_PREFIX)]
     for name in signals:
         builder.ExportOutput(outputs[name], name)
     wide = {
@@ -65,13 +69,13 @@ def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz:
     for index, port in enumerate(ports):
         builder.Connect(port, row.get_input_port(index))
     log = LogVectorOutput(row.get_output_port(), builder, 1 / log_hz)
-    log.set_name(LOG)
+    log.set_name(LOG_BLOCK_NAME)
     diagram = builder.Build()
     diagram.set_name(title)
     return diagram
 
 
-def _check(port: Any, side: System, what: str) -> None:
+def _check_port_size(port: Any, side: System, what: str) -> None:
     if not port:
         raise DrakeTeleopError(
             f"there is no {what}",

@@ -24,7 +24,7 @@ from drake_teleop.station.master import phantom
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, read_log
+from drake_teleop.station.simulation import MakeSimulator, read_recorded_signals
 from drake_teleop.station.slave.arm import forward_kinematics, inverse_dynamics, jacobian
 from drake_teleop.station.slave.home import home_position
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
@@ -298,7 +298,7 @@ def test_multipliers_predict_a_slow_decay():
     state = context.get_mutable_discrete_state(0).get_mutable_value()
     state[6:] = np.linalg.solve(phantom.jacobian(state[:6]), [0, 0, 2e-3, 0, 0, 0])
     simulator.AdvanceTo(0.7)
-    height = read_log(simulator, 0.0)["pose_master"][200:, 6]
+    height = read_recorded_signals(simulator, 0.0)["pose_master"][200:, 6]
     assert_same_rate(fitted_rate(height, predicted), predicted)
 
 
@@ -325,7 +325,7 @@ def test_multipliers_predict_growth_over_a_network():
     simulator = MakeSimulator(diagram, scenario.simulation)
     simulator.Initialize()
     simulator.AdvanceTo(2.6)
-    height = read_log(simulator, 2.0)["pose_master"][:, 6]
+    height = read_recorded_signals(simulator, 2.0)["pose_master"][:, 6]
     assert np.ptp(height) < 2 * depth  # permanent contact
     assert_same_rate(fitted_rate(height, predicted), predicted)
 

@@ -13,15 +13,15 @@ from drake_teleop.lab.analysis.cut_loop import cut_loop
 from drake_teleop.lab.analysis.maps import StabilityMap, force_distortion, stability_map
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 JR3 = Sampling(low_pass_hz=500.0)
 MEDIUM = OneAxis()
 LIGHT = replace(
     MEDIUM,
-    hand_mass=GRIPS["light"].mass,
-    hand_damping=GRIPS["light"].damping,
-    hand_stiffness=GRIPS["light"].stiffness,
+    hand_mass=GRIP_IMPEDANCES["light"].mass,
+    hand_damping=GRIP_IMPEDANCES["light"].damping,
+    hand_stiffness=GRIP_IMPEDANCES["light"].stiffness,
 )
 FREE = {"wall_stiffness": 0.0, "wall_damping": 0.0}
 SLOW_HAND = Sampling(hand_hz=500.0, low_pass_hz=500.0)

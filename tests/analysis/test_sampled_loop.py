@@ -38,7 +38,7 @@ from drake_teleop.lab.analysis.period_map import (
     delay_steps,
     sampled_two_port,
 )
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 STATION = Sampling()
 JR3 = Sampling(low_pass_hz=500.0)
@@ -57,7 +57,7 @@ def bench() -> ModuleType:
 
 
 def held(grip: str, **fields: float) -> OneAxis:
-    hand = GRIPS[grip]
+    hand = GRIP_IMPEDANCES[grip]
     axis = OneAxis(hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness)
     return replace(axis, **fields)
 

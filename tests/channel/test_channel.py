@@ -9,13 +9,13 @@ from pydrake.systems.primitives import PassThrough
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel import channel
-from drake_teleop.station.channel.channel import MEMORY_S, Channel, channel_step
+from drake_teleop.station.channel.channel import SLAVE_METHOD_MEMORY, Channel, step_channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.channel_side import MakeChannel, _limit_to_device
+from drake_teleop.station.channel_side import MakeChannel, _limit_method_to_device
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.passivity.memory import HELD_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
@@ -38,7 +38,7 @@ def test_method_is_limited_to_the_force_and_torque_of_the_device(model, share):
     device = scenario.master.device(0.0, 0.0)
     force, torque = device.peak_force, min(device.peak_torque)
     own = PassivityConfig(method="wave", force_limit=share * force, torque_limit=share * torque)
-    limited = _limit_to_device(scenario, own)
+    limited = _limit_method_to_device(scenario, own)
     assert limited.method == "wave"
     assert limited.force_limit == pytest.approx(min(share, 1.0) * force)
     assert limited.torque_limit == pytest.approx(min(share, 1.0) * torque)
@@ -117,9 +117,9 @@ def test_load_wrench_is_transformed_as_the_wrench():
     for name, value in inputs.items():
         block.GetInputPort(name).FixValue(context, value)
     ends = block.EvalUniquePeriodicDiscreteUpdate(context).value(2)
-    held = ends[MEMORY_S][HELD_WRENCH]
+    held = ends[SLAVE_METHOD_MEMORY][HELD_WRENCH]
     assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
-    np.testing.assert_allclose(ends[MEMORY_S][LOAD_WRENCH], 0.5 * held, atol=1e-15)
+    np.testing.assert_allclose(ends[SLAVE_METHOD_MEMORY][LOAD_WRENCH], 0.5 * held, atol=1e-15)
 
 
 def test_packets_in_transit_belong_to_the_context():
@@ -153,8 +153,8 @@ def test_packets_in_transit_belong_to_the_context():
 
 def test_directions_may_differ():
     channel = Channel(delay=0.1, backward=NetworkConfig(delay=0.2))
-    assert [line.delay for line in channel.lines()] == [0.1, 0.2]
-    assert Channel(network="lunar").lines() == (PRESETS["lunar"], PRESETS["lunar"])
+    assert [line.delay for line in channel.networks_of_directions()] == [0.1, 0.2]
+    assert Channel(network="lunar").networks_of_directions() == (PRESETS["lunar"], PRESETS["lunar"])
 
 
 @pytest.mark.parametrize(
@@ -189,20 +189,20 @@ def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
     def failing(method, pose, wrench_B, *rest):
         ends = rest[-4]
         failed = 2 * 800 <= ends[0] < 2 * 1000  # at 2 kHz, after 0.6 s of settling
-        channel_step(method, pose, np.full(6, np.nan) if failed else wrench_B, *rest)
+        step_channel(method, pose, np.full(6, np.nan) if failed else wrench_B, *rest)
 
-    monkeypatch.setattr(channel, "channel_step", failing)
+    monkeypatch.setattr(channel, "step_channel", failing)
     result = run(scenario, load_estimate)
     for name in result:
         values = result[name][:, :4] if name == "ports" else result[name]  # then come ages
         assert np.isfinite(values).all(), name
     t, force = result.t, np.linalg.norm(result["force_to_master"][:, :3], axis=1)
     position = result["pose_received"][:, 4:]
-    safe = (t > 0.2 + 0.01 + STOP_TIME + 0.005) & (t < 0.4)
+    safe = (t > 0.2 + 0.01 + STOP_TIME_S + 0.005) & (t < 0.4)
     assert force[safe].max() < 1e-12
     assert np.ptp(position[safe], axis=0).max() < 1e-12
     # Later the hand feels the tool's inertia at full, which trembles without the failure as well.
-    resumed = t[1:] < 0.4 + 0.01 + RESUME_TIME
+    resumed = t[1:] < 0.4 + 0.01 + RESUME_TIME_S
     assert np.abs(np.diff(result["force_to_master"][:, :3], axis=0))[resumed].max() < 0.5
     fastest = np.abs(np.diff(sound["pose_received"][:, 4:], axis=0)).max()
     assert np.abs(np.diff(position, axis=0)).max() < 2.0 * fastest
@@ -215,9 +215,9 @@ def test_the_timeout_follows_from_the_worse_of_both_directions():
     """1.5 silences of a packet every 0.2 s, from 0.1 s to 1 s, unless configured."""
     slow = NetworkConfig(rate_hz=5.0)
     for one in (Channel(rate_hz=5.0, backward=NetworkConfig()), Channel(backward=slow)):
-        assert one.silent_after(1e-3) == pytest.approx(0.3)
-    waits = [Channel(network=name).silent_after(5e-4) for name in PRESETS]
+        assert one.timeout_s(1e-3) == pytest.approx(0.3)
+    waits = [Channel(network=name).timeout_s(5e-4) for name in PRESETS]
     assert waits[:3] == [0.1] * 3
     assert waits == sorted(waits) and waits[-1] < 0.5
-    assert Channel(rate_hz=1.0).silent_after(1e-3) == 1.0
-    assert Channel(rate_hz=5.0, timeout=0.4).silent_after(1e-3) == 0.4
+    assert Channel(rate_hz=1.0).timeout_s(1e-3) == 1.0
+    assert Channel(rate_hz=5.0, timeout=0.4).timeout_s(1e-3) == 0.4

@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 
 from drake_teleop.station.channel import network
-from drake_teleop.station.channel.channel import MEMORY_S, channel_step, initial_ends
+from drake_teleop.station.channel.channel import (
+    SLAVE_METHOD_MEMORY,
+    initial_state_of_ends,
+    step_channel,
+)
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.memory import DAMPING, HELD_WRENCH, STIFFNESS
-from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters, steps_of
+from drake_teleop.station.passivity.methods import (
+    METHODS,
+    PassivityConfig,
+    method_parameters,
+    steps_of,
+)
 from drake_teleop.station.passivity.packet import PACKET_SIZE
-from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 
 T, STEPS, DELAY = 1e-3, 4000, 0.01
 LIMIT = 5.0
@@ -48,14 +57,14 @@ def hand_position() -> np.ndarray:
 
 def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=np.nan) -> Run:
     """Both ends with a hand that moves as prescribed and a slave behind a servo."""
-    p = parameters(PassivityConfig(method=method, force_limit=LIMIT), [1 / 17.5] * 2)
+    p = method_parameters(PassivityConfig(method=method, force_limit=LIMIT), [1 / 17.5] * 2)
     line = NetworkConfig(delay=DELAY)
-    lines = [network.parameters(line, 0, way, T, least=1) for way in range(2)]
-    states = [network.initial_state(each, np.zeros(PACKET_SIZE)) for each in lines]
+    lines = [network.network_parameters(line, 0, way, T, least=1) for way in range(2)]
+    states = [network.initial_network_state(each, np.zeros(PACKET_SIZE)) for each in lines]
     frame = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1])
     hand = hand_position()
     start = np.array([1.0, 0, 0, 0, hand[0], 0, 0])
-    ends, received, slave = initial_ends(method, p, start), start.copy(), start.copy()
+    ends, received, slave = initial_state_of_ends(method, p, start), start.copy(), start.copy()
     ports, felt, velocity = np.zeros(8), np.zeros(7), 0.0
     found = Run(
         np.arange(STEPS) * T, hand, *(np.zeros((STEPS, n)) for n in (7, 7, 8, 2)), np.zeros(STEPS)
@@ -76,14 +85,14 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
             inputs[fault][:] = bad
         if now and fault == "saturated":
             inputs["slave_wrench"][:] = 1e3
-        channel_step(
+        step_channel(
             steps_of(method), *inputs.values(), now and fault == "saturated",
             float(wall < 0.0), T, TIMEOUT, frame, p, *lines, *states, ends, received, ports, felt,
         )  # fmt: skip
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
         pull = p[STIFFNESS][0] * (received[4] - slave[4]) - p[DAMPING][0] * velocity
-        found.servo[k] = pull, ends[MEMORY_S][HELD_WRENCH][0]
+        found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][HELD_WRENCH][0]
     return found
 
 
@@ -112,10 +121,10 @@ def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):
     # No step, of force or of the command, that the sound run does not have.
     assert np.abs(np.diff(f)).max() < 0.5
     missed = np.ptp(faulty.hand[(t > FAULT[0]) & (t < FAULT[1])])
-    fastest = np.abs(np.diff(sound.command[:, 4])).max() + 2.0 * missed * T / RESUME_TIME
+    fastest = np.abs(np.diff(sound.command[:, 4])).max() + 2.0 * missed * T / RESUME_TIME_S
     assert np.abs(np.diff(x)).max() < 1.5 * fastest
     # The safe state of both ends.
-    safe = (t > FAULT[0] + DELAY + STOP_TIME + 0.005) & (t < FAULT[1])
+    safe = (t > FAULT[0] + DELAY + STOP_TIME_S + 0.005) & (t < FAULT[1])
     if fault != "saturated":
         assert np.abs(f[safe]).max() < 1e-12
         assert np.ptp(x[safe]) < 1e-12
@@ -138,9 +147,9 @@ def test_the_hand_fades_in_50_ms_and_not_at_once():
     found = run("none", "slave_wrench")
     f = found.felt[:, 0]
     told = round((FAULT[0] + DELAY) / T) + 2
-    fade = np.abs(f[told : told + round(STOP_TIME / T) + 2])
+    fade = np.abs(f[told : told + round(STOP_TIME_S / T) + 2])
     assert (np.diff(fade) <= 0.0).all()
-    assert np.abs(np.diff(fade)).max() < 2.5 * fade[0] * T / STOP_TIME
+    assert np.abs(np.diff(fade)).max() < 2.5 * fade[0] * T / STOP_TIME_S
     assert fade[-1] < 1e-12
 
 
@@ -151,7 +160,7 @@ def test_last_valid_wrench_is_rendered_while_the_sensor_is_saturated():
     t, f = found.t, found.felt[:, 0]
     held = f[(t > span[0] + 2 * DELAY) & (t < span[1])]
     assert np.ptp(held) < 1e-12 and abs(held[0]) > 1.0
-    back = f[(t > span[1]) & (t < span[1] + DELAY + STOP_TIME + 0.01)]
+    back = f[(t > span[1]) & (t < span[1] + DELAY + STOP_TIME_S + 0.01)]
     assert np.abs(np.diff(back)).max() < 0.1
     assert abs(back[-1]) < 0.1
 
@@ -161,6 +170,6 @@ def test_motor_ledger_uses_the_command_after_the_safe_state(method):
     """In the safe state and while it ends, this differs from the method's command."""
     found = run(method, "hand_wrench")
     t = found.t
-    changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME_TIME)
+    changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME_TIME_S)
     assert np.abs(found.servo[changed, 0]).max() > 0.1
     np.testing.assert_allclose(found.servo[:, 1], found.servo[:, 0], atol=1e-6)

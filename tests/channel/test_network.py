@@ -18,15 +18,15 @@ from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import (
     BACKWARD,
     FORWARD,
-    LONGEST_EXTRAPOLATION,
+    MAX_EXTRAPOLATION_S,
     PRESETS,
     NetworkConfig,
-    initial_state,
+    initial_network_state,
+    network_parameters,
     newest_packets,
     packet_delays,
-    parameters,
-    receive,
-    send,
+    receive_packet,
+    send_packet,
 )
 from drake_teleop.station.passivity.packet import (
     ENERGY,
@@ -74,17 +74,17 @@ seeds = st.integers(0, 2**63 - 1)
 @njit
 def _exchange(p, state, packets, received, newest, fresh):
     for k in range(len(packets)):
-        send(p, state, k, packets[k])
-        newest[k], fresh[k] = receive(p, state, k, received[k])
+        send_packet(p, state, k, packets[k])
+        newest[k], fresh[k] = receive_packet(p, state, k, received[k])
 
 
 def exchange(config: NetworkConfig, packets: np.ndarray, seed=0, neutral=None):
     """The step form over all packets: what is received, the newest step, whether it is new."""
-    p = parameters(config, seed, FORWARD, PERIOD)
+    p = network_parameters(config, seed, FORWARD, PERIOD)
     neutral = np.zeros(packets.shape[1]) if neutral is None else neutral
     received, newest = np.empty_like(packets), np.empty(len(packets), int)
     fresh = np.empty(len(packets), bool)
-    _exchange(p, initial_state(p, neutral), packets, received, newest, fresh)
+    _exchange(p, initial_network_state(p, neutral), packets, received, newest, fresh)
     return received, newest, fresh
 
 
@@ -169,9 +169,9 @@ def test_duplicates_only_ever_bring_a_packet_sooner(config, seed):
 @example(NetworkConfig(), 0)
 def test_no_packet_is_received_before_the_least_delay(config, seed):
     packets, least = random_packets(200), 3
-    p = parameters(config, seed, FORWARD, PERIOD, least)
+    p = network_parameters(config, seed, FORWARD, PERIOD, least)
     received, newest, fresh = np.empty_like(packets), np.empty(200, int), np.empty(200, bool)
-    _exchange(p, initial_state(p, np.zeros(PACKET_SIZE)), packets, received, newest, fresh)
+    _exchange(p, initial_network_state(p, np.zeros(PACKET_SIZE)), packets, received, newest, fresh)
     assert (newest <= np.maximum(np.arange(200) - least, -1)).all()
     np.testing.assert_array_equal(received[newest >= 0], packets[newest[newest >= 0]])
     if config == NetworkConfig():
@@ -285,7 +285,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
     config = NetworkConfig(
         delay=0.1, jitter=0.5, distribution=distribution, loss=0.2, burst_loss=0.5, duplicate=0.7
     )
-    p, taken = parameters(config, 0, FORWARD, PERIOD), []
+    p, taken = network_parameters(config, 0, FORWARD, PERIOD), []
 
     def uniform(p, k, draw):
         taken.append((k, draw))
@@ -405,13 +405,13 @@ def test_every_preset_is_named_here():
 
 def lonely(silence: str, silent: int) -> tuple[np.ndarray, np.ndarray]:
     """A packet that moves and turns, and what is read so many steps after it, the last one."""
-    p = parameters(NetworkConfig(silence=silence, rate_hz=1.0), 0, FORWARD, PERIOD)
+    p = network_parameters(NetworkConfig(silence=silence, rate_hz=1.0), 0, FORWARD, PERIOD)
     packet = random_packets(1)[0]
     packet[POSE][:4] /= np.linalg.norm(packet[POSE][:4])
-    state, received = initial_state(p, np.zeros(PACKET_SIZE)), np.empty(PACKET_SIZE)
+    state, received = initial_network_state(p, np.zeros(PACKET_SIZE)), np.empty(PACKET_SIZE)
     for k in range(silent + 1):
-        send(p, state, k, packet if k == 0 else np.full(PACKET_SIZE, np.nan))
-        newest, fresh = receive(p, state, k, received)
+        send_packet(p, state, k, packet if k == 0 else np.full(PACKET_SIZE, np.nan))
+        newest, fresh = receive_packet(p, state, k, received)
         assert newest == 0 and fresh == (k == 0)
     return packet, received
 
@@ -424,13 +424,13 @@ def test_silence(silence, silent):
     if silent and silence == "zero":
         expected[VELOCITY] = expected[WRENCH] = expected[LOAD] = 0.0
     if silent and silence == "extrapolate":
-        time = min(silent * PERIOD, LONGEST_EXTRAPOLATION)
+        time = min(silent * PERIOD, MAX_EXTRAPOLATION_S)
         v, w = packet[VELOCITY][:3], packet[VELOCITY][3:]
         expected[POSE][:4] = quaternion_product(
             quaternion_exponential(tuple(w * time)), tuple(packet[POSE][:4])
         )
         expected[POSE][4:] += v * time
-        if silent * PERIOD > LONGEST_EXTRAPOLATION:
+        if silent * PERIOD > MAX_EXTRAPOLATION_S:
             expected[VELOCITY] = 0.0
     np.testing.assert_allclose(received, expected, rtol=0, atol=1e-14)
     # Whatever the policy, counters and integrals stand still: silence brings no energy.
@@ -439,13 +439,13 @@ def test_silence(silence, silent):
 
 
 def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first():
-    p = parameters(NetworkConfig(), 0, FORWARD, PERIOD)
+    p = network_parameters(NetworkConfig(), 0, FORWARD, PERIOD)
     packets, received = random_packets(3), np.zeros(PACKET_SIZE)
-    state = initial_state(p, np.zeros(LOAD.start))
-    assert len(state[1]) < len(initial_state(p, np.zeros(PACKET_SIZE))[1])
+    state = initial_network_state(p, np.zeros(LOAD.start))
+    assert len(state[1]) < len(initial_network_state(p, np.zeros(PACKET_SIZE))[1])
     for k, packet in enumerate(packets):
-        send(p, state, k, packet)
-        receive(p, state, k, received)
+        send_packet(p, state, k, packet)
+        receive_packet(p, state, k, received)
         np.testing.assert_array_equal(received[: LOAD.start], packet[: LOAD.start])
         assert not received[LOAD].any()
 
@@ -503,7 +503,7 @@ def test_losses_add_to_those_of_a_trace(tmp_path):
 )
 def test_invalid_trace_is_rejected_with_file_column_and_row(tmp_path, text, named):
     with pytest.raises(DrakeTeleopError) as error:
-        parameters(write_trace(tmp_path / "net.csv", text), 0, FORWARD, PERIOD)
+        network_parameters(write_trace(tmp_path / "net.csv", text), 0, FORWARD, PERIOD)
     message = str(error.value)
     assert "\n" not in message
     for word in named:
@@ -512,7 +512,7 @@ def test_invalid_trace_is_rejected_with_file_column_and_row(tmp_path, text, name
 
 def test_missing_trace_file_is_named():
     with pytest.raises(DrakeTeleopError, match=r"nowhere\.csv: no such file"):
-        parameters(NetworkConfig(trace="nowhere.csv"), 0, FORWARD, PERIOD)
+        network_parameters(NetworkConfig(trace="nowhere.csv"), 0, FORWARD, PERIOD)
 
 
 # The configuration.
@@ -534,7 +534,7 @@ def test_missing_trace_file_is_named():
 )
 def test_invalid_values_are_rejected(change, named):
     with pytest.raises(DrakeTeleopError, match=f"^{named}: "):
-        parameters(NetworkConfig(**change), 0, FORWARD, PERIOD)
+        network_parameters(NetworkConfig(**change), 0, FORWARD, PERIOD)
 
 
 def test_it_loads_from_yaml():

@@ -28,7 +28,7 @@ from drake_teleop.lab.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.slave.joint_control import JointControlConfig
 
@@ -37,7 +37,7 @@ DEVICE_MASS, DEVICE_DAMPING = 0.15, 0.5
 
 def held(grip: str, **changes: float) -> OneDof:
     """Return a hand on a device without friction, and an ideal servo."""
-    hand = GRIPS[grip]
+    hand = GRIP_IMPEDANCES[grip]
     return OneDof(
         hand_mass=hand.mass,
         hand_damping=hand.damping + DEVICE_DAMPING,
@@ -79,7 +79,7 @@ def longest_round_trip(model: OneDof, rest: float, low: int, high: int) -> int:
 
 def contact_limit(grip: str, wall: float) -> float:
     """Return the least RTT [s] with an imaginary root of m s^2 + b s + k + K e^(-s RTT)."""
-    hand = GRIPS[grip]
+    hand = GRIP_IMPEDANCES[grip]
     m, b, k, K = hand.mass + DEVICE_MASS, hand.damping + DEVICE_DAMPING, hand.stiffness, wall / 17.5
 
     def excess(w: float) -> float:
@@ -102,7 +102,7 @@ def test_longest_delay_in_contact_equals_closed_form(grip, wall):
 
 def free_windows(grip: str) -> list[float]:
     """Return RTT [s] with imaginary roots of m s^2 + b s + k + mu s^2 e^(-s RTT)."""
-    hand = GRIPS[grip]
+    hand = GRIP_IMPEDANCES[grip]
     m, b, k, mu = (
         hand.mass + DEVICE_MASS,
         hand.damping + DEVICE_DAMPING,
@@ -138,7 +138,7 @@ def test_light_hand_has_an_unstable_window_in_free_motion():
 
 
 def test_default_hand_and_servo_are_those_of_the_station():
-    hand, servo, model = GRIPS["medium"], JointControlConfig(), OneDof()
+    hand, servo, model = GRIP_IMPEDANCES["medium"], JointControlConfig(), OneDof()
     assert (model.hand_mass, model.hand_damping) == (hand.mass, hand.damping)
     assert model.hand_stiffness == hand.stiffness
     assert model.position_gain == 2 * math.pi * servo.position_bandwidth_hz

@@ -14,13 +14,17 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.point_contact import ContactPairs, contact_force, indentation
+from drake_teleop.station.environment.point_contact import (
+    ContactPairs,
+    contact_force,
+    depth_of_sphere_in_box,
+)
 from drake_teleop.station.environment.slot import (
     PEG_RADIUS,
-    TIP_BALL,
-    UPPER_BALL,
+    TIP_BALL_CENTRE_Z,
+    UPPER_BALL_CENTRE_Z,
     Slot,
-    _boxes,
+    _boxes_of_slot,
 )
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import LoadScenario, replace
@@ -64,7 +68,7 @@ def test_the_peg_is_the_tools_ball_and_another_of_its_size():
     inspector = scene_graph.model_inspector()
     balls = plant.GetCollisionGeometriesForBody(plant.get_body(tool))
     centres = [inspector.GetPoseInFrame(ball).translation() for ball in balls]
-    np.testing.assert_array_equal(centres, [[0, 0, TIP_BALL], [0, 0, UPPER_BALL]])
+    np.testing.assert_array_equal(centres, [[0, 0, TIP_BALL_CENTRE_Z], [0, 0, UPPER_BALL_CENTRE_Z]])
     for ball in balls:
         assert isinstance(inspector.GetShape(ball), Sphere)
         assert inspector.GetShape(ball).radius() == PEG_RADIUS
@@ -76,7 +80,7 @@ def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
     corners = np.array(list(product([-0.5, 0.5], repeat=3)))
     lowest = min(
         (slot.X_WM @ pose @ (corners * box.size()).T)[2].min()
-        for pose, box in _boxes(slot).values()
+        for pose, box in _boxes_of_slot(slot).values()
     )
     assert slot.foot == pytest.approx(lowest, abs=1e-12)
     assert slot.stand[2:] == (0.5, -0.2, slot.foot)
@@ -138,7 +142,8 @@ def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
     expected = PEG_RADIUS - distance_to(corners, np.array([abs(across), height]))
     normal = np.empty(6)
     deepest = max(
-        indentation(pair, centre_W, np.eye(3), 0.0, normal) for pair in pairs_of_a_ball(slot)
+        depth_of_sphere_in_box(pair, centre_W, np.eye(3), 0.0, normal)
+        for pair in pairs_of_a_ball(slot)
     )
     if expected > 0.0:
         assert deepest == pytest.approx(expected, abs=1e-9)
@@ -170,14 +175,21 @@ def wrench_at(slave, angle: float, shift: float) -> np.ndarray:
     """
     tilt = RotationMatrix.MakeXRotation(angle)
     R_WS = tilt @ R_WS_HOME
-    middle_S = [0.0, 0.0, (TIP_BALL + UPPER_BALL) / 2]
+    middle_S = [0.0, 0.0, (TIP_BALL_CENTRE_Z + UPPER_BALL_CENTRE_Z) / 2]
     p_WS = np.array([0.55, shift, 0.2 - 0.02]) - R_WS.matrix() @ middle_S
     arm, wrench = slave.arm, np.empty(6)
     near = slave.plant.GetDefaultPositions(slave.instance)
     q, status = nearest_branch(R_WS.matrix(), p_WS, near, arm.lower, arm.upper)
     assert status == IkStatus.OK
     environment_wrench(
-        arm.table, *slave.contact.law, np.zeros(6), q, 0 * q, np.zeros(2), np.zeros(0), wrench
+        arm.table,
+        *slave.contact.compiled_law_arguments,
+        np.zeros(6),
+        q,
+        0 * q,
+        np.zeros(2),
+        np.zeros(0),
+        wrench,
     )
     return wrench
 
@@ -192,7 +204,7 @@ def test_an_upright_peg_has_its_play_and_then_both_balls_touch():
 
 def test_peg_tilted_beyond_its_clearance_jams():
     """The walls act on the balls as a couple against the tilt, without a force."""
-    slave, apart = slave_at(DEEP), TIP_BALL - UPPER_BALL
+    slave, apart = slave_at(DEEP), TIP_BALL_CENTRE_Z - UPPER_BALL_CENTRE_Z
     play = np.arcsin(DEEP.clearance / apart)
     assert not wrench_at(slave, 0.99 * play, 0.0).any()
     for angle in (1.5 * play, -1.5 * play):
@@ -247,7 +259,7 @@ def test_contact_only_takes_energy_from_the_tool(inserted):
 def test_the_replay_shows_the_slot_where_it_is_and_the_peg_in_it(inserted, meshcat):
     scenario, result = inserted
     scene = ReplayScene(meshcat, scenario, result)
-    scene.show(0.0, result, len(result.t) - 1)
+    scene.show_sample(0.0, result, len(result.t) - 1)
     slot = scene.plant.GetBodyByName("slot").EvalPoseInWorld(scene.context)
     np.testing.assert_allclose(slot.translation(), scenario.slot.position)
     assert len(scene.plant.GetVisualGeometriesForBody(scene.plant.GetBodyByName("slot"))) == 7

@@ -18,11 +18,11 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.run_summary import ScenarioRun, summarise
-from drake_teleop.station.environment.environment import Several
+from drake_teleop.station.environment.environment import SeveralObjects
 from drake_teleop.station.environment.moving_bodies import (
     JointTable,
-    bodies_into,
-    interpolate_bodies,
+    interpolate_joint_state,
+    poses_and_twists_into,
 )
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.solids import Block, Box, Wall
@@ -33,9 +33,9 @@ from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
-    FAR,
-    TOUCHING,
-    WATCHED,
+    PROXIMITY_FAR,
+    PROXIMITY_NEAR_MONITORED,
+    PROXIMITY_TOUCHING,
     environment_wrench,
     tool_proximity,
 )
@@ -59,7 +59,7 @@ SOFT_PAD = """
 
 def test_walls_and_boxes_follow_drakes_contact_law():
     """In a corner of a soft rough floor, a stiff smooth wall and a tilted box."""
-    corner = Several(
+    corner = SeveralObjects(
         [
             Wall(position=[0.55, 0.0, 0.2], stiffness=3e3, dissipation=4.0, friction=0.7),
             Wall(position=[0.567, 0.0, 0.2], normal=[-1.0, 0.0, 0.2], stiffness=7e5, friction=0.1),
@@ -80,7 +80,14 @@ def test_walls_and_boxes_follow_drakes_contact_law():
         results = plant.get_contact_results_output_port().Eval(context)
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
-            slave.arm.table, *slave.contact.law, np.zeros(6), q, v, np.zeros(2), np.zeros(0), found
+            slave.arm.table,
+            *slave.contact.compiled_law_arguments,
+            np.zeros(6),
+            q,
+            v,
+            np.zeros(2),
+            np.zeros(0),
+            found,
         )
         expected = contact_wrench_W(results, slave.contact.bodies, slave.contact.shapes)
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
@@ -109,7 +116,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
     """A block that tips over, and a drawer that slides in a rotating door."""
     (tmp_path / "cabinet.sdf").write_text(CABINET)
     cabinet = Scene(file=str(tmp_path / "cabinet.sdf"), position=[0.4, 0.0, 0.1])
-    both = Several([Block(position=[0.5, 0.0, 0.0], friction=0.6), cabinet])
+    both = SeveralObjects([Block(position=[0.5, 0.0, 0.0], friction=0.6), cabinet])
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, Slave(position=[0.6, 0.0, 0.4]), both)
     root = builder.Build().CreateDefaultContext()
@@ -130,7 +137,11 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
         arm = [get(context, slave.instance) for get in (plant.GetPositions, plant.GetVelocities)]
         state = plant.GetPositionsAndVelocities(context)
         environment_wrench(
-            *(slave.arm.table, *slave.contact.law, np.zeros(6)), *arm, np.zeros(2), state, found
+            *(slave.arm.table, *slave.contact.compiled_law_arguments, np.zeros(6)),
+            *arm,
+            np.zeros(2),
+            state,
+            found,
         )
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
         touched.add((bool(k % 2), bool(expected.any())))
@@ -140,7 +151,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
 
 def test_between_two_states_bodies_move_on_smoothly():
     """A body that rotates about two axes, at a half and a third of a step."""
-    plant = AddSlavePlant(DiagramBuilder(), Slave(), Several([Block(), Scene()])).plant
+    plant = AddSlavePlant(DiagramBuilder(), Slave(), SeveralObjects([Block(), Scene()])).plant
     bodies = [plant.GetBodyByName(name).index() for name in ("block", "door")]
     (joints, order), h = JointTable(plant, bodies), 0.002
     assert order == [int(body) for body in bodies]
@@ -159,10 +170,10 @@ def test_between_two_states_bodies_move_on_smoothly():
 
     for u in (1 / 3, 0.5):
         start, end, found = state(0.1), state(0.1 + h), state(0.1)
-        interpolate_bodies(joints, h, u, start, end, found)
+        interpolate_joint_state(joints, h, u, start, end, found)
         poses, expected = np.empty((2, 2, 13))
-        bodies_into(joints, found, poses)
-        bodies_into(joints, state(0.1 + u * h), expected)
+        poses_and_twists_into(joints, found, poses)
+        poses_and_twists_into(joints, state(0.1 + u * h), expected)
         np.testing.assert_allclose(poses[:, :7], expected[:, :7], atol=1e-9)
         np.testing.assert_allclose(poses[:, 7:], expected[:, 7:], atol=2e-6)
 
@@ -214,7 +225,7 @@ def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
         return
     # Its log has the leaf, and no other body moves.
     assert station.HasOutputPort("sheet_state")
-    assert "leaf is not alone" in sensor.beyond
+    assert "leaf is not alone" in sensor.reason_beyond_contact_law
 
 
 def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
@@ -259,14 +270,19 @@ def test_separation_of_tool_and_unmodelled_shapes():
     slave = Slave(position=[0.5, 0.0, 0.45], tool=Tool(mass=1.0, shapes=shapes))
     wall = Wall(position=[0.5, 0.0, 0.0])
     built, found = AddSlavePlant(DiagramBuilder(), slave, wall), []
-    pairs, joints = built.contact.law
+    pairs, joints = built.contact.compiled_law_arguments
     for height in (0.2499, 0.2501, 0.3279, 0.3281):
         rows = [pairs.copy(), built.contact.watched.copy()]
         for row in rows:
             row[:, 15] += height
         nothing = np.zeros(2)
         found.append(tool_proximity(built.arm.table, *rows, joints, built.start, nothing, nothing))
-    assert found == [FAR, TOUCHING, TOUCHING, WATCHED]  # from 0.45 - 0.1 - 0.002 - 0.02
+    assert found == [
+        PROXIMITY_FAR,
+        PROXIMITY_TOUCHING,
+        PROXIMITY_TOUCHING,
+        PROXIMITY_NEAR_MONITORED,
+    ]  # from 0.45 - 0.1 - 0.002 - 0.02
 
 
 @pytest.mark.long
@@ -318,7 +334,7 @@ def test_replay_shows_moving_bodies_at_their_poses(tmp_path, meshcat):
         "load_estimate": np.zeros((1, 16)),
     }
     scene = ReplayScene(meshcat, scenario, still | poses)
-    scene.show(0.0, still | poses, 0)
+    scene.show_sample(0.0, still | poses, 0)
     for name, pose in poses.items():
         body = scene.plant.GetBodyByName(name.removeprefix("pose_of_"))
         X_WBody = body.EvalPoseInWorld(scene.context)

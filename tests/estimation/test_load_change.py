@@ -8,15 +8,15 @@ from scipy.signal import sosfilt
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.online.change import (
-    CHANGED,
-    IDENTIFIED,
-    KNOWN,
-    change_memory,
-    change_parameters,
-    identified_load,
-    watch_load,
+    STATE_CHANGED,
+    STATE_IDENTIFIED,
+    STATE_KNOWN,
+    change_detector_parameters,
+    detector_states_of_log,
+    identified_or_known_load,
+    initial_change_memory,
 )
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig, butterworth_sections
@@ -55,20 +55,22 @@ def parts(rows):
 @pytest.fixture(scope="module")
 def tool():
     s, omega, alpha = np.split(SENSOR.motion_std(), 3)
-    noise = Noise(SENSOR.wrench_std(), s, omega, alpha)
+    noise = NoiseStd(SENSOR.wrench_std(), s, omega, alpha)
     return identify_batch(*parts(samples(99)), method="total", noise=noise).identification
 
 
 def watch(tool, rows, period):
     """Return the states (N,) and the identified load."""
-    parameters = change_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), period)
-    memory = change_memory(np.concatenate([tool.offsets, tool.phi]), tool.covariance)
-    return watch_load(memory, parameters, *parts(rows)), identified_load(memory, tool)
+    parameters = change_detector_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), period)
+    memory = initial_change_memory(np.concatenate([tool.offsets, tool.phi]), tool.covariance)
+    return detector_states_of_log(memory, parameters, *parts(rows)), identified_or_known_load(
+        memory, tool
+    )
 
 
 def test_no_alarm_in_free_motion(tool):
     for seed in range(3):
-        assert watch(tool, samples(seed), 1 / RATE)[0].max() == KNOWN
+        assert watch(tool, samples(seed), 1 / RATE)[0].max() == STATE_KNOWN
 
 
 @pytest.mark.parametrize("keep", [1, 8])
@@ -76,8 +78,8 @@ def test_a_grasp_at_8_and_at_1_khz(tool, keep):
     """The given noise is that before the filter, at either rate."""
     for seed in range(3):
         states, load = watch(tool, samples(seed, grasp=True)[::keep], keep / RATE)
-        assert states[: int(EVENT * RATE / keep)].max() == KNOWN
-        after = np.argmax(states >= CHANGED) * keep / RATE - EVENT
+        assert states[: int(EVENT * RATE / keep)].max() == STATE_KNOWN
+        after = np.argmax(states >= STATE_CHANGED) * keep / RATE - EVENT
         assert 0.0 < after < 0.5
-        assert states[-1] == IDENTIFIED
+        assert states[-1] == STATE_IDENTIFIED
         assert load.mass - tool.mass == pytest.approx(0.8, rel=0.01)

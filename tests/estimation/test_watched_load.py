@@ -9,23 +9,28 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.change import change_parameters
+from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
 from drake_teleop.load.online.watched import (
-    DISTURBED,
     FADE_TIME_S,
-    LEARNING,
-    OTHER_LOAD,
-    SETTLED,
-    watched_memory,
-    watched_state,
-    watched_update,
+    STATE_DISTURBED,
+    STATE_LEARNING,
+    STATE_OTHER_LOAD,
+    STATE_SETTLED,
+    initial_monitor_memory,
+    monitor_load,
+    monitor_state,
 )
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig, Sine
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+    simulate,
+)
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import GetBlock, MakeIdentificationStation, MakeTeleopStation
 
@@ -82,10 +87,10 @@ def grasped():
     station = MakeIdentificationStation(SCENARIO, TRAJECTORY)
     simulator = MakeSimulator(station, SCENARIO.simulation)
     simulator.Initialize()
-    advance(simulator, GRASP)
+    advance_without_garbage_collection(simulator, GRASP)
     grasp(station, simulator)
-    advance(simulator, SCENARIO.simulation.duration)
-    return read_log(simulator, 0.0)
+    advance_without_garbage_collection(simulator, SCENARIO.simulation.duration)
+    return read_recorded_signals(simulator, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -105,11 +110,11 @@ def first(result, state, after=0.0):
 
 @pytest.mark.slow
 def test_it_settles_and_freezes(grasped, tool):
-    settled = first(grasped, SETTLED)
+    settled = first(grasped, STATE_SETTLED)
     assert 0.1 < settled < 1.5
     during = (grasped.t >= settled) & (grasped.t < GRASP)
-    assert (grasped["load_state"][during] == SETTLED).all()
-    assert (grasped["load_state"][grasped.t < settled] == LEARNING).all()
+    assert (grasped["load_state"][during] == STATE_SETTLED).all()
+    assert (grasped["load_state"][grasped.t < settled] == STATE_LEARNING).all()
     estimate = grasped["load_estimate"][during]
     np.testing.assert_array_equal(
         estimate[:, 6:], np.broadcast_to(estimate[0, 6:], (len(estimate), 10))
@@ -122,25 +127,25 @@ def test_it_settles_and_freezes(grasped, tool):
 @pytest.mark.slow
 def test_grasp_is_detected_and_the_object_identified(grasped):
     """The change is detected within half a second, the new load soon after."""
-    assert first(grasped, DISTURBED) - GRASP < 0.05
-    changed = first(grasped, OTHER_LOAD)
+    assert first(grasped, STATE_DISTURBED) - GRASP < 0.05
+    changed = first(grasped, STATE_OTHER_LOAD)
     assert changed - GRASP < 0.5
-    again = first(grasped, SETTLED, changed)
+    again = first(grasped, STATE_SETTLED, changed)
     assert changed < again < changed + 2.0
     before, after = (grasped["load_estimate"][k, 6:] for k in (2900, -1))
     assert (after - before)[0] == pytest.approx(MASS, rel=0.01)
     found = (after - before)[1:4] / (after - before)[0]
     np.testing.assert_allclose(found, COM, atol=2e-3)
-    assert grasped["load_state"][-1] == SETTLED
+    assert grasped["load_state"][-1] == STATE_SETTLED
 
 
 @pytest.mark.slow
 def test_estimate_changes_without_a_step(grasped):
     """Between two loads nothing is eliminated; each sample moves the estimate by 1 %."""
     phi = grasped["load_estimate"][:, 6:]
-    faded = phi[grasped.t < first(grasped, SETTLED, first(grasped, OTHER_LOAD))][-1]
+    faded = phi[grasped.t < first(grasped, STATE_SETTLED, first(grasped, STATE_OTHER_LOAD))][-1]
     assert np.abs(faded[0]) < 0.01 * phi[2900, 0]
-    watched = grasped.t > first(grasped, SETTLED) + 0.01
+    watched = grasped.t > first(grasped, STATE_SETTLED) + 0.01
     steps = np.abs(np.diff(phi[watched], axis=0))
     assert (steps <= 1e-3 / FADE_TIME_S * np.ptp(phi[watched], axis=0) * 1.02).all()
 
@@ -163,14 +168,18 @@ def test_contacts_are_not_a_change_of_load(known):
         operator=OperatorConfig(grip="firm", intent=[press, sway]),
         simulation__duration=2.6,
     )
-    for scenario, last in ((touch, SETTLED), (hold, DISTURBED), (slide, DISTURBED)):
+    for scenario, last in (
+        (touch, STATE_SETTLED),
+        (hold, STATE_DISTURBED),
+        (slide, STATE_DISTURBED),
+    ):
         station = MakeTeleopStation(scenario, load_estimate=known[0], load_covariance=known[1])
         result = simulate(station, scenario.simulation)
         states = result["load_state"][:, 0]
-        assert states[0] == SETTLED and states[-1] == last
-        assert set(states) == {SETTLED, DISTURBED}
+        assert states[0] == STATE_SETTLED and states[-1] == last
+        assert set(states) == {STATE_SETTLED, STATE_DISTURBED}
         touched = np.any(result["true_contact_wrench_W"] != 0.0, axis=1)
-        assert result.t[states == DISTURBED][0] - result.t[touched][0] < 0.1
+        assert result.t[states == STATE_DISTURBED][0] - result.t[touched][0] < 0.1
         np.testing.assert_array_equal(
             result["load_estimate"][:, 6:], np.broadcast_to(known[0][6:], (len(states), 10))
         )
@@ -188,13 +197,13 @@ def at_rest(theta, added, seed):
 def watch(known, rows, fallback=None):
     """What is handed out (N, 16), and the states (N,)."""
     theta, covariance = known
-    out, memory = theta.copy(), watched_memory(theta, covariance)
-    options = change_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), 1e-3)
+    out, memory = theta.copy(), initial_monitor_memory(theta, covariance)
+    options = change_detector_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), 1e-3)
     handed, states = np.empty((len(rows), 16)), np.empty(len(rows))
     rest = np.zeros(10) if fallback is None else fallback
     for k, row in enumerate(rows):
-        watched_update(out, memory, row, rest, 1e-3, *options)
-        handed[k], states[k] = out, watched_state(memory)
+        monitor_load(out, memory, row, rest, 1e-3, *options)
+        handed[k], states[k] = out, monitor_state(memory)
     return handed, states
 
 
@@ -203,7 +212,7 @@ def test_offsets_are_kept_at_rest(known):
     t = np.arange(0.0, 30.0, 1e-3)[:, None]
     drift = t / 30.0 * np.array([1.5, -1.0, 1.5, 0.05, -0.05, 0.05])
     handed, states = watch(known, at_rest(known[0], drift, 0))
-    assert (states == SETTLED).all()
+    assert (states == STATE_SETTLED).all()
     wrong = handed[-1, :6] - known[0][:6] - drift[-1]
     assert (np.abs(wrong) < 0.15 * np.abs(drift[-1]) + np.repeat([0.05, 0.002], 3)).all()
     np.testing.assert_allclose(handed[-1, 6:], known[0][6:], rtol=1e-12)
@@ -213,8 +222,8 @@ def test_a_push_at_rest_is_neither_an_offset_nor_a_load(known):
     added = np.zeros((6000, 6))
     added[1000:] = [0.0, -1.5, -4.67, 0.3, 0.0, 0.0]  # along gravity, as half a kilogram would pull
     handed, states = watch(known, at_rest(known[0], added, 1))
-    assert states[900] == SETTLED
-    assert (states[1100:] == DISTURBED).all()
+    assert states[900] == STATE_SETTLED
+    assert (states[1100:] == STATE_DISTURBED).all()
     assert (np.abs(handed[-1, :6] - known[0][:6]) < np.repeat([0.1, 0.005], 3)).all()
     np.testing.assert_allclose(handed[-1, 6:], known[0][6:], rtol=1e-12)
 
@@ -225,7 +234,7 @@ def test_known_gripper_stays_eliminated(known, grasped):
     rows = np.hstack([grasped[name] for name in (*names, "angular_acceleration_S")])[2500:]
     gripper = 0.5 * known[0][6:]
     handed, states = watch(known, rows, gripper)
-    faded = handed[states == OTHER_LOAD][-1, 6]
+    faded = handed[states == STATE_OTHER_LOAD][-1, 6]
     assert faded == pytest.approx(gripper[0], rel=0.02)
     assert handed[-1, 6] == pytest.approx(known[0][6] + MASS, rel=0.01)
 

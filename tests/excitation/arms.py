@@ -131,7 +131,7 @@ class Recording:
     Attributes:
         t: (N,) [s], from 0.2 s before the trajectory to 0.2 s after it.
         q: (N, n) joint angles [rad].
-        truth: (N, 15 + n) input of a sensor at S, see `sensor_chain.read_into`.
+        truth: (N, 15 + n) input of a sensor at S, see `sensor_chain.read_sensor_into`.
         pose: (N, 7) [quaternion wxyz, position] of S in the world.
         phi: (10,) load about the origin of S.
     """

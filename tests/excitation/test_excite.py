@@ -38,20 +38,20 @@ from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.film import Film
+from drake_teleop.station.film import ReplayFile
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    estimate_into,
+    estimate_sample_into,
     motion_estimator,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
+    SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -155,7 +155,7 @@ def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
         assert speed.values[0] < 0.05 < speed.values.max()
         assert film.slow_motion == 1.0
 
-    monkeypatch.setattr(Film, "write", write)
+    monkeypatch.setattr(ReplayFile, "write", write)
     write_motion_film(tmp_path / "film.html", short)
     assert np.linalg.norm(frames[1].translation() - frames[0].translation()) > 0.02
 
@@ -165,8 +165,8 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
     """Return a record through sensor chain and motion estimation."""
     reading = np.empty(truth.shape[1] - 2)
     for k in range(len(truth)):
-        read_into(constants, memory, noise[k // NOISE_BLOCK], truth[k], reading)
-        estimate_into(estimator, remembered, table, reading, samples[k])
+        read_sensor_into(constants, memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading)
+        estimate_sample_into(estimator, remembered, table, reading, samples[k])
 
 
 @pytest.mark.long
@@ -183,12 +183,12 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
     vectors = np.empty((3, len(t), 3))
     write_sensor_motion(motions, vectors)
     truth = np.hstack([non_contact_wrench(*vectors, phi), *vectors, joints[0]])
-    constants, memory = sensor_chain(sensor, 6, period)
+    constants, memory = sensor_chain_constants(sensor, 6, period)
     estimator, remembered = motion_estimator(motion, sensor, 6, period)
     samples, found = np.empty((len(t), 22)), []
     rng = np.random.default_rng(0)
     for _ in range(200):
-        noise = rng.standard_normal((len(t) // NOISE_BLOCK + 1, NOISE_SIZE))
+        noise = rng.standard_normal((len(t) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         wrench, s, omega, alpha = (samples[::2, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(wrench, s, omega, alpha, noise=sensor.wrench_std())
@@ -343,7 +343,7 @@ def test_identification_refuses_an_unsuitable_trajectory(short):
         identify_load(scenario, trajectory=short.trajectory)
     fitting = replace(scenario, simulation__duration=2.4)
     with pytest.raises(DrakeTeleopError, match=r"trajectory: it uses 1\d\d\.\d% of its"):
-        identify_load(fitting, trajectory=short.trajectory.scaled(1.1))
+        identify_load(fitting, trajectory=short.trajectory.with_scaled_amplitudes(1.1))
     with pytest.raises(DrakeTeleopError, match="it has 5 joints, the arm 6"):
         less = {name: getattr(short.trajectory, name)[:5] for name in ("q0", "rho", "delta")}
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
@@ -515,7 +515,7 @@ def test_late_error_of_drake_is_one_error(urdf, monkeypatch):
     def refused(_):
         raise RuntimeError("form one or more loops")
 
-    monkeypatch.setattr("drake_teleop.lab.excitation.robot.finalize", refused)
+    monkeypatch.setattr("drake_teleop.lab.excitation.robot.finalize_plant", refused)
     with pytest.raises(DrakeTeleopError, match=r"arm\.urdf: cannot be read .*one or more loops"):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 
@@ -694,13 +694,13 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
     sensor = dataclasses.replace(
         without_parts(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
     )
-    constants, memory = sensor_chain(sensor, joints, 1e-3)
+    constants, memory = sensor_chain_constants(sensor, joints, 1e-3)
     rng = np.random.default_rng(0)
     readings = np.empty((len(recording.t), 13 + joints))
     for k, truth in enumerate(recording.truth):
-        if k % NOISE_BLOCK == 0:
+        if k % SAMPLES_PER_NOISE_BLOCK == 0:
             noise = rng.standard_normal(NOISE_SIZE)
-        read_into(constants, memory, noise, truth, readings[k])
+        read_sensor_into(constants, memory, noise, truth, readings[k])
     log = write_log(tmp_path, recording.t, readings, recording)
     with pytest.raises(SystemExit) as stop:
         main(["identify", str(log), "--out", str(tmp_path / "load"), "--quiet"])

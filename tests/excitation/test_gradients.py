@@ -29,9 +29,9 @@ from drake_teleop.lab.excitation.optimizer import Problem, Task, _Search
 from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
-from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, motion_gains
+from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, fusion_filters
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.arm import SLIDES
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -107,7 +107,7 @@ def test_predicted_deviations_are_those_of_white_noise():
 def test_error_filter_has_the_poles_of_the_motion_filter():
     """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
     T = 1 / 32000  # the filter is then nearly continuous
-    for filter_ in motion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
+    for filter_ in fusion_filters(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
         numerator, denominator = _error_filter(filter_, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
         correct = np.eye(3) - np.outer(filter_.gains, [1.0, 0.0, 0.0])
@@ -167,7 +167,7 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
     # Add damping, and make some joints prismatic.
     table = arm.table.copy()
     table[:-1, 23] = 0.5
-    table[sliding, SLIDES] = 1.0
+    table[sliding, IS_PRISMATIC_COLUMN] = 1.0
     home = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0])
     task = Task(table, limits_of(arm), Criterion(name, SCALES), home, 6.0, 3)
     problem = Problem(task)

@@ -17,7 +17,11 @@ from drake_teleop.lab.excitation.shortest import (
     design_shortest_motion,
     sidak_factor,
 )
-from drake_teleop.load.tolerance import deviations_of, errors_of, read_tolerance
+from drake_teleop.load.tolerance import (
+    derivatives_over_tolerances,
+    deviations_over_tolerances,
+    read_tolerance,
+)
 from drake_teleop.station.scenario import LoadScenario
 
 ASKED = read_tolerance("mass 0.1 %, com 0.1 mm, inertia 1 %")
@@ -31,7 +35,9 @@ def slave() -> Robot:
 def problem_of(slave: Robot, times: float = 1.0) -> ShortestProblem:
     criterion = Criterion("A16", slave.scales)
     task = Task(slave.arm.table, slave.limits, criterion, slave.home, 1.0, 3)
-    return ShortestProblem(task, times * errors_of(ASKED, slave.limits.phi), slave, None)
+    return ShortestProblem(
+        task, times * derivatives_over_tolerances(ASKED, slave.limits.phi), slave, None
+    )
 
 
 def test_reliable_factor_grows_with_the_number_of_tolerances() -> None:
@@ -77,13 +83,13 @@ def test_shortest_motion_reaches_the_tolerance_within_all_limits(
 
 def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
     """Without the accelerometer's noise the factor would be 2 to 5."""
-    problem, errors = problem_of(slave), errors_of(ASKED, slave.limits.phi)
+    problem, errors = problem_of(slave), derivatives_over_tolerances(ASKED, slave.limits.phi)
     x = problem.candidate(np.random.default_rng(2), near_home=True)
     x[-1] = np.log(1.2)
     motion = sensor_motion(slave, problem.trajectory(x))
     covariance = predicted_covariance(*motion, 1e-3, slave.noise, slave.limits.phi)
     known = problem.deviations(motion, 1.2)
-    np.testing.assert_allclose(known, deviations_of(errors, covariance), rtol=0.03)
+    np.testing.assert_allclose(known, deviations_over_tolerances(errors, covariance), rtol=0.03)
 
 
 def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:

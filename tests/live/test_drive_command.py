@@ -107,7 +107,7 @@ def test_a_virtual_device_is_the_hand(page, capfd):
 
 @pytest.mark.long
 def test_experiment_starts_with_consent_and_draws_no_force(page, capsys, monkeypatch):
-    monkeypatch.setattr(replay, "Arrow", None)  # fails if an arrow is drawn
+    monkeypatch.setattr(replay, "ForceArrow", None)  # fails if an arrow is drawn
     before, opened = ports(), list[int]()
     frames = page(
         '{"go": true}',

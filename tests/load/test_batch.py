@@ -13,8 +13,8 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
-from drake_teleop.load.batch.methods import METHODS, _std_growth, identify_batch
-from drake_teleop.load.batch.total_least_squares import Options, Record
+from drake_teleop.load.batch.methods import METHODS, _std_growth_by_rejection, identify_batch
+from drake_teleop.load.batch.total_least_squares import EstimatorOptions, SampleRecord
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import (
@@ -23,7 +23,7 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     transform_phi,
 )
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.station.result import SimulationResult
@@ -56,7 +56,9 @@ def knocks(wrench, seed=0):
 
 @pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("noise", [Noise(), Noise(WRENCH_NOISE, s=0.1, omega=0.01, alpha=1.0)])
+@pytest.mark.parametrize(
+    "noise", [NoiseStd(), NoiseStd(WRENCH_NOISE, s=0.1, omega=0.01, alpha=1.0)]
+)
 def test_exact_without_noise(method, noise):
     result = identify_batch(*record(), method=method, noise=noise)
     np.testing.assert_allclose(estimate(result), TRUTH, rtol=0, atol=1e-9)
@@ -68,7 +70,7 @@ def test_exact_without_noise(method, noise):
 @pytest.mark.parametrize("offsets", [True, False])
 def test_whitened_is_least_squares_with_the_channels_noise(offsets):
     F, *motion = record(noise=1.0)
-    result = identify_batch(F, *motion, method="whitened", noise=Noise(WRENCH_NOISE))
+    result = identify_batch(F, *motion, method="whitened", noise=NoiseStd(WRENCH_NOISE))
     expected = identify(F, *motion, noise=WRENCH_NOISE)
     np.testing.assert_allclose(estimate(result)[6:], expected.phi, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(result.identification.covariance, expected.covariance, rtol=1e-6)
@@ -85,7 +87,7 @@ def test_noise_is_estimated():
     F, *motion = record(noise=1.0)
     result = identify_batch(F, *motion, method="whitened")
     np.testing.assert_allclose(result.noise, WRENCH_NOISE, rtol=0.08)
-    given = identify_batch(F, *motion, method="whitened", noise=Noise(WRENCH_NOISE))
+    given = identify_batch(F, *motion, method="whitened", noise=NoiseStd(WRENCH_NOISE))
     deviations = given.identification.standard_deviations
     assert (np.abs(estimate(result) - estimate(given)) / deviations).max() < 0.2
 
@@ -94,7 +96,7 @@ def test_noise_of_the_motion_is_not_taken_for_the_wrenchs():
     F, s, omega, alpha = record(4000, noise=1.0)
     rng = np.random.default_rng(3)
     arrays = F, s + 0.2 * rng.normal(size=s.shape), omega, alpha + rng.normal(size=s.shape)
-    result = identify_batch(*arrays, method="total", noise=Noise(s=0.2, alpha=1.0))
+    result = identify_batch(*arrays, method="total", noise=NoiseStd(s=0.2, alpha=1.0))
     np.testing.assert_allclose(result.noise[:3], WRENCH_NOISE[:3], rtol=0.15)
 
 
@@ -141,10 +143,10 @@ def test_motion_is_not_rejected_for_a_disturbance():
 
 def test_a_quarter_of_the_samples_doubles_the_deviations():
     """Where nothing is rejected any more."""
-    whole = Record(*record(2000, noise=1.0))
-    fit = METHODS["whitened"].fit(whole, Options(Noise(WRENCH_NOISE)))
-    assert _std_growth(fit, whole.every(4).moments) == pytest.approx(2.0, rel=0.02)
-    assert _std_growth(fit, whole.moments) == pytest.approx(1.0)
+    whole = SampleRecord(*record(2000, noise=1.0))
+    fit = METHODS["whitened"].fit(whole, EstimatorOptions(NoiseStd(WRENCH_NOISE)))
+    assert _std_growth_by_rejection(fit, whole.decimate(4).moments) == pytest.approx(2.0, rel=0.02)
+    assert _std_growth_by_rejection(fit, whole.moments) == pytest.approx(1.0)
 
 
 def test_poses_share_a_noise():
@@ -173,7 +175,7 @@ def test_the_default_is_robust_consistent_and_knows_the_motions_noise():
     F = F + 0.1 * WRENCH_NOISE * rng.normal(size=F.shape)
     s, omega, alpha = motion
     alpha = alpha + 2.0 * rng.normal(size=alpha.shape)
-    noise = Noise(alpha=2.0)
+    noise = NoiseStd(alpha=2.0)
     found = identify_batch(F, s, omega, alpha, noise=noise)
     assert found.rejected[hit].all() and found.identification.physically_consistent
     errors = {
@@ -199,7 +201,7 @@ def test_what_only_the_prior_says_is_named(kind, offsets):
     np.testing.assert_allclose(load.phi[4:], thought[4:], atol=0.1 * thought[4])
     # The data say nothing of the inertia but what mass and centre of mass imply: the prior's
     # deviation where those are known.
-    expected = np.sqrt(np.diag(np.linalg.inv(prior.information(240)[4:, 4:])))
+    expected = np.sqrt(np.diag(np.linalg.inv(prior.inverse_covariance(240)[4:, 4:])))
     np.testing.assert_allclose(load.standard_deviations[10:], expected, rtol=0.02)
     moved = identify_batch(*record(noise=1.0), prior=Prior(thought, 1e-4, kind)).identification
     assert moved.verdicts == ("identified",) * 16
@@ -225,7 +227,7 @@ def normalised_errors(method, noise, std, repetitions=60, **options):
 
 
 def test_stated_deviations_hold_with_errors_in_variables():
-    noise = Noise(WRENCH_NOISE, s=0.1, omega=0.02, alpha=2.0)
+    noise = NoiseStd(WRENCH_NOISE, s=0.1, omega=0.02, alpha=2.0)
     errors = normalised_errors("total", noise, [WRENCH_NOISE, 0.1, 0.02, 2.0])
     assert errors.max() < 2.0
     assert 0.4 < errors.mean() < 1.3
@@ -236,7 +238,7 @@ def test_stated_deviations_hold_with_errors_in_variables():
 def test_stated_deviations_are_not_too_large_where_noise_couples_the_channels():
     """Of angular accelerations for the most part: in force and torque at once."""
     motion, errors = rich_motion(1000), []
-    noise = Noise(WRENCH_NOISE, alpha=1.0)
+    noise = NoiseStd(WRENCH_NOISE, alpha=1.0)
     clean = OFFSETS + non_contact_wrench(*motion, TOOL)
     for seed in range(150):
         rng = np.random.default_rng(seed)
@@ -255,13 +257,14 @@ def test_consistent_is_the_constrained_total():
     plate = phi_from_mass_com_inertia(0.3, [0, 0.01, 0.1], np.diag([1e-3, 2e-3, 3e-3]))
     motion = rich_motion(1000)
     F = OFFSETS + non_contact_wrench(*motion, plate)
-    noise, cost = Noise(WRENCH_NOISE, s=0.3, alpha=3.0), []
+    noise, cost = NoiseStd(WRENCH_NOISE, s=0.3, alpha=3.0), []
     rng = np.random.default_rng(4)
     F = F + WRENCH_NOISE * rng.normal(size=F.shape)
     s, omega, alpha = motion
     s, alpha = s + 0.3 * rng.normal(size=s.shape), alpha + 3.0 * rng.normal(size=s.shape)
     fits = [
-        METHODS[m].fit(Record(F, s, omega, alpha), Options(noise)) for m in ("total", "consistent")
+        METHODS[m].fit(SampleRecord(F, s, omega, alpha), EstimatorOptions(noise))
+        for m in ("total", "consistent")
     ]
     gram, right, free = fits[0].form[:3]
     found = fits[1].form.theta
@@ -291,7 +294,7 @@ def test_known_offsets():
 def test_the_covariance_by_gains_is_what_each_of_them_does(method, offsets):
     F, *motion = record(300)
     F -= 0.0 if offsets else OFFSETS
-    noise = Noise(1e-6 * WRENCH_NOISE)
+    noise = NoiseStd(1e-6 * WRENCH_NOISE)
 
     def solved(F, **stated):
         return identify_batch(F, *motion, method=method, noise=noise, offsets=offsets, **stated)
@@ -343,7 +346,7 @@ def test_noise_is_not_taken_for_excitation(method):
     F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
     F = F + WRENCH_NOISE * rng.normal(size=F.shape)
     motion = [x + e * rng.normal(size=s.shape) for x, e in ((s, 0.06), (0.0, 0.002), (0.0, 1.5))]
-    noise = Noise(s=0.06, omega=0.002, alpha=1.5)
+    noise = NoiseStd(s=0.06, omega=0.002, alpha=1.5)
     result = identify_batch(F, *motion, method=method, noise=noise).identification
     assert result.identifiable.tolist() == 10 * [True] + 6 * [False]
     assert result.mass == pytest.approx(TOOL[0], rel=0.005)
@@ -363,7 +366,7 @@ def static_poses():
 @given(rotation=rotations(), seed=st.integers(0, 1000), force=st.floats(0.1, 10.0))
 def test_order_frame_and_units_do_not_matter(method, rotation, seed, force):
     isotropic = np.repeat([0.3, 0.01], 3)
-    noise = Noise(isotropic, s=0.1, omega=0.01, alpha=1.0)
+    noise = NoiseStd(isotropic, s=0.1, omega=0.01, alpha=1.0)
     F, *motion = record(300, noise=1.0, seed=seed)
 
     def phi(wrench, motion, noise):
@@ -374,7 +377,7 @@ def test_order_frame_and_units_do_not_matter(method, rotation, seed, force):
     shuffled = phi(F[order], [x[order] for x in motion], noise)
     np.testing.assert_allclose(shuffled / scale, expected / scale, rtol=0, atol=1e-7)
     # Forces in other units: the load is heavier by as much.
-    other = Noise(force * isotropic, s=0.1, omega=0.01, alpha=1.0)
+    other = NoiseStd(force * isotropic, s=0.1, omega=0.01, alpha=1.0)
     scaled = phi(force * F, motion, other) / force
     np.testing.assert_allclose(scaled / scale, expected / scale, rtol=0, atol=1e-6)
     if method not in ("robust", "consistent"):  # which look at one axis after the other
@@ -470,7 +473,7 @@ def test_intervals_hold_when_offsets_wander():
         wandering = np.cumsum(bent * rng.normal(size=(1500, 6)), axis=0)
         seen = motion[0] + wandering[:, :3], motion[1], motion[2] + wandering[:, 3:]
         for walk in errors:
-            noise = Noise(WRENCH_NOISE, walk=walk * np.concatenate([steps, bent]))
+            noise = NoiseStd(WRENCH_NOISE, walk=walk * np.concatenate([steps, bent]))
             result = identify_batch(F, *seen, method="total", noise=noise)
             deviations = result.identification.standard_deviations
             errors[walk].append((estimate(result) - truth) / deviations)
@@ -485,7 +488,7 @@ def test_the_covariance_of_wandering_offsets_is_a_double_sum():
     F[20, 0] += 1e3
     steps = np.array([0.3, 0.1, 0.2, 0.01, 0.02, 0.005, 0.1, 0.2, 0.1, 0.3, 1.0, 2.0])
     with_walk, without = (
-        identify_batch(F, *motion, method="robust", noise=Noise(WRENCH_NOISE, walk=walk))
+        identify_batch(F, *motion, method="robust", noise=NoiseStd(WRENCH_NOISE, walk=walk))
         for walk in (steps, 0.0)
     )
     kept = ~with_walk.rejected
@@ -503,7 +506,7 @@ def test_the_covariance_of_wandering_offsets_is_a_double_sum():
     rows = np.zeros((kept.sum(), 6, 16))
     rows[:, :, :6] = np.eye(6)
     rows[:, :, 6:] = regressor(*(table[kept] for table in motion))
-    weighted = rows * with_walk.equations.weights[:, None]
+    weighted = rows * with_walk.equations.channel_weights[:, None]
     inverse = np.linalg.inv(np.einsum("nci,ncj->ij", rows, weighted))
     expected = np.einsum("nci,nm,mdj,cd->ij", weighted, walked, weighted, covariance)
     added = with_walk.identification.covariance - without.identification.covariance
@@ -512,4 +515,4 @@ def test_the_covariance_of_wandering_offsets_is_a_double_sum():
 
 def test_a_negative_walk_is_refused():
     with pytest.raises(DrakeTeleopError, match=r"noise\.walk: has the negative value -"):
-        Noise(walk=[-1.0] * 12)
+        NoiseStd(walk=[-1.0] * 12)

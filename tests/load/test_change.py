@@ -12,13 +12,13 @@ from scipy.signal import lfilter
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
-from drake_teleop.load.identification import Identification, identified_object
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.identification import Identification, load_of_object
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.online.change import (
     HOLD_S,
-    OBJECT_STD,
+    OBJECT_PRIOR_STD,
     change_state,
-    change_update,
+    update_change_detector,
 )
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
@@ -78,7 +78,7 @@ def test_an_object_is_noticed_and_known(bench, tool, kind):
         assert -0.02 < monitor.changed_at - bench.EVENT < 0.3
         assert states[-1] == IDENTIFIED
         pair = (monitor.load, before) if kind == "grasp" else (before, monitor.load)
-        found = identified_object(*pair)
+        found = load_of_object(*pair)
         error = np.concatenate([[share(found.phi, bench.OBJECT)], (found.phi - bench.OBJECT)[1:4]])
         assert abs(error[0]) < 0.01
         # The stated uncertainty covers it: covariances add.
@@ -201,7 +201,7 @@ def test_coloured_noise_of_the_stated_long_run_variance_is_no_change(bench, tool
 
 def test_errors_of_gain_and_cross_talk_are_no_change_if_stated(bench, tool):
     """The load was identified in the same sensor's units, but in another motion."""
-    noise = Noise(np.repeat([0.25, 0.012], 3), 0.06, 0.0, 1.5)
+    noise = NoiseStd(np.repeat([0.25, 0.012], 3), 0.06, 0.0, 1.5)
     alarms = {0.0: 0, 0.01: 0}
     for seed in SEEDS:
         per_channel = np.repeat([1.0, 0.1], 3)
@@ -240,7 +240,9 @@ def test_the_new_load_is_the_least_squares_solution_with_the_known_prior(bench, 
     rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
     weights = 16.0 / noise**2
     prior = tool.covariance.copy()
-    prior[np.arange(16), np.arange(16)] += np.concatenate([np.full(6, 1e-4), np.square(OBJECT_STD)])
+    prior[np.arange(16), np.arange(16)] += np.concatenate(
+        [np.full(6, 1e-4), np.square(OBJECT_PRIOR_STD)]
+    )
     information = np.linalg.inv(prior)
     gram = np.einsum("nci,c,ncj->ij", rows, weights, rows) + information
     right = np.einsum("nci,c,nc->i", rows, weights, means(F))
@@ -256,7 +258,7 @@ def test_single_samples_give_the_same_states_as_a_log(bench, tool):
     at_once, single = bench.monitor("JR3", tool), bench.monitor("JR3", tool)
     states = at_once.watch(*rows)
     for k, row in enumerate(zip(*rows, strict=True)):
-        change_update(single.memory, np.concatenate([*row, [0.0]]), *single.parameters)
+        update_change_detector(single.memory, np.concatenate([*row, [0.0]]), *single.parameters)
         assert change_state(single.memory) == states[k]
     assert states[-1] == CHANGED
     np.testing.assert_array_equal(single.memory, at_once.memory)

@@ -15,7 +15,7 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     pseudo_inertia,
 )
-from drake_teleop.load.moments import Moments, Noise
+from drake_teleop.load.moments import NoiseStd, SecondMoments
 from drake_teleop.load.regressor import non_contact_wrench
 
 ROD = phi_from_mass_com_inertia(0.009, [0, 0.002, 0.06], np.diag([5e-5, 5e-5, 0.0]))
@@ -29,9 +29,9 @@ def fit(phi, noise=0.0, seed=0):
     motion = rich_motion(500)
     F = OFFSETS + non_contact_wrench(*motion, phi)
     F = F + noise * WRENCH_NOISE * np.random.default_rng(seed).normal(size=F.shape)
-    moments = Moments()
+    moments = SecondMoments()
     moments.add(F, *motion)
-    return total_least_squares(moments, Noise(), WRENCH_NOISE)
+    return total_least_squares(moments, NoiseStd(), WRENCH_NOISE)
 
 
 def inconsistent_fit(phi, noise, number=0):
@@ -121,9 +121,9 @@ def test_all_mass_in_the_ellipsoid():
         consistent(fit(TOOL), ellipsoid=Ellipsoid(np.zeros(3), np.eye(3))), fit(TOOL).theta
     )
     inside = Ellipsoid([0.0, 0.01, 0.1], np.eye(3) / 0.03**2)
-    assert inside.row() @ whole[6:] < 0.0
+    assert inside.constraint_row() @ whole[6:] < 0.0
     bound = consistent(form, ellipsoid=inside)[6:]
-    assert inside.row() @ bound >= -1e-6 * PLATE[0]
+    assert inside.constraint_row() @ bound >= -1e-6 * PLATE[0]
     assert np.linalg.norm(mass_com_inertia(bound)[1] - [0.0, 0.01, 0.1]) < 0.03
 
 
@@ -139,4 +139,4 @@ def test_bad_input_is_named():
     ):
         Prior(POINT, 1.0)
     with pytest.raises(DrakeTeleopError, match=r"^ellipsoid\.matrix: is not positive definite"):
-        Ellipsoid(np.zeros(3), -np.eye(3)).row()
+        Ellipsoid(np.zeros(3), -np.eye(3)).constraint_row()

@@ -22,22 +22,22 @@ from contact_detection import auc, free_threshold
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import (
+    CONTACT_END_LEVEL,
     DEFAULT_SLACK,
-    END_LEVEL,
-    SIZE,
+    MEMORY_SIZE,
     ContactDetector,
-    detection_update,
+    central_axis_of_wrenches,
     fit_noise_floor,
-    statistics,
-    wrench_axis,
+    statistics_of_log,
+    update_statistics,
 )
 from drake_teleop.load.contact.noise_floor import (
-    STATISTICS,
-    WINDOW,
+    MAX_SUMMED_SAMPLES,
+    STATISTIC_NAMES,
     NoiseFloor,
-    finite_covariance,
+    limit_covariance,
 )
-from drake_teleop.load.identification import natural_scale
+from drake_teleop.load.identification import natural_scales
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 NOISE = np.repeat([0.05, 0.002], 3)
@@ -77,7 +77,7 @@ def test_the_floor_is_the_sum_of_its_parts(motion, a, root):
     J = np.hstack([np.eye(6), regressor(*motion)])
     expected = NOISE**2 + np.diag(J @ root @ root.T @ J.T)
     expected += growth[:, 0] ** 2 * (a @ a) + growth[:, 1] ** 2 * (motion[2] @ motion[2])
-    sigma = floor.sigma(*(x[None] for x in (*motion, a)))[0]
+    sigma = floor.noise_std_along(*(x[None] for x in (*motion, a)))[0]
     np.testing.assert_allclose(sigma**2, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -85,15 +85,15 @@ def test_the_floor_is_the_sum_of_its_parts(motion, a, root):
 def test_faster_motion_never_lowers_the_floor(a, factor):
     floor = NoiseFloor(NOISE, np.zeros((16, 16)), np.full((6, 2), 0.1), np.eye(6), np.zeros(6))
     s, rest = np.array([[0.0, 0.0, 9.81]]), np.zeros((1, 3))
-    slow = floor.sigma(s, rest, rest, a[None])
-    assert (floor.sigma(s, rest, rest, factor * a[None]) >= slow).all()
+    slow = floor.noise_std_along(s, rest, rest, a[None])
+    assert (floor.noise_std_along(s, rest, rest, factor * a[None]) >= slow).all()
 
 
 def test_a_held_acceleration_fades():
     floor = NoiseFloor(NOISE, np.zeros((16, 16)), np.ones((6, 2)), np.eye(6), np.zeros(6), fade=0.5)
     a = np.zeros((4, 3))
     a[1, 0] = 2.0
-    sigma = floor.sigma(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 3)), a)
+    sigma = floor.noise_std_along(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 3)), a)
     held = np.array([0.0, 4.0, 2.0, 1.0])
     np.testing.assert_allclose(sigma**2, NOISE**2 + held[:, None], rtol=1e-12)
 
@@ -107,14 +107,14 @@ def test_a_planted_floor_is_found(seed):
     growth = np.repeat([[0.08, 0.05], [0.004, 0.002]], 3, axis=0)
     root = np.linalg.cholesky(0.5 * np.eye(6) + 0.5)
     true = NoiseFloor(NOISE, np.zeros((16, 16)), growth, root @ root.T, np.zeros(6))
-    contact = true.sigma(*motion) * (rng.normal(size=(samples, 6)) @ root.T)
+    contact = true.noise_std_along(*motion) * (rng.normal(size=(samples, 6)) @ root.T)
     found = fit_noise_floor(contact, *motion, np.zeros((16, 16)))
     np.testing.assert_allclose(found.noise, NOISE, rtol=0.1)
     np.testing.assert_allclose(found.per_acceleration, growth, rtol=0.1)
     np.testing.assert_allclose(found.correlation, true.correlation, atol=0.03)
     np.testing.assert_allclose(found.rho, 0.0, atol=0.03)
     np.testing.assert_allclose(found.widths, 1.0, atol=0.1)
-    level = statistics(found, contact, *motion)[:, 0]
+    level = statistics_of_log(found, contact, *motion)[:, 0]
     # Its square is chi-squared, slow or fast.
     for rows in (np.linalg.norm(motion[3], axis=1) < 2.0, np.linalg.norm(motion[3], axis=1) > 5.0):
         assert (level[rows] ** 2 > chi2.isf(0.01, 6)).mean() == pytest.approx(0.01, abs=0.004)
@@ -128,9 +128,9 @@ def test_coloured_noise_is_made_white():
     found = fit_noise_floor(noise, *at_rest(len(noise)), np.zeros((16, 16)))
     np.testing.assert_allclose(found.rho, rho, atol=0.01)
     # The maximum of the likelihood ratios is then as rarely large as in white noise.
-    glr = statistics(found, noise, *at_rest(len(noise)))[:, 2]
+    glr = statistics_of_log(found, noise, *at_rest(len(noise)))[:, 2]
     assert (glr > 6.2).mean() < 1e-4
-    assert (statistics(white(), noise, *at_rest(len(noise)))[:, 2] > 6.2).mean() > 0.1
+    assert (statistics_of_log(white(), noise, *at_rest(len(noise)))[:, 2] > 6.2).mean() > 0.1
 
 
 def test_a_record_without_noise_has_a_floor_nevertheless():
@@ -152,18 +152,20 @@ def test_a_slow_error_does_not_set_the_threshold_of_quick_contacts():
     quick[501::1000, 0] += 6.0 * NOISE[0]
     noticed = []
     for floor in (found, blind):
-        threshold = free_threshold(statistics(floor, noise, *at_rest(n))[:, 2], 1e-4)
-        noticed.append((statistics(floor, quick, *at_rest(n))[501::1000, 2] >= threshold).mean())
+        threshold = free_threshold(statistics_of_log(floor, noise, *at_rest(n))[:, 2], 1e-4)
+        noticed.append(
+            (statistics_of_log(floor, quick, *at_rest(n))[501::1000, 2] >= threshold).mean()
+        )
     assert noticed[0] > 0.9
     assert noticed[1] < 0.5
 
 
 def test_what_a_record_left_open_counts_as_natural():
     covariance = np.diag(np.r_[np.full(6, 0.01), np.full(4, 1e-6), np.full(6, np.inf)])
-    P = finite_covariance(TOOL, covariance)
-    np.testing.assert_allclose(np.diag(P)[10:], natural_scale(TOOL)[10:] ** 2)
+    P = limit_covariance(TOOL, covariance)
+    np.testing.assert_allclose(np.diag(P)[10:], natural_scales(TOOL)[10:] ** 2)
     np.testing.assert_array_equal(P[:10, :10], covariance[:10, :10])
-    assert (finite_covariance(TOOL, covariance, tared=True)[:6] == 0.0).all()
+    assert (limit_covariance(TOOL, covariance, tared=True)[:6] == 0.0).all()
 
 
 # The statistics
@@ -187,23 +189,25 @@ def test_statistics_against_their_definitions(contact, rho, slack):
         lengths = [n for n in (1, 2, 4, 8, 16, 32) if n <= k + 1]
         glr.append(max(np.linalg.norm(e[k + 1 - n : k + 1].sum(0)) / math.sqrt(n) for n in lengths))
     expected = np.stack([np.linalg.norm(z, axis=1), cusum, glr], axis=1)
-    found = statistics(white(rho), contact, *at_rest(len(contact)), slack=slack)
+    found = statistics_of_log(white(rho), contact, *at_rest(len(contact)), slack=slack)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)
 
 
 def test_the_window_of_the_likelihood_ratio_is_forgotten():
-    contact = np.zeros((3 * WINDOW, 6))
+    contact = np.zeros((3 * MAX_SUMMED_SAMPLES, 6))
     contact[10] = 100.0 * NOISE
-    glr = statistics(white(), contact, *at_rest(len(contact)))[:, 2]
-    assert glr[10 + WINDOW - 1] == pytest.approx(100.0 * math.sqrt(6.0 / WINDOW))
-    np.testing.assert_allclose(glr[10 + WINDOW :], 0.0, atol=1e-9)
+    glr = statistics_of_log(white(), contact, *at_rest(len(contact)))[:, 2]
+    assert glr[10 + MAX_SUMMED_SAMPLES - 1] == pytest.approx(
+        100.0 * math.sqrt(6.0 / MAX_SUMMED_SAMPLES)
+    )
+    np.testing.assert_allclose(glr[10 + MAX_SUMMED_SAMPLES :], 0.0, atol=1e-9)
 
 
 @given(arrays(np.float64, (30, 6), elements=st.floats(-5.0, 5.0)))
 def test_correlated_channels_have_mahalanobis_distance(z):
     correlation = 0.6 * np.eye(6) + 0.4
     floor = NoiseFloor(NOISE, np.zeros((16, 16)), np.zeros((6, 2)), correlation, np.zeros(6))
-    level = statistics(floor, z * NOISE, *at_rest(30))[:, 0]
+    level = statistics_of_log(floor, z * NOISE, *at_rest(30))[:, 0]
     expected = np.einsum("ki,ij,kj->k", z, np.linalg.inv(correlation), z)
     np.testing.assert_allclose(level**2, expected, rtol=1e-9, atol=1e-9)
 
@@ -212,7 +216,7 @@ def test_sums_notice_a_weak_contact_sooner_at_equal_false_alarms():
     """A push of one standard deviation: the sums need some 20 samples, the level far more."""
 
     def found(x):
-        return statistics(white(), x, *at_rest(len(x)), slack=0.5)
+        return statistics_of_log(white(), x, *at_rest(len(x)), slack=0.5)
 
     rng, length, runs = np.random.default_rng(2), 400, 200
     free = rng.normal(size=(200_000, 6)) * NOISE
@@ -233,7 +237,7 @@ def test_sums_notice_a_weak_contact_sooner_at_equal_false_alarms():
 
 @pytest.mark.long
 @pytest.mark.slow
-@given(st.sampled_from(STATISTICS), st.integers(0, 100))
+@given(st.sampled_from(STATISTIC_NAMES), st.integers(0, 100))
 @settings(max_examples=20)
 def test_sample_by_sample_is_as_in_one_go(statistic, seed):
     rng = np.random.default_rng(seed)
@@ -250,7 +254,7 @@ def test_sample_by_sample_is_as_in_one_go(statistic, seed):
     np.testing.assert_array_equal(flags, [single.update(*x) for x in zip(*rows, strict=True)])
 
 
-@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("statistic", STATISTIC_NAMES)
 def test_a_contact_that_flickers_is_one_and_ends_after_the_hold(statistic):
     contact = np.zeros((400, 6))
     contact[100:200:5, 2] = 12.0 * NOISE[2]
@@ -284,7 +288,9 @@ def test_a_weak_contact_is_one_contact(statistic):
     contact = noise.copy()
     contact[3000:5000, 1] += 2.0 * NOISE[1]
     rows = at_rest(6000)
-    threshold = 1.25 * statistics(white(), noise, *rows)[:, STATISTICS.index(statistic)].max()
+    threshold = (
+        1.25 * statistics_of_log(white(), noise, *rows)[:, STATISTIC_NAMES.index(statistic)].max()
+    )
     flags = ContactDetector(white(), threshold, statistic=statistic).detect(contact, *rows)
     first, last = np.flatnonzero(np.diff(flags))
     assert 3000 <= first < 3050
@@ -337,18 +343,20 @@ def test_fast_motion_is_no_contact_and_a_push_in_it_is():
         (floor, free, second),
         (fixed, [free[0], *at_rest(half)], [second[0], *at_rest(half)]),
     ):
-        threshold = free_threshold(statistics(f, *train)[:, 0], 1e-3)
-        assert (statistics(f, *test)[:, 0] >= threshold).mean() < 0.005
-        pushed = statistics(f, test[0] + push, *test[1:])[:, 0]
+        threshold = free_threshold(statistics_of_log(f, *train)[:, 0], 1e-3)
+        assert (statistics_of_log(f, *test)[:, 0] >= threshold).mean() < 0.005
+        pushed = statistics_of_log(f, test[0] + push, *test[1:])[:, 0]
         seen.append((pushed[slow] >= threshold).mean())
     # With one floor for all motions the threshold is that of the fastest.
     assert seen[0] > 0.5 > 5.0 * seen[1]
 
 
 def test_an_update_is_one_sample():
-    memory, floor = np.zeros(SIZE), white(0.5)
+    memory, floor = np.zeros(MEMORY_SIZE), white(0.5)
     for count in (1.0, 2.0):
-        detection_update(memory, NOISE, *STILL, floor.parameters, DEFAULT_SLACK, 0.0, END_LEVEL)
+        update_statistics(
+            memory, NOISE, *STILL, floor.compiled_parameters, DEFAULT_SLACK, 0.0, CONTACT_END_LEVEL
+        )
         assert memory[0] == count
 
 
@@ -390,7 +398,7 @@ def test_a_wrench_is_rebuilt_from_its_axis(f, p, pitch):
     if size < 1e-3:
         return
     wrench = np.r_[f, np.cross(p, f) + pitch * f]
-    direction, point, found = wrench_axis(wrench)
+    direction, point, found = central_axis_of_wrenches(wrench)
     assert found == pytest.approx(pitch, abs=1e-9)
     np.testing.assert_allclose(direction, f / size)
     assert point @ f == pytest.approx(0.0, abs=1e-9 * size)
@@ -398,7 +406,7 @@ def test_a_wrench_is_rebuilt_from_its_axis(f, p, pitch):
 
 
 def test_a_wrench_without_force_has_no_axis():
-    assert np.isnan(wrench_axis(np.zeros(6))[1]).all()
+    assert np.isnan(central_axis_of_wrenches(np.zeros(6))[1]).all()
 
 
 # Bad input

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.identification import Identification, consistency_margin, identified_object
+from drake_teleop.load.identification import Identification, consistency_margin, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
@@ -29,7 +29,7 @@ def recorded(phi: np.ndarray, seed: int, samples: int = 400, noise: float = 1.0)
 
 def test_the_difference_has_the_object_and_the_sum_of_the_covariances() -> None:
     total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
-    found = identified_object(total, gripper)
+    found = load_of_object(total, gripper)
     assert np.abs((found.phi - OBJECT) / found.standard_deviations[6:]).max() < 4
     expected = total.covariance[6:, 6:] + gripper.covariance[6:, 6:]
     np.testing.assert_allclose(found.covariance[6:, 6:], expected, rtol=1e-12)
@@ -40,7 +40,7 @@ def test_the_difference_has_the_object_and_the_sum_of_the_covariances() -> None:
 def test_its_errors_are_as_large_as_the_covariance_says() -> None:
     scores = []
     for seed in range(60):
-        found = identified_object(
+        found = load_of_object(
             recorded(GRIPPER + OBJECT, 2 * seed), recorded(GRIPPER, 2 * seed + 1)
         )
         scores.append((found.phi - OBJECT) / found.standard_deviations[6:])
@@ -49,7 +49,7 @@ def test_its_errors_are_as_large_as_the_covariance_says() -> None:
 
 
 def test_it_is_a_file_like_any_other(tmp_path) -> None:
-    found = identified_object(recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2))
+    found = load_of_object(recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2))
     found.save(tmp_path / "object.json")
     again = Identification.load(tmp_path / "object.json")
     np.testing.assert_array_equal(again.covariance, found.covariance)
@@ -62,7 +62,7 @@ def test_what_the_gripper_record_left_undetermined_is_so_in_the_difference() -> 
     rest = np.zeros((30, 3))
     wrench = non_contact_wrench(s, rest, rest, GRIPPER) + 0.1 * NOISE * rng.normal(size=(30, 6))
     gripper = identify(wrench, s, rest, rest)
-    found = identified_object(recorded(GRIPPER + OBJECT, 1), gripper)
+    found = load_of_object(recorded(GRIPPER + OBJECT, 1), gripper)
     assert found.identifiable.tolist() == [True] * 10 + [False] * 6
     assert np.isinf(np.diag(found.covariance)[10:]).all()
     assert consistency_margin(found)[1] == np.inf
@@ -71,18 +71,18 @@ def test_what_the_gripper_record_left_undetermined_is_so_in_the_difference() -> 
 def test_exchanged_files_are_an_error() -> None:
     total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
     with pytest.raises(DrakeTeleopError, match=r"-0\.7\d* kg for the object.*gripper alone"):
-        identified_object(gripper, total)
+        load_of_object(gripper, total)
     with pytest.raises(DrakeTeleopError, match="0 kg"):
-        identified_object(total, total)
+        load_of_object(total, total)
 
 
 def test_the_margin_tells_a_body_from_none_and_from_noise() -> None:
     total, gripper = recorded(GRIPPER + OBJECT, 1), recorded(GRIPPER, 2)
-    margin, deviation = consistency_margin(identified_object(total, gripper))
+    margin, deviation = consistency_margin(load_of_object(total, gripper))
     assert margin > 3 * deviation > 0
     impossible = OBJECT - np.array([0, 0, 0, 0, 0.018, 0, 0, 0, 0, 0])  # I_xx far too small
     margin, deviation = consistency_margin(
-        identified_object(recorded(GRIPPER + impossible, 1), gripper)
+        load_of_object(recorded(GRIPPER + impossible, 1), gripper)
     )
     assert margin < -3 * deviation < 0
 
@@ -107,11 +107,11 @@ def test_degrees_of_freedom_are_those_of_a_sum_of_variances() -> None:
     gripper = replace(
         gripper, degrees_of_freedom=np.full(16, 20.0), covariance=total.covariance.copy()
     )
-    found = identified_object(total, gripper)
+    found = load_of_object(total, gripper)
     # Two equal variances with 20 degrees each have 40; the offsets are the total's alone.
     np.testing.assert_allclose(found.degrees_of_freedom, [20.0] * 6 + [40.0] * 10)
     given = replace(total, degrees_of_freedom=np.full(16, np.inf))
-    assert np.isinf(identified_object(given, given_as_gripper(given)).degrees_of_freedom).all()
+    assert np.isinf(load_of_object(given, given_as_gripper(given)).degrees_of_freedom).all()
 
 
 def given_as_gripper(load: Identification) -> Identification:

@@ -11,7 +11,7 @@ import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.identification import PARAMETER_NAMES, Identification
 from drake_teleop.load.normal_equations import NormalEquations, _pseudo_inverse, identify
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
@@ -110,7 +110,7 @@ def test_variances_follow_from_what_the_fit_leaves_of_each_channels_noise():
     left = np.eye(6 * n) - rows @ inverse @ rows.T * np.repeat(weights, n)
     power = (left**2).reshape(6, n, 6, n).sum(axis=(1, 3)) @ variances
     equations = NormalEquations(weights**-0.5)
-    found, degrees = equations._unbiased(power, n, grams, grams, inverse)
+    found, degrees = equations._unbiased_variances(power, n, grams, grams, inverse)
     np.testing.assert_allclose(found, variances, rtol=1e-9)
     assert degrees.sum() == pytest.approx(6 * n - 16)
 
@@ -172,7 +172,9 @@ def test_angles_from_rounding_do_not_count_as_excitation():
 def test_one_axis_determines_what_it_moves():
     motion = about_one_axis()
     result = identify(OFFSETS + non_contact_wrench(*motion, TOOL), *motion)
-    unknown = {n for n, known in zip(PARAMETERS, result.identifiable, strict=True) if not known}
+    unknown = {
+        n for n, known in zip(PARAMETER_NAMES, result.identifiable, strict=True) if not known
+    }
     assert unknown == {"I_xx", "I_xz", "I_zz"}
     known = result.identifiable
     np.testing.assert_allclose(estimate(result)[known], TRUTH[known], rtol=0, atol=1e-9)
@@ -185,7 +187,7 @@ def test_one_pose_determines_no_mass():
     # The minimum norm solution reproduces the wrench; only what one pose tells is called known.
     predicted = result.offsets + non_contact_wrench(s, REST, REST, result.phi)
     np.testing.assert_allclose(predicted, F, atol=1e-9)
-    known = {n for n, known in zip(PARAMETERS, result.identifiable, strict=True) if known}
+    known = {n for n, known in zip(PARAMETER_NAMES, result.identifiable, strict=True) if known}
     assert known <= {"f_ox", "f_oy", "tau_oz"}
     assert not result.identifiable[6:].any()
 

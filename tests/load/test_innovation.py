@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from load_cases import TOOL
 
-from drake_teleop.load.online.change import whitening
+from drake_teleop.load.online.change import whitening_matrix
 from drake_teleop.load.regressor import non_contact_wrench
 
 
@@ -17,5 +17,5 @@ def test_a_share_of_force_and_torque_is_not_known():
     arm = np.sum((TOOL[1:4] / TOOL[0]) ** 2)
     assert wrench[5] ** 2 > 0.05 * tau
     expected = 0.02**2 * np.repeat([f, tau + arm * f], 3)
-    root = whitening(motion, TOOL, np.zeros(15), 0.02**2, 3)
+    root = whitening_matrix(motion, TOOL, np.zeros(15), 0.02**2, 3)
     np.testing.assert_allclose(root, np.diag(expected**-0.5), rtol=1e-9)

@@ -102,7 +102,7 @@ def test_the_bias_is_gone_without_knowing_the_noise_and_the_covariance_is_honest
 def test_useless_instruments_leave_the_prior():
     F, motion, _ = record(1)
     estimator = learnt(F, motion, np.zeros((1500, 9)))
-    assert not estimator.settled
+    assert not estimator.is_settled
     assert (np.abs(estimator.phi) < 0.1 * np.array(PRIOR_STD[6:])).all()
     deviations = np.sqrt(np.diag(estimator.covariance))
     np.testing.assert_allclose(deviations[6:], PRIOR_STD[6:], rtol=0.05)
@@ -127,7 +127,7 @@ def test_standing_still_does_not_wind_up():
     assert (np.abs(estimator.phi) <= PRIOR_STD[6:]).all()
     deviations = np.sqrt(np.diag(estimator.covariance))
     assert (deviations <= np.array(PRIOR_STD) * (1 + 1e-9)).all()
-    assert not estimator.settled
+    assert not estimator.is_settled
     estimator.learn(F, *motion, commanded)
     assert estimator.phi[0] == pytest.approx(TOOL[0], abs=0.15)
 

@@ -160,11 +160,11 @@ def test_settles_when_the_bound_is_reached():
     estimators = [RecursiveLeastSquares(NOISE, bound=bound) for bound in (0.1, 0.05, 0.02)]
     settled = []
     for estimator in estimators:
-        assert not estimator.settled
+        assert not estimator.is_settled
         settled.append(3000)
         for k, sample in enumerate(zip(F, *motion, strict=True)):
             estimator.update(*sample)
-            if estimator.settled:
+            if estimator.is_settled:
                 settled[-1] = k
                 break
         deviations = np.sqrt(np.diag(estimator.covariance))
@@ -180,9 +180,9 @@ def test_a_load_on_an_axis_can_be_settled_and_no_load_cannot():
     for sample in zip(F, *motion, strict=True):
         estimator.update_into(theta, memory, np.concatenate(sample))
     theta[7] = 0.0
-    assert estimator.settled_at(theta, memory)
+    assert estimator.is_settled_at(theta, memory)
     theta[6] = 0.0
-    assert not estimator.settled_at(theta, memory)
+    assert not estimator.is_settled_at(theta, memory)
 
 
 def test_bad_input_is_named_and_leaves_the_estimate():

@@ -9,7 +9,7 @@ from load_cases import OFFSETS, TOOL, rich_motion
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.moments import Noise
+from drake_teleop.load.moments import NoiseStd
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares
@@ -63,7 +63,7 @@ def test_without_noise_in_the_motion_it_is_least_squares():
 def test_it_is_the_batch_of_the_samples_so_far():
     F, motion = record(9)
     estimator = learnt(F, motion)
-    noise = Noise(NOISE, *(std[0] for std in np.split(MOTION, 3)))
+    noise = NoiseStd(NOISE, *(std[0] for std in np.split(MOTION, 3)))
     batch = identify_batch(F, *motion, method="total", noise=noise).identification
     np.testing.assert_allclose(estimator.phi, batch.phi, rtol=2e-4, atol=1e-7)
     np.testing.assert_allclose(estimator.offsets, batch.offsets, rtol=2e-4)
@@ -112,10 +112,10 @@ def test_after_one_and_a_half_seconds_the_load_is_settled():
     motion = [np.ascontiguousarray(x[::2]) for x in motion]  # any rate; a slow motion
     estimator = RecursiveTotalLeastSquares(NOISE, MOTION, bound=0.02)
     estimator.learn(F[:40], *(x[:40] for x in motion))
-    assert not estimator.settled
+    assert not estimator.is_settled
     F, motion = record(2)
     estimator = learnt(F, motion)
-    assert estimator.settled
+    assert estimator.is_settled
     assert estimator.phi[0] == pytest.approx(TOOL[0], rel=0.02)
     com = estimator.phi[1:4] / estimator.phi[0] - TOOL[1:4] / TOOL[0]
     assert np.linalg.norm(com) < 0.05 * np.linalg.norm(TOOL[1:4] / TOOL[0])
@@ -128,7 +128,7 @@ def test_without_rotation_the_inertia_stays_bounded_and_is_not_called_known():
     for sample in zip(F, *motion, strict=True):
         estimator.update(*sample)
         assert np.abs(estimator.phi[4:]).max() < 0.2
-    assert not estimator.settled
+    assert not estimator.is_settled
     result = estimator.identification()
     assert not result.identifiable[INERTIAS].any()
     assert [result.verdicts[i] for i in INERTIAS] == ["prior"] * 3
@@ -157,7 +157,7 @@ def test_standing_still_does_not_wind_up():
     estimator.learn(F_still, *still)
     assert np.isfinite(theta(estimator)).all()
     assert (np.abs(estimator.phi) <= PRIOR_STD[6:]).all()
-    assert not estimator.settled
+    assert not estimator.is_settled
     deviations = np.sqrt(np.diag(estimator.covariance))
     assert (deviations <= np.array(PRIOR_STD) * (1 + 1e-9)).all()
     estimator.learn(F, *motion)
@@ -186,7 +186,7 @@ def test_an_ideal_sensor_is_no_trouble(noise_std, motion_std):
         assert (np.linalg.eigvalsh(estimator.covariance) >= -1e-12).all()
     np.testing.assert_allclose(estimator.phi, TOOL, rtol=0, atol=1e-7)
     np.testing.assert_allclose(estimator.offsets, OFFSETS, rtol=0, atol=1e-6)
-    assert estimator.settled and estimator.identification().identifiable.all()
+    assert estimator.is_settled and estimator.identification().identifiable.all()
 
 
 def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same():
@@ -214,7 +214,7 @@ def test_starts_from_an_estimate():
     for _ in range(50):
         estimator.update_into(state, memory, sample)
     np.testing.assert_allclose(state, TRUTH, rtol=1e-9)
-    assert not estimator.settled_at(state, memory)
+    assert not estimator.is_settled_at(state, memory)
 
 
 def test_identification_is_saved_and_read(tmp_path):

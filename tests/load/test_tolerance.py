@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.tolerance import (
-    deviations_of,
-    errors_of,
+    derivatives_over_tolerances,
+    deviations_over_tolerances,
     read_tolerance,
-    sizes_of,
-    values_of,
+    tolerances_in_units,
+    values_of_required,
 )
 
 ALL = "mass 0.5 %, com 0.5 mm, inertia 5 %"
@@ -23,8 +25,8 @@ PHI = phi_from_mass_com_inertia(3.1, [0.02, -0.03, 0.085], INERTIA)
 def test_words_are_read_as_they_are_written() -> None:
     asked = read_tolerance(ALL)
     assert (asked.mass, asked.com, asked.inertia) == (0.005, 0.0005, 0.05)
-    assert str(asked) == ALL and len(asked.entries) == 10
-    assert read_tolerance("com 1e-3 m").entries == ("com x", "com y", "com z")
+    assert str(asked) == ALL and len(asked.required_entries) == 10
+    assert read_tolerance("com 1e-3 m").required_entries == ("com x", "com y", "com z")
 
 
 @pytest.mark.parametrize(
@@ -38,10 +40,11 @@ def test_what_is_no_tolerance_is_refused(text: str) -> None:
 
 def test_small_errors_are_those_of_the_numbers_themselves() -> None:
     asked, step = read_tolerance(ALL), 1e-6
-    moved = [values_of(asked, PHI + step * row) - values_of(asked, PHI - step * row)
-             for row in np.eye(10)]  # fmt: skip
-    numbers = np.array(moved).T / (2.0 * step) / sizes_of(asked, PHI)[:, None]
-    errors = errors_of(asked, PHI)
+    steps = step * np.eye(10)
+    values = partial(values_of_required, asked)
+    moved = [values(PHI + row) - values(PHI - row) for row in steps]
+    numbers = np.array(moved).T / (2.0 * step) / tolerances_in_units(asked, PHI)[:, None]
+    errors = derivatives_over_tolerances(asked, PHI)
     np.testing.assert_array_equal(errors[:, :6], 0.0)
     np.testing.assert_allclose(errors[:, 6:], numbers, rtol=1e-6, atol=1e-6 * np.abs(numbers).max())
 
@@ -49,5 +52,9 @@ def test_small_errors_are_those_of_the_numbers_themselves() -> None:
 def test_what_depends_on_the_unknown_is_unknown() -> None:
     covariance = np.diag(np.full(16, 1e-8))
     covariance[10, 10] = np.inf  # I_xx
-    known = np.isfinite(deviations_of(errors_of(read_tolerance(ALL), PHI), covariance))
+    known = np.isfinite(
+        deviations_over_tolerances(
+            derivatives_over_tolerances(read_tolerance(ALL), PHI), covariance
+        )
+    )
     np.testing.assert_array_equal(known, [True] * 4 + [False] + [True] * 5)

@@ -8,12 +8,12 @@ from load_cases import OFFSETS, TOOL, rich_motion
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.total_least_squares import total_least_squares
-from drake_teleop.load.moments import Moments, Noise, normal_equations, residual_covariance
+from drake_teleop.load.moments import NoiseStd, SecondMoments, normal_equations, residual_covariance
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 TRUTH = np.concatenate([OFFSETS, TOOL])
 WRENCH_NOISE = np.array([0.25] * 3 + [0.012] * 3)
-NOISE = Noise(s=0.1, omega=0.03, alpha=3.0)
+NOISE = NoiseStd(s=0.1, omega=0.03, alpha=3.0)
 
 
 def record(samples=500, seed=0):
@@ -28,7 +28,7 @@ def noisy(clean, seed):
 
 
 def moments_of(arrays, **weights):
-    moments = Moments()
+    moments = SecondMoments()
     moments.add(*arrays, **weights)
     return moments
 
@@ -39,25 +39,25 @@ def test_moments_hold_the_stacked_matrix():
     root = np.random.default_rng(2).normal(size=(6, 6))
     W, weights = root @ root.T, np.random.default_rng(3).uniform(size=500)
     moments = moments_of((F, *motion), weights=weights)
-    gram, right = normal_equations(moments.mean, W)
+    gram, right = normal_equations(moments.mean_products, W)
     WA = np.einsum("n,cd,ndj->ncj", weights / weights.sum(), W, A)
     np.testing.assert_allclose(gram, np.einsum("nci,ncj->ij", A, WA), rtol=1e-9, atol=1e-8)
     np.testing.assert_allclose(right, np.einsum("ncj,nc->j", WA, F), rtol=1e-9, atol=1e-8)
     r = F - A @ TRUTH
     expected = np.einsum("n,nc,nd->cd", weights / weights.sum(), r, r)
-    got = residual_covariance(moments.mean, TRUTH)
+    got = residual_covariance(moments.mean_products, TRUTH)
     np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-9)
 
 
 def test_noise_covariance_predicts_the_residual():
     clean = record(5000)
     Q = moments_of(clean).noise_covariance(NOISE, WRENCH_NOISE)
-    S = residual_covariance(moments_of(noisy(clean, 4)).mean, TRUTH)
+    S = residual_covariance(moments_of(noisy(clean, 4)).mean_products, TRUTH)
     scale = np.sqrt(np.outer(np.diag(S), np.diag(S)))
     np.testing.assert_allclose(S / scale, residual_covariance(Q, TRUTH) / scale, atol=0.06)
 
 
-@pytest.mark.parametrize("noise", [Noise(), NOISE])
+@pytest.mark.parametrize("noise", [NoiseStd(), NOISE])
 def test_exact_without_noise(noise):
     form = total_least_squares(moments_of(record()), noise, WRENCH_NOISE)
     np.testing.assert_allclose(form.theta, TRUTH, rtol=0, atol=1e-9)
@@ -68,7 +68,7 @@ def test_no_bias_where_least_squares_has_one():
     errors = np.empty((2, 40, 16))
     for seed in range(40):
         moments = moments_of(noisy(clean, seed))
-        for k, noise in enumerate([Noise(), NOISE]):
+        for k, noise in enumerate([NoiseStd(), NOISE]):
             errors[k, seed] = total_least_squares(moments, noise, WRENCH_NOISE).theta - TRUTH
     bias, deviation = errors.mean(axis=1), errors.std(axis=1) / np.sqrt(40)
     moments_of_inertia = [10, 13, 15]
@@ -79,7 +79,7 @@ def test_no_bias_where_least_squares_has_one():
 
 def test_scale_says_how_wrong_the_stated_noise_is():
     moments = moments_of(noisy(record(4000), 5))
-    stated = Noise(s=0.05, omega=0.015, alpha=1.5)
+    stated = NoiseStd(s=0.05, omega=0.015, alpha=1.5)
     form = total_least_squares(moments, stated, 0.5 * WRENCH_NOISE)
     assert form.scale == pytest.approx(4.0, rel=0.05)
     right = total_least_squares(moments, NOISE, WRENCH_NOISE)
@@ -99,17 +99,17 @@ def test_static_poses_leave_the_inertia_at_zero():
     s = record(50)[1]
     F = OFFSETS + non_contact_wrench(s, np.zeros(3), np.zeros(3), TOOL)
     moments = moments_of((F, s, np.zeros(3), np.zeros(3)))
-    form = total_least_squares(moments, Noise(s=0.1), WRENCH_NOISE)
+    form = total_least_squares(moments, NoiseStd(s=0.1), WRENCH_NOISE)
     np.testing.assert_allclose(form.theta[:10], TRUTH[:10], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(form.theta[10:], np.zeros(6))
 
 
 def test_bad_input_is_named():
     with pytest.raises(DrakeTeleopError, match=r"^noise\.alpha: has the negative value -"):
-        Noise(alpha=-1.0)
+        NoiseStd(alpha=-1.0)
     with pytest.raises(
         DrakeTeleopError, match=r"^noise\.wrench: has the value .*, which is not positive"
     ):
-        Noise(wrench=np.zeros(6))
+        NoiseStd(wrench=np.zeros(6))
     with pytest.raises(DrakeTeleopError, match="2 samples cannot determine"):
-        total_least_squares(moments_of([x[:2] for x in record()]), Noise(), WRENCH_NOISE)
+        total_least_squares(moments_of([x[:2] for x in record()]), NoiseStd(), WRENCH_NOISE)

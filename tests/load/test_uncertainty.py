@@ -19,14 +19,14 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.uncertainty import (
     base_parameters,
-    intervals,
-    prior_dominated,
+    confidence_intervals,
+    is_prior_dominated,
 )
 from drake_teleop.load.identification import (
-    PARAMETERS,
+    PARAMETER_NAMES,
     Identification,
     com_deviations,
-    natural_scale,
+    natural_scales,
 )
 from drake_teleop.load.normal_equations import NormalEquations, identify
 from drake_teleop.load.online.recursive import RecursiveLeastSquares
@@ -164,7 +164,7 @@ def test_slow_noise_is_told():
     walk = np.cumsum(white, axis=0) / np.sqrt(len(white))
     drifting = slow(np.where(np.arange(6) == 4, white + 30.0 * walk, white))
     assert drifting.slow_noise == ("tau_y",)
-    assert drifting.lines()[-1] == "drift or slow noise in tau_y: all +- are lower bounds"
+    assert drifting.text_lines()[-1] == "drift or slow noise in tau_y: all +- are lower bounds"
     for seed in range(20):
         noise = study.coloured_noise(np.random.default_rng(seed), len(white), "AR(1) 0.9, 1 kHz")
         assert slow(noise).slow_noise == ()
@@ -213,18 +213,18 @@ def plain(**changes):
 
 def test_quantiles():
     normal = plain(degrees_of_freedom=np.full(16, np.inf))
-    low, high = intervals(normal)
+    low, high = confidence_intervals(normal)
     np.testing.assert_allclose(high - low, 2 * 1.959964 * normal.standard_deviations, rtol=1e-5)
     np.testing.assert_allclose((high + low) / 2, [*normal.offsets, *normal.phi], atol=1e-12)
-    low, high = intervals(plain(degrees_of_freedom=np.full(16, 4.0)), level=0.99)
+    low, high = confidence_intervals(plain(degrees_of_freedom=np.full(16, 4.0)), level=0.99)
     np.testing.assert_allclose(high - low, 2 * 4.604095 * normal.standard_deviations, rtol=1e-5)
     with pytest.raises(DrakeTeleopError, match=r"^level: 1\.0 is not between 0 and 1"):
-        intervals(normal, 1.0)
+        confidence_intervals(normal, 1.0)
 
 
 def test_undetermined_parameters_can_be_anything():
     load = equations_of(turntable()).solve()
-    low, high = intervals(load)
+    low, high = confidence_intervals(load)
     unknown = np.isinf(load.standard_deviations)
     assert unknown.any()
     assert (low[unknown] == -np.inf).all() and (high[unknown] == np.inf).all()
@@ -236,7 +236,7 @@ def test_undetermined_parameters_can_be_anything():
 def test_verdicts_follow_from_the_deviations():
     load = plain()
     share = np.array([0.049, 0.051, 0.49, 0.51, np.inf, *[0.01] * 11])
-    variances = (share * natural_scale(load.phi)) ** 2
+    variances = (share * natural_scales(load.phi)) ** 2
     load = plain(
         covariance=np.diag(variances),
         identifiable=share <= 0.05,
@@ -247,17 +247,17 @@ def test_verdicts_follow_from_the_deviations():
 
 
 def test_prior_dominated_is_what_the_data_did_not_tell():
-    assert prior_dominated([0.1, 0.5, 1.0, 1.0], [1.0, 1.0, 1.0, np.inf]).tolist() == [
+    assert is_prior_dominated([0.1, 0.5, 1.0, 1.0], [1.0, 1.0, 1.0, np.inf]).tolist() == [
         *(False, True, True, False)
     ]
     with pytest.raises(
         DrakeTeleopError, match=r"^prior_std: has shape .*; give positive numbers of shape \(2,\)"
     ):
-        prior_dominated([1.0, 1.0], [1.0, 0.0])
+        is_prior_dominated([1.0, 1.0], [1.0, 0.0])
     with pytest.raises(
         DrakeTeleopError, match=r"^prior_std: has shape .*; give positive numbers of shape \(2,\)"
     ):
-        prior_dominated([1.0, 1.0], [1.0])
+        is_prior_dominated([1.0, 1.0], [1.0])
     prior = np.full(16, 10.0)
     estimator = RecursiveLeastSquares(NOISE, prior_std=prior)
     motion = turntable(200)
@@ -265,7 +265,7 @@ def test_prior_dominated_is_what_the_data_did_not_tell():
         sample = tuple(x[i] for x in motion)
         estimator.update(OFFSETS + non_contact_wrench(*sample, TOOL), *sample)
     deviations = np.sqrt(np.diag(estimator.covariance))
-    names = {PARAMETERS[i] for i in np.flatnonzero(prior_dominated(deviations, prior))}
+    names = {PARAMETER_NAMES[i] for i in np.flatnonzero(is_prior_dominated(deviations, prior))}
     assert {"I_xx", "I_xy", "I_yy"} <= names
     assert not names & {"f_ox", "f_oy", "m c_y"}
 
@@ -322,7 +322,7 @@ def test_a_turntable_determines_sums():
     motion = turntable()
     base = base_parameters(equations_of(motion, noise=1e-3))
     rows = stacked(motion)
-    assert base.rank == np.linalg.matrix_rank(rows, tol=1e-9 * np.linalg.norm(rows))
+    assert base.num_combinations == np.linalg.matrix_rank(rows, tol=1e-9 * np.linalg.norm(rows))
     assert set(base.without_influence) == {"I_xx", "I_xy", "I_yy"}
     coefficients = np.array([c.coefficients for c in base.combinations])
     # No combination changes along the null space, and its estimate is the truth's.
@@ -342,14 +342,14 @@ def test_a_turntable_determines_sums():
 
 
 def unit(name):
-    return np.eye(16)[PARAMETERS.index(name)]
+    return np.eye(16)[PARAMETER_NAMES.index(name)]
 
 
 def test_one_pose_in_words():
     still = np.zeros((100, 3))
     lines = base_parameters(
         equations_of((still + np.array([0.0, 0.0, 9.81]), still, still), noise=1e-3)
-    ).lines()
+    ).text_lines()
     assert lines[0] == "6 of 16 combinations of offsets and load are determined"
     assert lines[1].endswith("m c_z, I_xx, I_xy, I_xz, I_yy, I_yz, I_zz")
     together = {line.split(" = ")[0] for line in lines[2:]}
@@ -362,10 +362,10 @@ def test_one_pose_in_words():
 
 def test_a_full_record_has_nothing_to_add():
     base = base_parameters(equations_of(rich_motion(2000), noise=1.0))
-    assert base.rank == 16 and not base.without_influence and not base.directions
-    assert base.lines() == ["16 of 16 combinations of offsets and load are determined"]
-    names = [PARAMETERS[c.leading] for c in base.combinations]
-    assert names == list(PARAMETERS)
+    assert base.num_combinations == 16 and not base.without_influence and not base.directions
+    assert base.text_lines() == ["16 of 16 combinations of offsets and load are determined"]
+    names = [PARAMETER_NAMES[c.leading] for c in base.combinations]
+    assert names == list(PARAMETER_NAMES)
     load = equations_of(rich_motion(2000), noise=1.0).solve()
     deviations = [c.standard_deviation for c in base.combinations]
     np.testing.assert_allclose(deviations, load.standard_deviations, rtol=1e-9)
@@ -385,7 +385,7 @@ def test_weak_directions_are_principal_directions_of_the_covariance():
         variance = c.coefficients @ load.covariance @ c.coefficients
         assert c.standard_deviation == pytest.approx(np.sqrt(variance))
     worst = base.directions[-1]
-    assert any(worst.words in line and line.startswith("weak: ") for line in base.lines())
+    assert any(worst.words in line and line.startswith("weak: ") for line in base.text_lines())
 
 
 # ---- predicted wrench
@@ -436,7 +436,7 @@ def test_intervals_of_poses_at_rest_cover_the_truth(repeats, misfit):
     covered = []
     for count in (3, 4, 6, 12) if repeats == 1 else (4, 6, 12):
         for load in loads_at_rest(count, 300 if repeats == 1 else 150, repeats, misfit):
-            lower, upper = intervals(load)
+            lower, upper = confidence_intervals(load)
             covered.append((lower <= TRUTH) & (upper >= TRUTH))
             assert not load.identifiable[10:].any()
     for name, group in GROUPS.items():
@@ -480,7 +480,7 @@ def test_poses_about_the_vertical_determine_three_offsets_alone(seed):
     load = identify_batch(F, s, 0 * s, 0 * s, shared_noise=True).identification
     known = [
         name
-        for name, x in zip(PARAMETERS, load.covariance.diagonal(), strict=True)
+        for name, x in zip(PARAMETER_NAMES, load.covariance.diagonal(), strict=True)
         if np.isfinite(x)
     ]
     assert known == ["f_ox", "f_oy", "tau_oz"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from drake_teleop.load.identification import Identification, natural_scale
+from drake_teleop.load.identification import Identification, natural_scales
 from drake_teleop.logs.processing import IdentifiedLog, eliminate_log, identify_log
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.replay_log import ReplayLogSource
@@ -58,7 +58,7 @@ def is_right(found: IdentifiedLog) -> bool:
     """Whether no number that is called identified is certain and wrong, and the mass is known."""
     load = found.identification
     error = np.abs(np.concatenate([load.offsets, load.phi]) - TRUTH)
-    wrong = (error > 4.0 * load.standard_deviations) & (error > 0.02 * natural_scale(PHI))
+    wrong = (error > 4.0 * load.standard_deviations) & (error > 0.02 * natural_scales(PHI))
     return bool(load.identifiable[6] and not (wrong & load.identifiable).any())
 
 

@@ -11,12 +11,12 @@ from posed_record import PHI
 from test_causes_model import GRAVITY_W, OFFSETS, SWAPPED, T, moving, record
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causes.candidates import candidates
-from drake_teleop.logs.causes.cause import causes_of, stretches
-from drake_teleop.logs.causes.changes import contact_spans, with_ramps
+from drake_teleop.logs.causes.candidates import fit_candidates
+from drake_teleop.logs.causes.cause import causes_of_fit, loads_between_changes
+from drake_teleop.logs.causes.changes import find_contact_spans, fit_with_ramps
 from drake_teleop.logs.causes.explain import _remove_delay
-from drake_teleop.logs.causes.instants import instants
-from drake_teleop.logs.causes.model import DELAY, Model, Step
+from drake_teleop.logs.causes.instants import block_means_of_record
+from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, Step
 from drake_teleop.logs.causes.state import State, likelihood_gain
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
@@ -27,7 +27,7 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
     covariance = np.diag(1e-6 * np.arange(1.0, len(x) + 1))
     fit, data = SimpleNamespace(covariance=covariance), record(np.zeros((len(T), 6)))
     state = SimpleNamespace(model=model, x=x, fit=fit, data=data, spans=spans)
-    state.extension = partial(State.extension, state)
+    state.parameters_of_extension = partial(State.parameters_of_extension, state)
     return state
 
 
@@ -61,12 +61,12 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
     ],
 )  # fmt: skip
 def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, name, figures, words):
-    (cause,) = causes_of(state_of(model, values))
+    (cause,) = causes_of_fit(state_of(model, values))
     assert cause.name == name and words in cause.message
     for key, value in figures.items():
         found = cause.values[key]
         assert found == (value if key == "axes" else pytest.approx(value, abs=1e-3))
-    given = causes_of(state_of(model, values), given=model.parts)
+    given = causes_of_fit(state_of(model, values), given=model.parts)
     assert bool(given) != bool(model.parts)
 
 
@@ -78,7 +78,7 @@ def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
     steps = (Step("load", 103.0), Step("offsets", 105.0))
     values = [*LOAD, 1.0, *np.zeros(5)]
     state = state_of(Model(steps=steps), values, (span,))
-    found = causes_of(state)
+    found = causes_of_fit(state)
     contacts = [(x.start_s, x.stop_s) for x in found if x.name == "contact"]
     margin = state.data.dt
     assert contacts == ([(span[0] + margin, span[1] - margin)] if shown else [])
@@ -91,7 +91,7 @@ def test_each_part_of_a_record_has_its_load_and_the_uncertainty_of_all_changes_b
     values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
     state = state_of(Model(steps=steps), values)
     covariance = 4.0 * state.fit.covariance[:16, :16]
-    parts = stretches(state, covariance)
+    parts = loads_between_changes(state, covariance)
     assert [(x.start_s, x.stop_s) for x in parts] == [
         (pytest.approx(a), pytest.approx(b))
         for a, b in ((100.0, 102.0), (102.0, 104.0), (104.0, T[-1]))
@@ -104,7 +104,7 @@ def test_each_part_of_a_record_has_its_load_and_the_uncertainty_of_all_changes_b
         np.diag(parts[2].covariance)[6:],
         variance + 4e-6 * (np.arange(18.0, 28) + np.arange(34.0, 44)),
     )
-    assert stretches(state_of(Model(steps=steps[1:2]), [1.0] * 6), covariance) == []
+    assert loads_between_changes(state_of(Model(steps=steps[1:2]), [1.0] * 6), covariance) == []
 
 
 @pytest.mark.parametrize(
@@ -117,13 +117,13 @@ def test_delay_of_a_model_is_removed_up_to_300_ms(before, moves, late):
     wrench = non_contact_wrench(s, omega, alpha, PHI) + OFFSETS + noise
 
     def with_delay(delay: float):
-        return instants(T, wrench, moving(T + delay - before - late), GRAVITY_W)
+        return block_means_of_record(T, wrench, moving(T + delay - before - late), GRAVITY_W)
 
-    state = State.of(with_delay(before), Model())
-    assert state.x[DELAY] == pytest.approx(late, abs=1e-3)
+    state = State.fit_record(with_delay(before), Model())
+    assert state.x[DELAY_PARAMETER] == pytest.approx(late, abs=1e-3)
     after, delay = _remove_delay(state, before, with_delay)
     assert delay == (pytest.approx(before + late, abs=5e-4) if moves else before)
-    assert (abs(after.x[DELAY]) < 5e-4) == moves
+    assert (abs(after.x[DELAY_PARAMETER]) < 5e-4) == moves
     assert _remove_delay(state, before, None) == (state, before)
 
 
@@ -152,14 +152,14 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
     wrench += share * ("load" in kinds) * non_contact_wrench(s, omega, alpha, load)
     wrench += share * ("offsets" in kinds) * step
     wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
-    state = State.of(record(wrench), Model(steps=(Step("offsets", 100.99),)))
-    found = with_ramps(state, [kinds], [guess], ((100.5, 100.6),))
+    state = State.fit_record(record(wrench), Model(steps=(Step("offsets", 100.99),)))
+    found = fit_with_ramps(state, [kinds], [guess], ((100.5, 100.6),))
     assert found.spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
     assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
     assert found.model.steps[0].time == 100.99
     for k, kind in enumerate(kinds, start=1):
         assert found.model.steps[k].time == pytest.approx(103.0, abs=0.03)
-        value = found.extension(f"step {k}")[0]
+        value = found.parameters_of_extension(f"step {k}")[0]
         truth = load if kind == "load" else step
         np.testing.assert_allclose(value[:3], truth[:3], atol=0.02)
 
@@ -175,15 +175,15 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
     touched = ((start < T) & (stop > T))[:, None]
     wrench += touched * [8.0, 0.0, 5.0, 0.3, 0.0, 0.0] * (1.0 + np.sin(3.0 * T[:, None]))
-    state = State.of(record(wrench), Model())
-    ((found_start, found_stop),) = contact_spans(state)
+    state = State.fit_record(record(wrench), Model())
+    ((found_start, found_stop),) = find_contact_spans(state)
     assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
     assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
-    for name in ("_fit_part", "_factor", "_axes"):
+    for name in ("_fit_part", "_torque_factor_candidates", "_axis_permutation_candidates"):
         monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
     monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step", lambda *_: None)
     monkeypatch.setattr("drake_teleop.logs.causes.candidates._SMALLEST_GAIN", 1.0)
-    (contact,) = candidates(state, True)
+    (contact,) = fit_candidates(state, True)
     price = (6 + 2 * ends) * np.log(state.data.used.sum())
     gain = 2.0 * (contact.state.likelihood - state.likelihood)
     assert contact.name == "contact" and contact.state.spans == ((found_start, found_stop),)
@@ -201,4 +201,9 @@ def test_rest_at_both_ends_does_not_make_another_error_a_contact(rest: float) ->
     motion = (s, omega, np.gradient(omega, dt, axis=0))
     wrench = non_contact_wrench(*motion, PHI)[:, [1, 0, 2, 4, 3, 5]] + OFFSETS
     wrench += np.repeat([0.02, 2e-3], 3) * np.random.default_rng(1).normal(size=wrench.shape)
-    assert contact_spans(State.of(instants(t, wrench, motion, GRAVITY_W), Model())) == ()
+    assert (
+        find_contact_spans(
+            State.fit_record(block_means_of_record(t, wrench, motion, GRAVITY_W), Model())
+        )
+        == ()
+    )

@@ -10,10 +10,15 @@ from posed_record import PHI
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causes.instants import FORCES, Instants, free_delay, instants
+from drake_teleop.logs.causes.instants import (
+    FORCES,
+    Instants,
+    block_means_of_record,
+    delay_of_free_fit,
+)
 from drake_teleop.logs.causes.intervals import misfit_factor
-from drake_teleop.logs.causes.model import DELAY, Model, Step
-from drake_teleop.logs.causes.state import Rows, fit, in_spans, regularized_inverse
+from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, Step
+from drake_teleop.logs.causes.state import Rows, fit_model, is_in_spans, regularized_inverse
 
 GRAVITY_W = np.array([0.4, -0.3, -9.79])
 OFFSETS = np.array([3.0, -2.0, 5.0, 0.3, -0.2, 0.1])
@@ -31,7 +36,7 @@ def moving(t: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def record(wrench: np.ndarray) -> Instants:
-    return instants(T, wrench, moving(T), GRAVITY_W)
+    return block_means_of_record(T, wrench, moving(T), GRAVITY_W)
 
 
 def read(name: str, values: np.ndarray) -> np.ndarray:
@@ -78,18 +83,22 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
     model = Model(() if gains else (name,), gains)
     data = record(read(name, values) + OFFSETS)
     x = np.concatenate([OFFSETS, PHI, [0.0], values])
-    y = data.with_steps(())
-    np.testing.assert_allclose(model.wrench(x[None])[0] @ y[1:-1].T, y[1:-1, FORCES].T, atol=1e-9)
-    left = model.residual(x) @ y[:, model.columns].T
+    y = data.append_step_signals(())
+    np.testing.assert_allclose(
+        model.wrench_coefficients(x[None])[0] @ y[1:-1].T, y[1:-1, FORCES].T, atol=1e-9
+    )
+    left = model.residual_coefficients(x) @ y[:, model.columns].T
     np.testing.assert_allclose(left, 0.0, atol=1e-9)
     move = 1e-6 * np.random.default_rng(1).normal(size=model.size)
-    change = model.residual(x + move) - model.residual(x - move)
-    expected = -2.0 * np.tensordot(move, model.derivative(x), 1)
+    change = model.residual_coefficients(x + move) - model.residual_coefficients(x - move)
+    expected = -2.0 * np.tensordot(move, model.wrench_derivative(x), 1)
     np.testing.assert_allclose(change, expected, atol=1e-9)
-    assert model.start(x, Model())[: DELAY + 1] == pytest.approx(x[: DELAY + 1])
-    assert not model.start(x, Model())[DELAY + 1 :].any()
-    other = model.extended("torque factor")
-    np.testing.assert_array_equal(other.start(x, model)[other.slices[name]], values)
+    assert model.start_parameters(x, Model())[: DELAY_PARAMETER + 1] == pytest.approx(
+        x[: DELAY_PARAMETER + 1]
+    )
+    assert not model.start_parameters(x, Model())[DELAY_PARAMETER + 1 :].any()
+    other = model.with_extension("torque factor")
+    np.testing.assert_array_equal(other.start_parameters(x, model)[other.slices[name]], values)
 
 
 def test_axes_factor_and_steps_change_the_wrench_as_stated():
@@ -105,7 +114,7 @@ def test_axes_factor_and_steps_change_the_wrench_as_stated():
     expected = both.reshape(-1, 6) + OFFSETS + np.where(T < 103.01, 0.0, 1.0)[:, None] * offsets
     rng = np.random.default_rng(0)
     data = record(rng.normal(size=(len(T), 6)))
-    found = data.with_steps(model.times) @ model.wrench(x[None])[0].T
+    found = data.append_step_signals(model.step_times) @ model.wrench_coefficients(x[None])[0].T
     rates = np.gradient(data.y[:, FORCES], 0.02, axis=0)
     inside = slice(2, -2)
     np.testing.assert_allclose(found[inside], (expected + 0.02 * rates)[inside], atol=1e-9)
@@ -120,12 +129,12 @@ def test_whitened_sums_are_those_of_rows_with_four_predecessors(gaps):
     model = Model()
     rows = Rows(data, used, (), model.columns)
     whole = [n for n in range(4, len(T)) if used[n - 4 : n + 1].all()]
-    np.testing.assert_array_equal(rows.whole, whole)
+    np.testing.assert_array_equal(rows.rows_with_predecessors, whole)
     filters = rng.normal(size=(6, 5))
-    found = rows.whitened(filters)
+    found = rows.whitened_products(filters)
     residual = rng.normal(size=(6, len(model.columns)))
     e = rows.y @ residual.T
-    order, power = rows.noise(residual, np.zeros(6))
+    order, power = rows.noise_filters_and_power(residual, np.zeros(6))
     for c in range(6):
         z = sum(filters[c, d] * rows.y[np.array(whole) - d] for d in range(5))
         np.testing.assert_allclose(found[c], z.T @ z, atol=1e-7 * np.abs(z.T @ z).max())
@@ -133,8 +142,8 @@ def test_whitened_sums_are_those_of_rows_with_four_predecessors(gaps):
         taps = np.linalg.lstsq(past, e[whole, c], rcond=None)[0]
         np.testing.assert_allclose(order[c], [1.0, *-taps], atol=1e-5)
         assert power[c] == pytest.approx(np.mean((e[whole, c] - past @ taps) ** 2), rel=1e-5)
-    np.testing.assert_allclose(rows.rms(residual), np.sqrt(np.mean(e[used] ** 2, axis=0)))
-    assert rows.noise(residual, np.full(6, 1e9))[1].tolist() == [1e9] * 6
+    np.testing.assert_allclose(rows.residual_rms(residual), np.sqrt(np.mean(e[used] ** 2, axis=0)))
+    assert rows.noise_filters_and_power(residual, np.full(6, 1e9))[1].tolist() == [1e9] * 6
 
 
 @pytest.mark.parametrize(
@@ -155,11 +164,11 @@ def test_fit_gives_the_cause_within_its_deviations(name, values):
     data = record(read(name, np.array(values)) + OFFSETS + noise)
     gains = (int(name[-1]),) if "gain" in name else ()
     model = Model(() if gains else (name,), gains)
-    found = fit(model, Rows(data, data.used, (), model.columns))
+    found = fit_model(model, Rows(data, data.used, (), model.columns))
     error = found.x - np.concatenate([OFFSETS, PHI, [0.0], values])
     deviations = np.sqrt(np.diag(found.covariance))
     assert np.abs(error / deviations).max() < 4.0
-    assert np.linalg.norm(error[DELAY + 1 :]) < 0.05 * np.linalg.norm(values)
+    assert np.linalg.norm(error[DELAY_PARAMETER + 1 :]) < 0.05 * np.linalg.norm(values)
     np.testing.assert_allclose(found.filters[:, 1], -0.7, atol=0.25)
     np.testing.assert_allclose(np.sqrt(found.power) / white, 1.0, atol=0.25)
 
@@ -178,7 +187,7 @@ def test_inverse_has_large_values_only_for_undetermined_parameters():
 def test_free_delay_is_that_of_the_motion(delay):
     s, omega, alpha, *_ = moving(T + delay)
     data = record(non_contact_wrench(s, omega, alpha, PHI) + OFFSETS)
-    assert free_delay(data) == pytest.approx(delay, abs=2e-3)
+    assert delay_of_free_fit(data) == pytest.approx(delay, abs=2e-3)
 
 
 @pytest.mark.parametrize("size", [1, 4, 10])
@@ -189,20 +198,20 @@ def test_instants_are_block_means(size):
     noise = np.random.default_rng(0).normal(size=(len(t), 6)) * np.repeat([0.4, 0.03], 3)
     lost = np.zeros(len(t), bool)
     lost[[50 * size, 120 * size - 1]] = True
-    data = instants(t, noise, moving(t), GRAVITY_W, lost)
+    data = block_means_of_record(t, noise, moving(t), GRAVITY_W, lost)
     np.testing.assert_array_equal(np.flatnonzero(~data.used), [0, 50, 119, 199])
     np.testing.assert_allclose(data.t, t.reshape(200, size).mean(axis=1))
     means = noise.reshape(200, size, 6).mean(axis=1)
     np.testing.assert_allclose(data.y[data.used][:, FORCES], means[data.used])
     np.testing.assert_allclose(data.white * np.sqrt(size), np.repeat([0.4, 0.03], 3), rtol=0.25)
-    called = instants(t, noise, moving, GRAVITY_W, lost)
+    called = block_means_of_record(t, noise, moving, GRAVITY_W, lost)
     np.testing.assert_allclose(called.y, data.y, atol=2e-3 * np.abs(data.y).max())
     assert data.dt == pytest.approx(0.02) and data.positions
 
 
 def test_rows_within_spans_are_marked():
     data = record(np.zeros((len(T), 6)))
-    inside = in_spans(data, ((101.0, 101.5), (103.0, 103.0)))
+    inside = is_in_spans(data, ((101.0, 101.5), (103.0, 103.0)))
     np.testing.assert_allclose(data.t[inside], [*np.arange(101.0, 101.51, 0.02), 103.0])
 
 

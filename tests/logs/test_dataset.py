@@ -23,12 +23,12 @@ from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_chan
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     find_hypothesis,
-    offset_step,
-    unexplained,
+    find_offset_step,
+    unexplained_reading,
 )
-from drake_teleop.logs.pose_motion.poses import Posed, Poses
+from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.sample import NOISE, PHI, SampleEpisode, sample_episode
+from drake_teleop.logs.sample import NOISE_STD, TRUE_PHI, SampleEpisode, sample_episode
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from sample_dataset import write_sample_dataset
@@ -38,17 +38,22 @@ QUARTER_Z = Rotation.from_euler("z", 90, degrees=True).as_matrix()
 
 
 def log_of(x: SampleEpisode) -> Log:
-    poses, none = Poses(x.t, x.position, x.quaternion).continued(), np.zeros((len(x.t), 3))
-    return Log(x.t, x.wrench, none, none, none, posed=Posed(poses, GRAVITY_W))
+    poses, none = (
+        Poses(x.t, x.position, x.quaternion).with_continuous_quaternions(),
+        np.zeros((len(x.t), 3)),
+    )
+    return Log(x.t, x.wrench, none, none, none, posed=PosesOfLog(poses, GRAVITY_W))
 
 
 def verdict(x: SampleEpisode) -> set[str]:
     fps = 1.0 / (x.t[1] - x.t[0])
     signals = EpisodeSignals(log_of(x), max(2.0, 0.12 * fps))
-    predict = signals.predictor(PHI)
-    found = find_hypothesis(predict, signals.regress, 0.0, 0.8 * NOISE)
-    names = {f.name for f in name_faults(found, 0.0, PHI, fps) + saturated_channels(x.wrench)}
-    step = offset_step(unexplained(found, predict, signals.regress), found.spread)
+    predict = signals.reading_predictor(TRUE_PHI)
+    found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD)
+    names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturated_channels(x.wrench)}
+    step = find_offset_step(
+        unexplained_reading(found, predict, signals.regressor_at_lag), found.spread
+    )
     return names | ({"tared"} if step is not None else set())
 
 
@@ -108,9 +113,9 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
     squares = []
     for number in range(6):
         x = sample_episode(number, phi=phi, contacts=0)
-        reading, load_wrench = EpisodeSignals(log_of(x), 4.0).predictor(phi)("sensor", 0.0)
+        reading, load_wrench = EpisodeSignals(log_of(x), 4.0).reading_predictor(phi)("sensor", 0.0)
         rest = reading - load_wrench
-        squares.append(((rest - np.median(rest, axis=0)) / NOISE) ** 2)
+        squares.append(((rest - np.median(rest, axis=0)) / NOISE_STD) ** 2)
     assert np.sqrt(np.mean(squares)) < 1.2
     assert np.sqrt(np.mean([x[[0, -1]] for x in squares])) < 4.0
 
@@ -125,7 +130,9 @@ def test_any_large_rotation_of_the_wrench_is_found(
     R = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     x = mapped(R)(sample_episode(number, contacts=1))
     signals = EpisodeSignals(log_of(x), 3.6)
-    found = find_hypothesis(signals.predictor(PHI), signals.regress, 0.0, 0.8 * NOISE)
+    found = find_hypothesis(
+        signals.reading_predictor(TRUE_PHI), signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD
+    )
     assert np.degrees(Rotation.from_matrix(found.force @ R.T).magnitude()) < 3.0
 
 
@@ -144,7 +151,7 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     assert [row["verdict"] for row in summary["episodes"]] == [
         *(["ok"], ["ok"], ["sign", "frame"], ["ok"])
     ]
-    assert summary["mass"] == pytest.approx(PHI[0], rel=5e-3)
+    assert summary["mass"] == pytest.approx(TRUE_PHI[0], rel=5e-3)
     assert files_of(source) == before
     data = "data/chunk-000/file-000.parquet"
     old, new = (pl.read_parquet(folder / data) for folder in (source, tmp_path / "out" / "demo"))
@@ -152,7 +159,7 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     contact = np.array(new["observation.contact_wrench"].to_list())
     truth = np.vstack([x.contact_wrench for x in episodes])
     free = ~truth.any(axis=1)
-    assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * NOISE).all()
+    assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * NOISE_STD).all()
     touched, true = (
         new["observation.in_contact"].to_numpy(),
         np.hstack([x.in_contact for x in episodes]),
@@ -174,7 +181,7 @@ def test_a_killed_run_continues_to_the_same_bytes(
     source = tmp_path / "demo"
     write_sample_dataset(source, episodes=2)
     dataset_command(source, tmp_path / "whole", identify=True, quiet=True)
-    judged, left = [], command._judge
+    judged, left = [], command._judge_episode
 
     def judge(task: Any, work: Path, number: int) -> None:
         if len(judged) == 1:
@@ -182,7 +189,7 @@ def test_a_killed_run_continues_to_the_same_bytes(
         judged.append(number)
         left(task, work, number)
 
-    monkeypatch.setattr(command, "_judge", judge)
+    monkeypatch.setattr(command, "_judge_episode", judge)
     out = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
         dataset_command(source, out, identify=True, quiet=True)

@@ -14,14 +14,14 @@ from drake_teleop.logs.dataset.episode_faults import name_faults, saturated_chan
 from drake_teleop.logs.dataset.episode_verdict import (
     EpisodeSignals,
     Hypothesis,
-    _deviations,
-    as_described,
-    calm_half,
-    offset_step,
+    _weighted_number_of_deviations,
+    find_offset_step,
+    hypothesis_without_fault,
+    spread_and_centre_of_calm_half,
 )
-from drake_teleop.logs.sample import PHI, sample_episode
+from drake_teleop.logs.sample import TRUE_PHI, sample_episode
 
-PLAIN, I3 = as_described(2.0), np.eye(3)
+PLAIN, I3 = hypothesis_without_fault(2.0), np.eye(3)
 QUARTER = Rotation.from_euler("y", 90, degrees=True).as_matrix()
 SKEW = Rotation.from_euler("y", 30, degrees=True).as_matrix()
 FLIP = np.diag([1.0, -1.0, 1.0])
@@ -44,11 +44,11 @@ FLIP = np.diag([1.0, -1.0, 1.0])
         ({"gain": np.array([0.1, 1.0])}, ["the force is 0.1 times that in N: its unit is daN"]),
         ({"gain": np.array([1.0, 8.85])}, ["torque is 8.85 times that in N m: its unit is lbf in"]),
         ({"gain": np.array([1.3, 1.0])}, ["the force is 1.3 times that in N"]),
-        ({"phi": 2.0 * PHI}, ["another one: "]),
+        ({"phi": 2.0 * TRUE_PHI}, ["another one: "]),
     ],
 )  # fmt: skip
 def test_findings_contain_figures_and_units(change, expected):
-    found = name_faults(replace(PLAIN, **change), 2.0, PHI, 20.0)
+    found = name_faults(replace(PLAIN, **change), 2.0, TRUE_PHI, 20.0)
     assert len(found) == len(expected)
     for finding, words in zip(found, expected, strict=True):
         assert words in finding.message
@@ -69,27 +69,29 @@ def test_findings_contain_figures_and_units(change, expected):
         ({"gain": np.array([2.0, 1.0])}, 1.0),
         ({"gain": np.array([1.0, 3.0])}, 1.0),
         ({"gain": np.array([2.0, 3.0]), "kind": "base"}, 3.0),
-        ({"phi": PHI, "lag": 0.0}, 5.0),
+        ({"phi": TRUE_PHI, "lag": 0.0}, 5.0),
     ],
 )
 def test_each_deviation_has_its_price(change, count):
-    assert _deviations(replace(PLAIN, **change), 2.0) == count
+    assert _weighted_number_of_deviations(replace(PLAIN, **change), 2.0) == count
 
 
 @pytest.mark.parametrize("gain", [(1.0, 1.0), (0.3, 7.0)])
 def test_correct_is_the_inverse_of_apply(gain):
     wrench = np.random.default_rng(0).normal(size=(9, 6))
     x = Hypothesis("sensor", 0.0, SKEW, -QUARTER, np.array(gain))
-    read = x.apply(wrench)
+    read = x.reading_of_load(wrench)
     np.testing.assert_allclose(read[:, :3], gain[0] * wrench[:, :3] @ SKEW.T)
     np.testing.assert_allclose(read[:, 3:], -gain[1] * wrench[:, 3:] @ QUARTER.T)
-    np.testing.assert_allclose(x.correct(read), wrench)
+    np.testing.assert_allclose(x.wrench_of_reading(read), wrench)
 
 
 def test_calm_half_is_the_narrowest_half_of_each_channel():
     """Of 8 numbers 5 are within 2 half widths: the half has 4 intervals."""
     x = np.array([5.0, 5.25, 5.5, 5.75, 6.0, 9.0, -20.0, 40.0])
-    spread, centres = calm_half(np.column_stack([x, 3.0 - 2.0 * x, 0.0 * x]), np.full(3, 1e-3))
+    spread, centres = spread_and_centre_of_calm_half(
+        np.column_stack([x, 3.0 - 2.0 * x, 0.0 * x]), np.full(3, 1e-3)
+    )
     np.testing.assert_allclose(np.exp(spread), [0.5, 1.0, 1e-3])
     np.testing.assert_allclose(centres, [5.5, -8.0, 0.0])
 
@@ -104,15 +106,15 @@ def test_step_of_the_offsets_is_found_inside_the_episode(step, at, found, channe
     before = np.arange(6.0)
     residual = noise + before
     residual[at:, channel] += step
-    spread = calm_half(noise, np.zeros(6))[0]
-    jump = offset_step(residual, spread)
+    spread = spread_and_centre_of_calm_half(noise, np.zeros(6))[0]
+    jump = find_offset_step(residual, spread)
     assert (jump is not None) == found
     if jump is not None:
         assert jump[0] == at
         np.testing.assert_allclose(jump[1], before, atol=0.01)
         np.testing.assert_allclose(jump[2] - before, step * np.eye(6)[channel], atol=0.02)
         residual[at - 8 : at + 8, channel] = before[channel] + step / 2.0  # no sharp step
-        assert offset_step(residual, spread) is None
+        assert find_offset_step(residual, spread) is None
 
 
 @pytest.mark.parametrize(("rows", "saturated"), [(3, False), (4, True), (9, True)])
@@ -135,15 +137,15 @@ def test_signals_of_an_episode_have_the_lag_and_the_axes_of_their_kind(lag):
     x = sample_episode(3)
     signals = EpisodeSignals(log_of(x), 3.6)
     at = signals.motion(x.t + lag * (x.t[1] - x.t[0]))
-    w = signals.predictor(PHI)("sensor", lag)
+    w = signals.reading_predictor(TRUE_PHI)("sensor", lag)
     np.testing.assert_array_equal(w[0], x.wrench)
-    expected = non_contact_wrench(at.s, at.omega, at.alpha, PHI)
+    expected = non_contact_wrench(at.s, at.omega, at.alpha, TRUE_PHI)
     np.testing.assert_allclose(w[1], expected, atol=1e-6)
-    np.testing.assert_allclose(signals.regress(lag) @ PHI, expected, atol=1e-6)
-    weightless = signals.predictor(PHI)("weight removed", lag)[1]
-    weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, PHI)
+    np.testing.assert_allclose(signals.regressor_at_lag(lag) @ TRUE_PHI, expected, atol=1e-6)
+    weightless = signals.reading_predictor(TRUE_PHI)("weight removed", lag)[1]
+    weight = non_contact_wrench(-at.gravity, 0.0 * at.omega, 0.0 * at.alpha, TRUE_PHI)
     np.testing.assert_allclose(weightless, expected - weight, atol=1e-6)
-    turned = signals.predictor(PHI)("base", lag)[0]
+    turned = signals.reading_predictor(TRUE_PHI)("base", lag)[0]
     for part in (slice(0, 3), slice(3, 6)):
         back = np.einsum("nij,nj->ni", at.R_WS, turned[:, part])
         np.testing.assert_allclose(back, x.wrench[:, part], atol=2e-3)

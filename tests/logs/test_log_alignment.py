@@ -8,10 +8,10 @@ from scipy.signal import savgol_filter
 from drake_teleop.logs.read.alignment import (
     angular_motion,
     low_pass,
-    noise_gain,
+    noise_gain_of_derivatives,
+    remove_delay,
     resample,
     smooth_derivatives,
-    undelayed,
     uniform_times,
 )
 from drake_teleop.logs.read.canonical import Log
@@ -72,7 +72,7 @@ def test_smoother_is_accurate_in_long_windows() -> None:
 def test_noise_gain_predicts_the_output_noise() -> None:
     noise = np.random.default_rng(2).normal(size=(200_000, 1))
     measured = [part[500:-500].std() for part in smooth_derivatives(noise, 1e-3, 30.0)]
-    np.testing.assert_allclose(measured, noise_gain(1e-3, 30.0), rtol=0.02)
+    np.testing.assert_allclose(measured, noise_gain_of_derivatives(1e-3, 30.0), rtol=0.02)
 
 
 def test_angular_motion_from_orientations() -> None:
@@ -88,7 +88,7 @@ def test_undelayed_shifts_motion_but_not_wrench() -> None:
     t = np.arange(0, 2, 0.001)
     late = motion_at(t - 0.0123)
     log = Log(t, make_log(t).wrench, late.specific_force, late.omega, late.alpha)
-    back = undelayed(log, 0.0123)
+    back = remove_delay(log, 0.0123)
     now = motion_at(back.t)
     assert len(back) == len(t) - 13
     np.testing.assert_array_equal(back.wrench, log.wrench[: len(back)])

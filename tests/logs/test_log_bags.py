@@ -22,7 +22,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read import bags
-from drake_teleop.logs.read.bags import is_bag, read_topic, topics_of
+from drake_teleop.logs.read.bags import is_bag, list_topics, read_topic
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
 
@@ -156,10 +156,10 @@ def test_bag_and_parquet_give_the_same_load(
     assert found.log.notes == expected.log.notes
     np.testing.assert_allclose(found.identification.phi, expected.identification.phi, rtol=1e-9)
     np.testing.assert_allclose(found.identification.phi, PHI, rtol=0.02, atol=2e-4)
-    names = [(topic.name, topic.type.split("/")[-1], topic.messages) for topic in topics_of(bag)]
+    names = [(topic.name, topic.type.split("/")[-1], topic.messages) for topic in list_topics(bag)]
     kinds = {"/ft/wrench": "WrenchStamped", "/imu": "Imu", "/pose": "PoseStamped"}
     assert names == [(name, kind, len(T)) for name, kind in kinds.items()]
-    assert topics_of(bag)[0].rate_hz == pytest.approx(250, rel=0.01)
+    assert list_topics(bag)[0].rate_hz == pytest.approx(250, rel=0.01)
 
 
 @pytest.mark.parametrize("kind", ["PoseStamped", "Odometry", "TransformStamped", "TFMessage"])
@@ -365,7 +365,7 @@ def test_error_names_the_missing_library(tmp_path: Path, monkeypatch: pytest.Mon
     write_bag(tmp_path / "run1", {"/wrench": islice(wrenches(), 20)})
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(DrakeTeleopError, match=r"; install .*: pip install '\.\[ros\]' "):
-        topics_of(tmp_path / "run1")
+        list_topics(tmp_path / "run1")
 
 
 @pytest.mark.parametrize("limit", ["_MAX_UNPACKED_BYTES", "_MAX_MEMORY_BYTES"])
@@ -397,7 +397,7 @@ def test_messages_in_blocks_give_the_same_table(
     for topic, child in (("/ft", None), ("/tf", "tool0")):
         whole = read_topic(bag, topic, child).columns
         with monkeypatch.context() as patch:
-            patch.setattr(bags, "_BLOCK_MESSAGES", 7)
+            patch.setattr(bags, "_MESSAGES_PER_BLOCK", 7)
             parts = read_topic(bag, topic, child).columns
         assert parts.keys() == whole.keys() and len(whole["received"]) > 7
         for name, values in whole.items():

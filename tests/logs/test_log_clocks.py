@@ -15,8 +15,17 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.read.canonical import ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
-from drake_teleop.logs.read.clocks import Clock, find_gaps, read_clock, spread_shared_stamps
+from drake_teleop.logs.read.canonical import (
+    ANGULAR_VELOCITY_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    WRENCH_COLUMNS,
+)
+from drake_teleop.logs.read.clocks import (
+    Clock,
+    find_gaps_in_times,
+    read_clock,
+    spread_shared_stamps,
+)
 from drake_teleop.logs.read.description import Time
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.tables import Table
@@ -38,7 +47,7 @@ def test_valid_stamps_are_unchanged() -> None:
     clock = clock_of(t, offset=0.5)
     np.testing.assert_array_equal(clock.t, t + 0.5)
     np.testing.assert_array_equal(clock.rows, np.arange(50))
-    assert clock.notes == () and not len(find_gaps(clock.t, 30.0))
+    assert clock.notes == () and not len(find_gaps_in_times(clock.t, 30.0))
     scaled = clock_of(t, scale=1.001, offset=0.5).t
     np.testing.assert_allclose(scaled - t[0] - 0.5, 1.001 * (t - t[0]), atol=1e-6)
 
@@ -209,7 +218,9 @@ def test_load_is_identified_despite_clock_errors(
         if holed:
             start, length = 8.0 * gap[0], gap[1]
             rows = rows[(t[rows] < start) | (t[rows] > start + length)]
-        names = WRENCH if unit == 1e-3 else (*SPECIFIC_FORCE, *ANGULAR_VELOCITY)
+        names = (
+            WRENCH_COLUMNS if unit == 1e-3 else (*SPECIFIC_FORCE_COLUMNS, *ANGULAR_VELOCITY_COLUMNS)
+        )
         tables.append(frame(stamps[rows], names, values[rows]))
     folder = tmp_path_factory.mktemp("clocks")
     path = write_streams(folder, *tables, offset=offset)
@@ -227,8 +238,8 @@ def test_interpolated_samples_in_a_gap_are_not_used(tmp_path: Path) -> None:
     t = np.arange(0.0, 8.0, 0.002)
     x = record(t)
     kept = (t < 3.0) | (t > 4.0)
-    wrench = frame(1e3 * t[kept], WRENCH, x[kept, :6])
-    imu = frame(t, (*SPECIFIC_FORCE, *ANGULAR_VELOCITY), x[:, 6:])
+    wrench = frame(1e3 * t[kept], WRENCH_COLUMNS, x[kept, :6])
+    imu = frame(t, (*SPECIFIC_FORCE_COLUMNS, *ANGULAR_VELOCITY_COLUMNS), x[:, 6:])
     path = write_streams(tmp_path, wrench, imu)
     bridged = read_log(path)
     assert np.abs(bridged.wrench - record(bridged.t)[:, :6]).max() > 5

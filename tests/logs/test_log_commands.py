@@ -21,7 +21,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.contact import robust_offsets
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.read.canonical import WRENCH, Log, write_log
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS, Log, write_log
 from drake_teleop.logs.read.description import STANDARD_GRAVITY
 from drake_teleop.logs.read.reading import read_log
 
@@ -141,7 +141,7 @@ def test_eliminate_leaves_the_contact(tmp_path: Path, load: Path) -> None:
     log = simulated(tmp_path / "log.parquet", contact=push(t), noise=0.1)
     summary = eliminate_command(log, load, tmp_path, quiet=True)
     table = pl.read_parquet(tmp_path / "contact_wrench.parquet")
-    contact = table.select([f"contact_{c}" for c in WRENCH]).to_numpy()
+    contact = table.select([f"contact_{c}" for c in WRENCH_COLUMNS]).to_numpy()
     error = contact - push(table["t"].to_numpy())
     assert np.abs(error[:, :3]).max() < 0.3
     assert np.abs(error[:, 3:]).max() < 0.03

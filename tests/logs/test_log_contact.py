@@ -8,10 +8,10 @@ from scipy.signal import lfilter
 
 from drake_teleop.logs.contact import (
     Detection,
-    Samples,
-    contacts_of,
+    DetectorSamples,
     detect_contact,
     noise_floor,
+    summarize_contacts,
 )
 from drake_teleop.logs.read.alignment import low_pass
 
@@ -26,9 +26,9 @@ def quiet(seed: int, n: int = 6000) -> np.ndarray:
 def detected(contact: np.ndarray, dt: float = DT, free: np.ndarray | None = None) -> Detection:
     """At rest."""
 
-    def at_rest(wrench: np.ndarray) -> Samples:
+    def at_rest(wrench: np.ndarray) -> DetectorSamples:
         still, up = np.zeros((len(wrench), 3)), np.tile([0.0, 0.0, 9.81], (len(wrench), 1))
-        return Samples(wrench, up, still, still, still)
+        return DetectorSamples(wrench, up, still, still, still)
 
     calm = None if free is None else (at_rest(free), dt)
     found = detect_contact(at_rest(contact), dt, CUTOFF, np.zeros((16, 16)), STD, free=calm)
@@ -51,7 +51,7 @@ def test_contacts_have_their_times_and_peaks() -> None:
     force[1000:1300] = 12.0 * np.sin(np.linspace(0, 2 * np.pi, 300))  # changes its sign
     force[4000:4001] = 40.0
     contact[:, 2] += force
-    swing, knock = contacts_of(t, contact, detected(contact).touched)
+    swing, knock = summarize_contacts(t, contact, detected(contact).touched)
     assert swing["start_s"] == pytest.approx(12.0, abs=0.05)
     assert swing["stop_s"] == pytest.approx(12.6, abs=0.05)
     assert swing["peak_N"] == pytest.approx(12.0, abs=1.5)
@@ -95,7 +95,7 @@ def test_the_threshold_does_not_rise_with_the_contacts(
     # 0.13 N of noise hide 1 N.
     assert found.touched[push > 1.4].all()
     assert not found.touched[push == 0.0].any()
-    assert len(contacts_of(DT * np.arange(n), contact, found.touched)) == count
+    assert len(summarize_contacts(DT * np.arange(n), contact, found.touched)) == count
 
 
 def test_more_contact_than_can_be_told_is_noted() -> None:
@@ -113,5 +113,5 @@ def test_more_contact_than_can_be_told_is_noted() -> None:
 
 
 def test_a_record_that_is_too_short_says_nothing() -> None:
-    rows = Samples(quiet(5, 120), *(np.zeros((120, 3)) for _ in range(4)))
+    rows = DetectorSamples(quiet(5, 120), *(np.zeros((120, 3)) for _ in range(4)))
     assert detect_contact(rows, DT, CUTOFF, np.zeros((16, 16)), STD) is None

@@ -312,7 +312,7 @@ def test_for_comparisons_a_log_is_thinned_to_means_whatever_tells_its_time(
     if time is None:
         streams = {"static": wrench | {"gravity": {"columns": ["s"]}}}
     description = Description.model_validate(streams)
-    log = LogData(description, "log.yaml", {Path("w"): table}).thin(description)
+    log = LogData(description, "log.yaml", {Path("w"): table}).read_thinned_log(description)
     if time is None:  # of poses there are few, and none follows another
         assert log.static and len(log) == 900
     else:
@@ -346,6 +346,6 @@ def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
     predicted = (1 - np.sqrt(left)) * wrench
     if refused:
         with pytest.raises(DrakeTeleopError, match=refused):
-            conventions.question_fit(log, load, predicted, 0.0, check)
+            conventions.check_suspicious_load(log, load, predicted, 0.0, check)
     else:
-        assert conventions.question_fit(log, load, predicted, 0.0, check) == (reason,)
+        assert conventions.check_suspicious_load(log, load, predicted, 0.0, check) == (reason,)

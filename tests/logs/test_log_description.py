@@ -104,7 +104,7 @@ def test_auto_without_the_required_streams_raises_error(tmp_path: Path) -> None:
     path = tmp_path / "log.yaml"
     path.write_text(yaml.safe_dump(data))
     imu = load_description(path).imu
-    assert imu and imu.automatic and (imu.frame, imu.position) == ("auto", "auto")
+    assert imu and imu.is_mounting_auto and (imu.frame, imu.position) == ("auto", "auto")
     del data["pose"]
     _expect_error(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
     data["imu"]["frame"] = "sensor"

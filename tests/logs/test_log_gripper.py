@@ -17,7 +17,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import eliminate_log
-from drake_teleop.logs.read.canonical import WRENCH, Log, write_log
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS, Log, write_log
 
 GRIPPER = phi_from_mass_com_inertia(1.2, [0.0, 0.01, 0.05], np.diag([0.004, 0.004, 0.002]))
 DESCRIPTION = """
@@ -183,8 +183,8 @@ def test_contacts_and_the_causal_wrench_come_with_eliminate(files: Path, tmp_pat
     share = np.sqrt(np.mean(1 / (1 + (np.linspace(0, 250, 5000) / 30) ** 4) ** 2))
     np.testing.assert_allclose(summary["noise_floor"], share * np.repeat([0.1, 0.01], 3), rtol=0.25)
     table = pl.read_parquet(out / "contact_wrench.parquet")
-    contact = table.select([f"contact_{c}" for c in WRENCH]).to_numpy()
-    late = table.select([f"causal_contact_{c}" for c in WRENCH]).to_numpy()
+    contact = table.select([f"contact_{c}" for c in WRENCH_COLUMNS]).to_numpy()
+    late = table.select([f"causal_contact_{c}" for c in WRENCH_COLUMNS]).to_numpy()
     assert table["in_contact"].mean() == summary["in_contact"]
     assert summary["causal"]["mode"] == "delayed"
     assert summary["causal"]["lag_s"] == pytest.approx(0.0098, abs=2e-4)

@@ -14,15 +14,15 @@ from test_log_commands import GRAVITY, describe_poses, describe_record
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.change import (
-    CHANGED,
-    KNOWN,
-    change_memory,
-    change_parameters,
-    watch_load,
+    STATE_CHANGED,
+    STATE_KNOWN,
+    change_detector_parameters,
+    detector_states_of_log,
+    initial_change_memory,
 )
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.explain import explain
-from drake_teleop.logs.causes.instants import instants
+from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 
@@ -90,17 +90,17 @@ def test_online_on_ntnu_records(ntnu: Path, tmp_path: Path, record: str) -> None
     theta = np.concatenate([known.offsets, known.phi])
 
     def states(wrench: np.ndarray) -> np.ndarray:
-        parameters = change_parameters(noise, motion_std, log.dt, model_error=0.02)
-        memory = change_memory(theta, known.covariance, drift)
-        return watch_load(memory, parameters, wrench, *log.motion)
+        parameters = change_detector_parameters(noise, motion_std, log.dt, model_error=0.02)
+        memory = initial_change_memory(theta, known.covariance, drift)
+        return detector_states_of_log(memory, parameters, wrench, *log.motion)
 
     free = states(log.wrench)
-    assert free.max() < CHANGED and free[-1] == KNOWN
-    assert (free == KNOWN).mean() > (1 - 1e-9 if record == "1-baseline" else 0.95)
+    assert free.max() < STATE_CHANGED and free[-1] == STATE_KNOWN
+    assert (free == STATE_KNOWN).mean() > (1 - 1e-9 if record == "1-baseline" else 0.95)
     added = phi_from_mass_com_inertia(0.25, [0.0, 0.0, 0.08], 1e-5 * np.eye(3))
     after = log.t - log.t[0] - 2.5
     grasped = states(log.wrench + (after > 0)[:, None] * non_contact_wrench(*log.motion, added))
-    assert 0.0 < after[np.argmax(grasped == CHANGED)] < 0.5
+    assert 0.0 < after[np.argmax(grasped == STATE_CHANGED)] < 0.5
 
 
 @pytest.mark.long
@@ -145,7 +145,7 @@ def test_utias_records_have_one_load(utias: Path) -> None:
             x + std * rng.normal(size=x.shape) for x, std in ((s, s_std), (alpha, alpha_std))
         )
         t = 0.01 * np.arange(len(s))
-        why = explain(instants(t, wrench, (s, omega, alpha), None))
+        why = explain(block_means_of_record(t, wrench, (s, omega, alpha), None))
         assert [cause.name for cause in why.causes if cause.name != "no load"] == [], file.stem
 
 

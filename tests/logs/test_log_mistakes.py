@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.rotations import quaternions_of
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import check_log, identify_log
-from drake_teleop.logs.read.canonical import SPECIFIC_FORCE, WRENCH
+from drake_teleop.logs.read.canonical import SPECIFIC_FORCE_COLUMNS, WRENCH_COLUMNS
 
 Columns = dict[str, np.ndarray]
 IMU, POSE, BOTH = ("imu",), ("pose",), ("imu", "pose")
@@ -206,7 +206,9 @@ def test_poses_at_rest_are_enough_and_different(
     R = Rotation.from_rotvec(turn * rng.normal(size=(rows, 3))).as_matrix()
     s, rest = -GRAVITY_W @ R, np.zeros((rows, 3))
     wrench = non_contact_wrench(s, rest, rest, PHI) + 0.01 * rng.normal(size=(rows, 6))
-    table = dict(zip((*WRENCH, *SPECIFIC_FORCE), np.hstack([wrench, s]).T, strict=True))
+    table = dict(
+        zip((*WRENCH_COLUMNS, *SPECIFIC_FORCE_COLUMNS), np.hstack([wrench, s]).T, strict=True)
+    )
     pl.DataFrame(table).write_csv(tmp_path / "rest.csv")
     found = check_log(tmp_path / "rest.csv").findings
     assert [says is not None and says in f.message for f in found] == ([True] if says else [])

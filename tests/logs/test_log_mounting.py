@@ -136,7 +136,9 @@ def test_mounting_is_estimated_within_its_deviations(
     R_SI: np.ndarray, p_SoIo_S: np.ndarray, seed: int, gyroscope: bool
 ) -> None:
     found = mounting(Recorder(R_SI, p_SoIo_S, seed), gyroscope=gyroscope)
-    assert found.determined and found.lever is not None and found.lever.determined.all()
+    assert (
+        found.is_determined and found.lever is not None and found.lever.is_determined_by_axis.all()
+    )
     # Interpolation of the pose causes errors of 0.1 % of lever arm and rotation.
     error = np.abs(rotation_vector_deg(found.R_SI @ R_SI.T))
     assert (error < 5 * found.deviations_deg + 0.02).all()
@@ -151,7 +153,7 @@ def test_lag_is_searched_within_one_second(lag: float, is_found: bool) -> None:
     found = mounting(
         Recorder(random_rotation(3), np.array([0.05, -0.03, 0.08]), seconds=8.0, lag=lag)
     )
-    assert found.fits == is_found
+    assert found.fits_pose == is_found
     assert (found.lag_s == pytest.approx(lag, abs=1e-3)) == is_found
 
 
@@ -179,7 +181,7 @@ def test_wrench_determines_the_lever_arm_without_a_pose(seed: int) -> None:
     description = described(pose=False, frame=recorder.R_SI.tolist())
     tables = recorder.tables()
     found = lever_arm_from_wrench(read_description(description, "log.yaml", tables=tables))
-    assert found is not None and found.determined.all()
+    assert found is not None and found.is_determined_by_axis.all()
     assert (np.abs(found.p_SoIo_S - p) < 4 * found.deviations + 3e-4).all()
     auto = read_description(
         described(pose=False, frame=recorder.R_SI.tolist(), position="auto"),
@@ -241,8 +243,8 @@ def test_rotation_about_one_axis_determines_two_coordinates(source: str) -> None
     at_Io = read_description(described(**streams), "log.yaml", tables=recorder.tables())
     lever = mounting(recorder).lever if source == "pose" else lever_arm_from_wrench(at_Io)
     assert lever is not None and lever.source == source
-    assert lever.determined.tolist() == [True, False, True]
-    known = lever.determined
+    assert lever.is_determined_by_axis.tolist() == [True, False, True]
+    known = lever.is_determined_by_axis
     error = (lever.p_SoIo_S - recorder.p_SoIo_S)[known]
     assert (np.abs(error) < 4 * lever.deviations[known] + 3e-4).all()
     with pytest.raises(DrakeTeleopError, match=r"imu.position: .*determine y of"):
@@ -261,7 +263,7 @@ def test_orientation_alone_does_not_determine_the_lever_arm() -> None:
     found = mounting(recorder, gyroscope=False, positioned=False)
     assert found.lever is None
     # The arc does not affect the estimated rotation.
-    assert found.determined
+    assert found.is_determined
     assert np.linalg.norm(rotation_vector_deg(found.R_SI @ recorder.R_SI.T)) < 0.3
 
 
@@ -373,7 +375,7 @@ def test_gaps_are_excluded_from_the_mounting() -> None:
             tables[Path(name)], columns={k: x[kept] for k, x in columns.items()}
         )
     found = mounting(recorder, tables)
-    assert found.lever is not None and found.determined and found.unexplained < 1e-3
+    assert found.lever is not None and found.is_determined and found.unexplained < 1e-3
     assert np.linalg.norm(rotation_vector_deg(found.R_SI @ recorder.R_SI.T)) < 0.1
     assert np.abs(found.lever.p_SoIo_S - p).max() < 1e-3
 

@@ -17,7 +17,7 @@ from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.logs.check.pose_checks import frame_finding
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
-from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
@@ -135,7 +135,7 @@ LIMITS = {
     "pose_motion.splines._CHUNK_ROWS": 260,
     "posed_fit._MIN_KEPT_SAMPLES": 300,
     "posed_fit._CHUNK": 70,
-    "posed_fit._NEIGHBOURS": 30,
+    "posed_fit._FILTER_NEIGHBOURS": 30,
 }
 """What an hour at 1 kHz is too long for, so low that 10 s are."""
 
@@ -243,7 +243,7 @@ def test_wrong_torque_unit_is_not_reported_as_a_shift(unit):
     """The motion determines r + R c and the torque c, so a lever along c resembles a wrong unit."""
     t, wrench, poses = record(Kind(seed=4))
     wrench = wrench * np.repeat([1.0, unit], 3)
-    posed = Posed(poses, GRAVITY_W)
+    posed = PosesOfLog(poses, GRAVITY_W)
     found = estimate_from_poses(t, wrench, poses, GRAVITY_W)
     assert frame_finding(found, posed) is None
 

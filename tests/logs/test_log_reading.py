@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    ORIENTATION,
-    POSITION,
-    SPECIFIC_FORCE,
-    WRENCH,
+    ANGULAR_ACCELERATION_COLUMNS,
+    ANGULAR_VELOCITY_COLUMNS,
+    POSITION_COLUMNS,
+    QUATERNION_COLUMNS,
+    SPECIFIC_FORCE_COLUMNS,
+    WRENCH_COLUMNS,
     Log,
     write_log,
 )
@@ -41,13 +41,15 @@ def make_log(t: np.ndarray = T) -> Log:
 
 def canonical(*groups: str) -> pl.DataFrame:
     motion = motion_at(T)
-    columns: dict[str, Any] = {"t": T} | dict(zip(WRENCH, smooth_wrench(motion).T, strict=True))
+    columns: dict[str, Any] = {"t": T} | dict(
+        zip(WRENCH_COLUMNS, smooth_wrench(motion).T, strict=True)
+    )
     for name, names, values in (
-        ("s", SPECIFIC_FORCE, motion.specific_force),
-        ("omega", ANGULAR_VELOCITY, motion.omega),
-        ("alpha", ANGULAR_ACCELERATION, motion.alpha),
-        ("q", ORIENTATION, quaternions(motion.R_WS)),
-        ("p", POSITION, motion.p_WS),
+        ("s", SPECIFIC_FORCE_COLUMNS, motion.specific_force),
+        ("omega", ANGULAR_VELOCITY_COLUMNS, motion.omega),
+        ("alpha", ANGULAR_ACCELERATION_COLUMNS, motion.alpha),
+        ("q", QUATERNION_COLUMNS, quaternions(motion.R_WS)),
+        ("p", POSITION_COLUMNS, motion.p_WS),
     ):
         if name in groups:
             columns |= dict(zip(names, values.T, strict=True))
@@ -99,8 +101,8 @@ def test_orientation_without_position_sets_acceleration_to_zero_with_a_note(tmp_
     [
         (lambda f: f.drop("f_x"), "no column 'f_x'; did you mean "),
         (lambda f: f.drop("s_z"), "no column 's_z'"),
-        (lambda f: f.drop(*SPECIFIC_FORCE), "without kinematics: no columns s_x s_y s_z"),
-        (lambda f: f.drop(*ANGULAR_VELOCITY), "no columns omega_x omega_y omega_z"),
+        (lambda f: f.drop(*SPECIFIC_FORCE_COLUMNS), "without kinematics: no columns s_x s_y s_z"),
+        (lambda f: f.drop(*ANGULAR_VELOCITY_COLUMNS), "no columns omega_x omega_y omega_z"),
         (lambda f: f.head(15), "15 samples in log.csv are too few"),
         (
             lambda f: f.with_columns(t=pl.col("t").reverse()),
@@ -303,11 +305,14 @@ def test_nominal_rate_replaces_time_stamps(tmp_path: Path) -> None:
     stream = {"file": "all.csv", "time": {"rate": 500.0}}
     description = {
         "wrench": stream
-        | {"force": {"columns": list(WRENCH[:3])}, "torque": {"columns": list(WRENCH[3:])}},
+        | {
+            "force": {"columns": list(WRENCH_COLUMNS[:3])},
+            "torque": {"columns": list(WRENCH_COLUMNS[3:])},
+        },
         "imu": stream
         | {
-            "specific_force": {"columns": list(SPECIFIC_FORCE)},
-            "angular_velocity": {"columns": list(ANGULAR_VELOCITY)},
+            "specific_force": {"columns": list(SPECIFIC_FORCE_COLUMNS)},
+            "angular_velocity": {"columns": list(ANGULAR_VELOCITY_COLUMNS)},
         },
     }
     path = tmp_path / "log.yaml"
@@ -327,7 +332,7 @@ def test_a_gap_is_noted_and_marked(tmp_path: Path) -> None:
     # Half of the smoother's 60 ms on either side.
     marked = log.t[log.bridged]
     assert [marked[0], marked[-1]] == pytest.approx([0.998 - 0.03, 1.2 + 0.03], abs=0.003)
-    known = log.only(~log.bridged)
+    known = log.select_rows(~log.bridged)
     np.testing.assert_allclose(known.wrench, smooth_wrench(motion_at(known.t)), atol=1e-3)
     np.testing.assert_allclose(known.angular_acceleration, motion_at(known.t).alpha, atol=0.02)
 
@@ -384,12 +389,12 @@ def test_canonical_rows_at_rest_are_static_poses(
     g_S = GRAVITY_W @ R_WS
     rest = np.zeros_like(g_S)
     groups = {
-        "s": (SPECIFIC_FORCE, -g_S),
-        "omega": (ANGULAR_VELOCITY, rest),
-        "q": (ORIENTATION, quaternions(R_WS)),
-        "p": (POSITION, rest),
+        "s": (SPECIFIC_FORCE_COLUMNS, -g_S),
+        "omega": (ANGULAR_VELOCITY_COLUMNS, rest),
+        "q": (QUATERNION_COLUMNS, quaternions(R_WS)),
+        "p": (POSITION_COLUMNS, rest),
     }
-    values = dict(zip(WRENCH, np.hstack([-2 * g_S, rest]).T, strict=True))
+    values = dict(zip(WRENCH_COLUMNS, np.hstack([-2 * g_S, rest]).T, strict=True))
     for group in columns:
         values |= dict(zip(groups[group][0], groups[group][1].T, strict=True))
     if rate is not None:

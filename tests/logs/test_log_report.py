@@ -13,11 +13,11 @@ from known_motion import motion_at
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.cli.printing import print_identification
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.identification import PARAMETERS
+from drake_teleop.load.identification import PARAMETER_NAMES
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.pictures import draw_fit, draw_knowledge, spectrum
+from drake_teleop.logs.pictures import draw_fit, draw_spectrum_and_intervals, spectrum
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
@@ -51,7 +51,7 @@ def test_the_page_stands_alone_and_has_the_numbers_of_the_summary(tmp_path: Path
     assert page.count('"pill agrees"') == len(summary["identifiable"])
     assert "10 of 10" in page
     assert summary["determined"] == ["16 of 16 combinations of offsets and load are determined"]
-    assert summary["verdicts"] == dict.fromkeys(PARAMETERS, "identified")
+    assert summary["verdicts"] == dict.fromkeys(PARAMETER_NAMES, "identified")
     low, high = np.array(summary["phi_interval"]).T
     assert ((low < summary["phi"]) & (summary["phi"] < high)).all()
     assert ((low - PHI) < (high - low)).all() and ((PHI - high) < (high - low)).all()
@@ -62,7 +62,7 @@ def test_the_centre_of_mass_is_not_identifiable_without_the_mass(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     summary = identify_command(record(tmp_path / "log.parquet"), tmp_path, delay=0.0, quiet=True)
-    for known, count in ((PARAMETERS, 0), ([x for x in PARAMETERS if x != "m"], 4)):
+    for known, count in ((PARAMETER_NAMES, 0), ([x for x in PARAMETER_NAMES if x != "m"], 4)):
         print_identification(summary | {"identifiable": list(known)}, tmp_path)
         lines = [x for x in capsys.readouterr().out.splitlines() if "not identifiable" in x]
         assert len(lines) == count and all("mass" in x or "com" in x for x in lines)
@@ -108,7 +108,7 @@ def test_static_poses_have_a_page_too(tmp_path: Path) -> None:
 
 def test_the_page_of_pictures_shows_all_channels_and_parameters(tmp_path: Path) -> None:
     found = identify_log(record(tmp_path / "log.parquet"), delay=0.0)
-    axes = [*_all_axes(draw_fit(found)), *_all_axes(draw_knowledge(found))]
+    axes = [*_all_axes(draw_fit(found)), *_all_axes(draw_spectrum_and_intervals(found))]
     # Six channels, two spectra, intervals, deviations.
     assert len(axes) == 10
     (intervals_axis,) = [axis for axis in axes if "intervals" in axis.get_title("left")]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.rotations import WIDTHS, rotation_matrices
+from drake_teleop.common.rotations import NUM_COLUMNS_OF_FORM, rotation_matrices
 from drake_teleop.logs.read.mounting import solve_least_squares
 from drake_teleop.logs.read.streams import Orientations
 
@@ -60,7 +60,7 @@ def test_solve_uses_given_linear_derivatives() -> None:
 
 
 @pytest.mark.parametrize("inverse", [False, True])
-@pytest.mark.parametrize("form", WIDTHS)
+@pytest.mark.parametrize("form", NUM_COLUMNS_OF_FORM)
 def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: bool) -> None:
     turns = Rotation.from_rotvec(VECTORS[:5])
     columns = {
@@ -84,7 +84,7 @@ def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: b
     np.testing.assert_allclose(rotation_matrices(found, "quaternion_wxyz"), wanted, atol=1e-12)
     rows = np.array([0, 2, 3])  # increasing; written where later rows may still be unread
     wanted = (turns.inv() if inverse else turns).as_matrix()[rows]
-    written = orientations.output(len(rows))
+    written = orientations.allocate_quaternions(len(rows))
     for k in range(len(rows)):
         written[k : k + 1] = orientations.quaternions(rows[k : k + 1])
     np.testing.assert_allclose(rotation_matrices(written, "quaternion_wxyz"), wanted, atol=1e-12)

@@ -17,20 +17,20 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import causal_low_pass
-from drake_teleop.logs.contact import contacts_of
+from drake_teleop.logs.contact import summarize_contacts
 from drake_teleop.logs.pose_motion.estimate import motion_of_load
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.pose_motion.splines import PoseSplines
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
-from drake_teleop.logs.read.alignment import low_pass, undelayed
-from drake_teleop.logs.read.canonical import ORIENTATION, POSITION
-from drake_teleop.logs.read.canonical import WRENCH as CANONICAL
-from drake_teleop.logs.read.description_fields import UNITS
+from drake_teleop.logs.read.alignment import low_pass, remove_delay
+from drake_teleop.logs.read.canonical import POSITION_COLUMNS, QUATERNION_COLUMNS
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS as CANONICAL
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.sample import CLOCK_S, sample_log_command
-from drake_teleop.logs.sample import NOISE as SAMPLE_NOISE
-from drake_teleop.logs.sample import TOUCHES as TOUCHES_OF_SAMPLE
+from drake_teleop.logs.sample import CLOCK_START_S, sample_log_command
+from drake_teleop.logs.sample import FINGERTIP_PUSHES as TOUCHES_OF_SAMPLE
+from drake_teleop.logs.sample import NOISE_STD as SAMPLE_NOISE
 
 WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")
 NOISE = np.repeat([0.1, 0.004], 3)
@@ -131,13 +131,15 @@ def held_sample(
     frames = np.arange(begin, stop, 1.0 / rate)
     w, p = (
         table[np.searchsorted(t, frames, side="right") - 1, 1:]
-        for t, table in ((wrench[:, 0] / 1e3, wrench), (pose[:, 0] - CLOCK_S, pose))
+        for t, table in ((wrench[:, 0] / 1e3, wrench), (pose[:, 0] - CLOCK_START_S, pose))
     )
-    units = np.repeat([UNITS["lbf"], UNITS["lbf in"]], 3)
+    units = np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
     quaternion = Rotation.from_rotvec(p[:, 3:], degrees=True).as_quat()[:, [3, 0, 1, 2]]
     columns = np.hstack([(frames - begin)[:, None], -w * units, quaternion, p[:, :3] / 1e3])
     path = folder / "log.csv"
-    pl.DataFrame(columns, schema=["t", *CANONICAL, *ORIENTATION, *POSITION]).write_csv(path)
+    pl.DataFrame(
+        columns, schema=["t", *CANONICAL, *QUATERNION_COLUMNS, *POSITION_COLUMNS]
+    ).write_csv(path)
     return path
 
 
@@ -164,7 +166,7 @@ def test_contacts_at_the_rate_of_a_camera_are_those_at_the_full_rate(sample, tmp
     off = (found.contact - contact)[~found.edge, :3]
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.17
     for one, begin in ((found, 0.05), (full, 0.0)):
-        starts = contacts_of(one.log.t, one.contact, one.touched)
+        starts = summarize_contacts(one.log.t, one.contact, one.touched)
         assert [round(x["start_s"] + begin, 1) for x in starts] == pytest.approx(
             [touch.start_s for touch in TOUCHES_OF_SAMPLE], abs=0.11
         )
@@ -264,7 +266,7 @@ def test_a_differentiated_motion_has_edges_of_half_a_window(tmp_path):
 def test_the_causal_wrench_keeps_the_motion_that_a_loop_has(tmp_path):
     path = logged(tmp_path, Kind(place=0.0, turn=0.0, seed=11), touches=TOUCHES)
     found = eliminate_log(path, LOAD, causal="delayed", delay=LATE)
-    log = undelayed(read_log(path), LATE)
+    log = remove_delay(read_log(path), LATE)
     contact = contact_wrench(log.wrench, OFFSETS, *log.motion, PHI)
     expected = causal_low_pass(contact, log.dt, 30.0)
     wait = int(np.ceil(LATE / log.dt))
@@ -322,7 +324,7 @@ def test_the_clock_of_the_poses_is_corrected_with_a_known_load_too(rate):
 def test_the_coefficients_of_a_load_give_its_wrench():
     rng = np.random.default_rng(2)
     _, _, poses = record(Kind(seed=15))
-    splines, t = PoseSplines(poses.continued(), 0.1), np.linspace(1.0, 19.0, 50)
+    splines, t = PoseSplines(poses.with_continuous_quaternions(), 0.1), np.linspace(1.0, 19.0, 50)
     weight = rng.normal(size=4)
     s, omega, alpha = splines.motion(t, GRAVITY_W)
     rest, zeta = np.zeros_like(s), splines.signals(t, GRAVITY_W)

@@ -84,7 +84,7 @@ def test_column_types_do_not_depend_on_the_first_rows(tmp_path: Path, row: int, 
     table = read_table(write(tmp_path / "x.csv", "\n".join(["a,b", *(f"{c},7" for c in cells)])))
     expected = np.arange(3000.0)
     expected[row] = float(cell or "nan")
-    np.testing.assert_array_equal(table.single("a", "here"), expected)
+    np.testing.assert_array_equal(table.single_column("a", "here"), expected)
 
 
 @pytest.mark.parametrize("row", [1, 2500])
@@ -217,7 +217,7 @@ def test_types_and_byte_order_of_mat_files_are_respected(tmp_path: Path) -> None
     savemat(tmp_path / "x.mat", {kind: numbers.astype(kind) for kind in kinds})
     table = read_table(tmp_path / "x.mat")
     for kind in kinds:
-        assert table.single(kind, "here").tolist() == numbers.tolist()
+        assert table.single_column(kind, "here").tolist() == numbers.tolist()
     # Big-endian, as written by old workstations.
     tag = partial(struct.pack, ">II")
     content = tag(6, 8) + struct.pack(">II", 6, 0) + tag(5, 8) + struct.pack(">ii", 3, 1)
@@ -232,7 +232,7 @@ def test_types_and_byte_order_of_mat_files_are_respected(tmp_path: Path) -> None
     (tmp_path / "y.mat").write_bytes(head + variables)
     table = read_table(tmp_path / "y.mat")
     assert list(table.columns) == ["t"]
-    assert table.single("t", "here").tolist() == [0.5, 1.0, -2.0]
+    assert table.single_column("t", "here").tolist() == [0.5, 1.0, -2.0]
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -279,12 +279,12 @@ def test_row_numbers_in_errors_include_comment_lines(tmp_path: Path) -> None:
 )
 def test_dates_and_times_of_day_are_seconds(tmp_path: Path, stamps: list[str]) -> None:
     text = "t,f\n" + "".join(f"{stamp},1\n" for stamp in stamps)
-    t = read_table(write(tmp_path / "x.csv", text)).single("t", "here")
+    t = read_table(write(tmp_path / "x.csv", text)).single_column("t", "here")
     assert t[1] - t[0] == pytest.approx(0.25, abs=1e-6)
     assert t[0] % 86400 == pytest.approx(43200.25, abs=1e-6)
     pl.DataFrame({"t": stamps}).write_csv(tmp_path / "y.csv")
     pl.read_csv(tmp_path / "y.csv", try_parse_dates=True).write_parquet(tmp_path / "y.parquet")
-    assert read_table(tmp_path / "y.parquet").single("t", "here").tolist() == t.tolist()
+    assert read_table(tmp_path / "y.parquet").single_column("t", "here").tolist() == t.tolist()
 
 
 @pytest.mark.parametrize(

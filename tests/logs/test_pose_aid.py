@@ -14,15 +14,20 @@ from scipy.interpolate import BSpline
 
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 from drake_teleop.logs.pose_motion.imu_rows import _least_squares, compare_imu
-from drake_teleop.logs.pose_motion.poses import Inertial, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.spectra import (
-    Grid,
-    bands,
+    WrenchGrid,
     end_taper,
+    frequency_bands,
     noise_moments,
     signal_spectrum,
 )
-from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, SplineCache, _normal_of_rates
+from drake_teleop.logs.pose_motion.splines import (
+    SPLINE_DEGREE,
+    PoseSplines,
+    SplineCache,
+    _normal_equations_of_rates,
+)
 from drake_teleop.logs.processing import identify_log
 
 RATE, NOISE = 250.0, (0.03, 2e-3)
@@ -33,7 +38,7 @@ BIAS, MATRIX = (
 ROUGH = Kind(place=1e-3, turn=1e-3, rate=50.0, seed=4)
 
 
-def imu_data(seed: int, later: float = 0.0) -> Inertial:
+def imu_data(seed: int, later: float = 0.0) -> ImuData:
     """Return an IMU with bias, gain and axis errors, on the clock of the poses plus `later`."""
     rng, t = np.random.default_rng([seed, 5]), np.arange(0.05, SECONDS - 0.05, 1 / RATE)
     at = motion_at(t - LATE - later)
@@ -41,12 +46,12 @@ def imu_data(seed: int, later: float = 0.0) -> Inertial:
         x @ MATRIX.T + k * BIAS + std * rng.normal(size=x.shape)
         for x, k, std in zip((at.specific_force, at.omega), (1.0, 0.1), NOISE, strict=True)
     )
-    return Inertial(t, s, omega)
+    return ImuData(t, s, omega)
 
 
 def poses_of(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
     t, wrench, poses = record(kind)
-    return t, wrench, poses.continued()
+    return t, wrench, poses.with_continuous_quaternions()
 
 
 def test_poses_determine_bias_axes_clock_and_noise_of_an_imu():
@@ -84,13 +89,13 @@ def test_gains_of_an_imu_have_a_prior_of_10_percent(size):
 def test_derivatives_enter_the_normal_equations_as_rows():
     rng, t = np.random.default_rng(1), np.sort(np.random.default_rng(2).uniform(0.0, 3.0, 200))
     inner = np.arange(0.3, 2.8, 0.3)
-    knots = np.concatenate([np.zeros(DEGREE + 1), inner, np.full(DEGREE + 1, 3.0)])
+    knots = np.concatenate([np.zeros(SPLINE_DEGREE + 1), inner, np.full(SPLINE_DEGREE + 1, 3.0)])
     x = rng.normal(size=(200, 2))
-    size = len(knots) - DEGREE - 1
+    size = len(knots) - SPLINE_DEGREE - 1
     for order in (1, 2):
-        rows = BSpline(knots, np.eye(size), DEGREE).derivative(order)(t)
-        band, right = _normal_of_rates(t, x, knots, order)
-        gram = sum(np.diag(band[DEGREE - k, k:], k) for k in range(DEGREE + 1))
+        rows = BSpline(knots, np.eye(size), SPLINE_DEGREE).derivative(order)(t)
+        band, right = _normal_equations_of_rates(t, x, knots, order)
+        gram = sum(np.diag(band[SPLINE_DEGREE - k, k:], k) for k in range(SPLINE_DEGREE + 1))
         gram = gram + np.triu(gram, 1).T
         np.testing.assert_allclose(gram, rows.T @ rows, atol=1e-9 * np.abs(gram).max())
         np.testing.assert_allclose(right, rows.T @ x, atol=1e-9 * np.abs(right).max())
@@ -100,8 +105,8 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
     """Means over 6 records, of acceleration and angular acceleration, 2 to 6 Hz."""
     exact = poses_of(replace(ROUGH, place=0.0, turn=0.0))[2]
     t = np.arange(0.0, SECONDS, 0.01)
-    grid, taper = Grid(t, np.zeros((len(t), 6)), 1), end_taper(t, 1.0, SECONDS - 1.0)
-    of = bands(grid, taper, 6.0)
+    grid, taper = WrenchGrid(t, np.zeros((len(t), 6)), 1), end_taper(t, 1.0, SECONDS - 1.0)
+    of = frequency_bands(grid, taper, 6.0)
     clean = PoseSplines(exact, 0.05).signals(t, GRAVITY_W)
     sums, said = np.zeros(2), np.zeros(2)
     for seed in range(6):
@@ -112,11 +117,13 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
         noisy = Poses(exact.t, moved, q / np.linalg.norm(q, axis=1, keepdims=True))
         aid = compare_imu(PoseSplines(noisy, 0.1), imu_data(seed), GRAVITY_W)
         assert aid is not None
-        splines = SplineCache(noisy, aid).at(0.05)
+        splines = SplineCache(noisy, aid).splines_with_spacing(0.05)
         error = splines.signals(t, GRAVITY_W) - clean
-        power = of.sums(np.abs(signal_spectrum(grid, taper, error, len(of.frequency))) ** 2)
-        Q = noise_moments(splines, grid, taper, clean, of, splines.noise())
-        fast = of.sums(of.frequency) / of.sizes > 2.0
+        power = of.sums_over_bands(
+            np.abs(signal_spectrum(grid, taper, error, len(of.frequency))) ** 2
+        )
+        Q = noise_moments(splines, grid, taper, clean, of, splines.estimate_pose_noise())
+        fast = of.sums_over_bands(of.frequency) / of.sizes > 2.0
         for k, where in enumerate((slice(1, 4), slice(7, 10))):
             sums[k] += power[fast, where].sum()
             said[k] += np.diagonal(Q, axis1=1, axis2=2)[fast, where].sum()

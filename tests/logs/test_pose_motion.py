@@ -32,37 +32,37 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import use_spline_motion
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, _base_taper, estimate_from_poses
 from drake_teleop.logs.pose_motion.linear_model import (
-    Window,
+    FitWindow,
     best_delay,
-    fit_levels,
     fit_linear_model,
+    fit_noise_levels,
 )
 from drake_teleop.logs.pose_motion.poses import Poses
-from drake_teleop.logs.pose_motion.rejection import NOTHING_REJECTED, find_disturbances
+from drake_teleop.logs.pose_motion.rejection import NOTHING_REJECTED_NOTE, find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
-    ReadOff,
-    State,
+    RigidParameters,
+    UnitsAndAxes,
     _apply_step,
-    _columns,
+    _FitData,
     _gain_effects,
-    _Record,
-    _solve,
+    _residual_derivative,
+    _solve_rigid_fit,
     fit_rigid,
-    motion_map,
-    read_off,
+    motion_transformation_matrix,
+    read_units_and_axes,
 )
 from drake_teleop.logs.pose_motion.spectra import (
-    RATES,
-    Grid,
-    Levels,
-    bands,
+    SIGNAL_RATE_COLUMNS,
+    NoiseLevels,
+    WrenchGrid,
     end_taper,
-    moments,
+    frequency_bands,
     noise_moments,
+    second_moments,
     signal_spectrum,
 )
-from drake_teleop.logs.pose_motion.spectra import exclude as exclude_from_taper
-from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _thin_knots
+from drake_teleop.logs.pose_motion.spectra import exclude_from_taper as exclude_from_taper
+from drake_teleop.logs.pose_motion.splines import SPLINE_DEGREE, PoseSplines, _knots, _thin_knots
 from drake_teleop.logs.read.canonical import Log
 
 
@@ -78,7 +78,9 @@ def deviations(found: PoseEstimate) -> np.ndarray:
 def test_signals_match_the_motion_with_jitter_and_a_gap():
     t, _, poses = record(Kind(place=0.0, turn=0.0))
     far = (poses.t < 9.0) | (poses.t > 9.6)
-    poses = Poses(poses.t[far], poses.position[far], poses.quaternion[far]).continued()
+    poses = Poses(
+        poses.t[far], poses.position[far], poses.quaternion[far]
+    ).with_continuous_quaternions()
     zeta = PoseSplines(poses, 0.05).signals(t + LATE, GRAVITY_W)
     known = (t > 0.5) & (t < SECONDS - 0.5) & (np.abs(t - 9.3) > 1.2)
     true = motion_at(t)
@@ -100,7 +102,9 @@ def test_signals_match_the_motion_with_jitter_and_a_gap():
 def test_samples_within_two_knots_of_ends_and_gaps_are_flagged(spacing, delay):
     t, wrench, poses = record(Kind())
     kept = (np.abs(poses.t - 7.3) > 0.3) & (np.abs(poses.t - 12.0) > 0.01)
-    poses = Poses(poses.t[kept], poses.position[kept], poses.quaternion[kept]).continued()
+    poses = Poses(
+        poses.t[kept], poses.position[kept], poses.quaternion[kept]
+    ).with_continuous_quaternions()
     posed = SimpleNamespace(gravity_W=GRAVITY_W)
     log = Log(t, wrench, *np.zeros((3, len(t), 3)), posed=posed)
     found = SimpleNamespace(delay_s=delay, splines=PoseSplines(poses, spacing))
@@ -122,7 +126,7 @@ def test_400_ms_beside_gaps_of_the_poses_and_lost_samples_have_no_weight(delay, 
     poses = Poses(poses.t[kept], poses.position[kept], poses.quaternion[kept])
     gap = np.searchsorted(poses.t, 7.0)
     first, last = poses.t[gap - 1] - delay, poses.t[gap] - delay
-    taper = _base_taper(Grid(t, wrench, 1), poses, np.abs(t - 12.0) < 0.05, delay)
+    taper = _base_taper(WrenchGrid(t, wrench, 1), poses, np.abs(t - 12.0) < 0.05, delay)
     near = (t > first - 0.399) & (t < last + 0.399)
     assert (taper[near] == 0.0).all() if excluded else taper[near].min() > 0.99
     assert (taper[np.abs(t - 12.0) < 0.05] == 0.0).all()
@@ -134,13 +138,16 @@ def test_knots_are_thinned_where_poses_are_too_few():
     """Gaps of all lengths, as on a busy computer, would make the spline undetermined."""
     t = np.cumsum(np.random.default_rng(1).exponential(0.0125, 200))
     knots = _thin_knots(_knots(t, 0.0125), t)
-    assert np.diff(np.searchsorted(t, knots[DEGREE:-DEGREE])).min() >= 2 and len(knots) > 80
+    assert (
+        np.diff(np.searchsorted(t, knots[SPLINE_DEGREE:-SPLINE_DEGREE])).min() >= 2
+        and len(knots) > 80
+    )
     assert knots[0] == t[0] and knots[-1] == t[-1]
 
 
 def test_quaternions_of_other_length_give_the_same_motion():
     t, _, poses = record(Kind(place=0.0, turn=0.0))
-    poses = poses.continued()
+    poses = poses.with_continuous_quaternions()
     longer = poses.quaternion * (1.0 + 0.1 * np.sin(3.0 * poses.t))[:, None]
     inside = slice(100, -100)
     signals, same = (
@@ -151,8 +158,8 @@ def test_quaternions_of_other_length_give_the_same_motion():
 
 
 def test_noise_is_estimated_from_the_residual_of_the_splines():
-    poses = record(Kind(place=3e-4, turn=7e-4))[2].continued()
-    place, turn = PoseSplines(poses, 0.05).noise()
+    poses = record(Kind(place=3e-4, turn=7e-4))[2].with_continuous_quaternions()
+    place, turn = PoseSplines(poses, 0.05).estimate_pose_noise()
     assert place == pytest.approx(3e-4, rel=0.08)
     assert turn == pytest.approx(7e-4, rel=0.08)
 
@@ -161,10 +168,10 @@ def test_noise_moments_predict_the_effect_of_noise():
     """Differences of signals with and without noise, over 12 records."""
     kind = Kind(place=0.0, turn=0.0)
     t, wrench, clean = record(kind)
-    grid = Grid.of(t, wrench)
+    grid = WrenchGrid.from_samples(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
-    of = bands(grid, taper, 8.0)
-    splines = PoseSplines(clean.continued(), 0.07)
+    of = frequency_bands(grid, taper, 8.0)
+    splines = PoseSplines(clean.with_continuous_quaternions(), 0.07)
     zeta = splines.signals(grid.t, GRAVITY_W)
     place, turn = 2e-4, 5e-4
     Q = noise_moments(splines, grid, taper, zeta, of, (place, turn))
@@ -174,13 +181,15 @@ def test_noise_moments_predict_the_effect_of_noise():
         noise = np.random.default_rng(seed).normal(size=(len(clean.t), 6))
         R = rotation_matrices(clean.quaternion, "quaternion_wxyz")
         R = R @ rotation_matrices(turn * noise[:, 3:], "rotation_vector")
-        noisy = Poses(clean.t, clean.position + place * noise[:, :3], quaternions(R)).continued()
+        noisy = Poses(
+            clean.t, clean.position + place * noise[:, :3], quaternions(R)
+        ).with_continuous_quaternions()
         error = PoseSplines(noisy, 0.07).signals(grid.t, GRAVITY_W) - zeta
         spectrum = signal_spectrum(grid, taper, error, len(of.frequency))
-        sums += moments(spectrum, none, of, rates * spectrum) / 12
+        sums += second_moments(spectrum, none, of, rates * spectrum) / 12
     # Below 2 Hz the motion modulates additional noise from higher frequencies.
-    whole = Levels.flat(of).grouped
-    well = whole(of.sums(of.frequency)) / whole(of.sizes) > 2.0
+    whole = NoiseLevels.white_within_groups(of).sums_over_groups
+    well = whole(of.sums_over_bands(of.frequency)) / whole(of.sizes) > 2.0
     sums, Q = whole(sums), whole(Q)
     size = np.sqrt(np.einsum("bii,bjj->bij", Q, Q))
     error = np.abs(sums - Q)[well] / np.where(size > 0.0, size, np.inf)[well]
@@ -188,7 +197,7 @@ def test_noise_moments_predict_the_effect_of_noise():
     both = sums[well], Q[well]
     diagonal, expected = (np.diagonal(x, axis1=1, axis2=2).sum(axis=0) for x in both)
     shown = expected > 0.0
-    assert shown[1:16].all() and shown[RATES][1:].all()
+    assert shown[1:16].all() and shown[SIGNAL_RATE_COLUMNS][1:].all()
     np.testing.assert_allclose(diagonal[shown], expected[shown], rtol=0.15)
 
 
@@ -203,7 +212,7 @@ def test_motion_map_is_that_of_a_rigid_body(rho, r, a, minus_g, alpha, w):
         [[1.0], a, minus_g, alpha, w * w, [w[0] * w[1], w[0] * w[2], w[1] * w[2]]]
     )
     F = np.arange(6.0)
-    z = motion_map(R, r) @ np.concatenate([zeta, F])
+    z = motion_transformation_matrix(R, r) @ np.concatenate([zeta, F])
     v = R.T @ w
     s = R.T @ (a + minus_g + np.cross(alpha, r) + np.cross(w, np.cross(w, r)))
     expected = [[1.0], F, s, R.T @ alpha, v * v, [v[0] * v[1], v[0] * v[2], v[1] * v[2]]]
@@ -213,12 +222,12 @@ def test_motion_map_is_that_of_a_rigid_body(rho, r, a, minus_g, alpha, w):
 @given(vector, vector, st.integers(0, 22))
 def test_columns_are_derivatives_of_the_residual(rho, r, k):
     R = rotation_matrices(rho[None], "rotation_vector")[0]
-    state = State(TRUTH, 1e-3, r, R)
+    state = RigidParameters(TRUTH, 1e-3, r, R)
     step = np.zeros(23)
     step[k] = 1e-5
-    ahead, behind = (_columns(_apply_step(state, x))[1] for x in (step, -step))
+    ahead, behind = (_residual_derivative(_apply_step(state, x))[1] for x in (step, -step))
     derivative = (ahead - behind) / 2e-5
-    np.testing.assert_allclose(_columns(state)[0][:, k], -derivative, atol=1e-6)
+    np.testing.assert_allclose(_residual_derivative(state)[0][:, k], -derivative, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -233,9 +242,9 @@ def test_load_delay_and_frame_are_within_their_deviations(kind):
     found = estimate(kind)
     assert np.abs(deviations(found)).max() < 3.5
     assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation)
-    assert found.fit.rigid and found.rejected.mean() < 0.03 and found.note == ""
+    assert found.fit.is_rigid and found.rejected.mean() < 0.03 and found.note == ""
     assert not found.frame.shifted and not found.frame.turned
-    assert found.frame.position_known.all() and found.frame.rotation_known.all()
+    assert found.frame.is_position_known.all() and found.frame.is_rotation_known.all()
     assert np.abs(found.frame.p_SoPo_S / found.frame.position_deviations).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) < 1e-3
 
@@ -249,7 +258,7 @@ def test_wrong_pose_frame_is_detected_and_estimated():
     assert frame.position_deviations.max() < 5e-4
     turn = np.degrees(np.arccos((np.trace(frame.R_SP.T @ TURN) - 1) / 2))
     assert turn < 5 * frame.turn_deviations_deg.max() < 0.2
-    assert not found.fit.rigid and found.fit.inflation > 5.0
+    assert not found.fit.is_rigid and found.fit.deviation_inflation > 5.0
 
 
 def test_deviations_of_the_frame_match_the_scatter():
@@ -270,18 +279,25 @@ def test_deviations_of_the_frame_match_the_scatter():
 def test_noise_of_poses_does_not_bias_the_load():
     """The knots are much too fine, so that accelerations are half noise."""
     t, wrench, poses = record(Kind(place=6e-4, turn=6e-4, seed=11))
-    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.035)
+    grid, splines = (
+        WrenchGrid.from_samples(t, wrench),
+        PoseSplines(poses.with_continuous_quaternions(), 0.035),
+    )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = Window(grid, taper, GRAVITY_W, 12.0).spectra(splines, LATE)
+    spectra = FitWindow(grid, taper, GRAVITY_W, 12.0).spectra_at_delay(splines, LATE)
     zeta = splines.signals(grid.t + LATE, GRAVITY_W)
-    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
-    free, start = np.arange(23) < 17, State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.estimate_pose_noise())
+    free, start = np.arange(23) < 17, RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     inertias = []
     for noise in (Q, np.zeros_like(Q)):
-        record_ = _Record(
-            spectra.moments(), noise, Levels.flat(spectra.of), free, spectra.fit().power
+        record_ = _FitData(
+            spectra.second_moments(),
+            noise,
+            NoiseLevels.white_within_groups(spectra.of),
+            free,
+            spectra.fit_coefficients().power,
         )
-        inertias.append(_solve(record_, start).state.theta[[10, 13]] / PHI[[4, 7]] - 1.0)
+        inertias.append(_solve_rigid_fit(record_, start).state.theta[[10, 13]] / PHI[[4, 7]] - 1.0)
     compensated, plain = np.abs(inertias)
     assert (compensated < 0.5 * plain).all()
     assert (compensated < 0.02).all()
@@ -294,7 +310,7 @@ def test_described_or_estimated_frame_gives_the_load():
     left = estimate_from_poses(*arrays, GRAVITY_W, p_SoPo_S=None, R_SP=None)
     for found in (declared, left):
         assert np.abs(deviations(found)).max() < 3.5
-        assert found.fit.rigid
+        assert found.fit.is_rigid
     assert not declared.frame.shifted and not declared.frame.turned
     np.testing.assert_allclose(left.frame.p_SoPo_S, SHIFT, atol=1e-3)
 
@@ -319,39 +335,50 @@ def test_load_is_estimated_with_40_percent_of_the_record_excluded():
     found = estimate_from_poses(t, wrench, poses, GRAVITY_W, lost=(t % 2.0) < 0.8)
     assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation)
     assert found.delay_deviation < 3e-4
-    assert found.fit.rigid and np.abs(deviations(found)).max() < 3.5
+    assert found.fit.is_rigid and np.abs(deviations(found)).max() < 3.5
     assert np.sqrt(found.covariance[6, 6]) < 2e-3
 
 
 def test_fixed_taper_keeps_its_place_when_the_delay_changes():
     t, wrench, poses = record(Kind(seed=1))
-    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
+    grid, splines = (
+        WrenchGrid.from_samples(t, wrench),
+        PoseSplines(poses.with_continuous_quaternions(), 0.1),
+    )
     taper = exclude_from_taper(end_taper(grid.t, 0.3, SECONDS - 0.3), (grid.t % 2.0) < 0.8, grid.dt)
     spectra, there = (
-        Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, delay)
+        FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, delay)
         for delay in (LATE, LATE + 0.03)
     )
-    moved, slight = spectra.at(LATE + 0.03), spectra.at(LATE + 1e-5)
+    moved, slight = spectra.with_delay(LATE + 0.03), spectra.with_delay(LATE + 1e-5)
     size = np.abs(spectra.signals).max(axis=0)
     np.testing.assert_allclose(moved.signals / size, there.signals / size, atol=1e-3)
     rates = (slight.signals - spectra.signals) / 1e-5
-    expected = moments(spectra.signals, spectra.wrench, spectra.of, rates)
+    expected = second_moments(spectra.signals, spectra.wrench, spectra.of, rates)
     scale = np.sqrt(np.einsum("bii,bjj->bij", expected, expected))
     scale[:, 22], scale[:, :, 22] = np.inf, np.inf  # the constant has zero derivative
-    np.testing.assert_allclose(spectra.moments() / scale, expected / scale, atol=2e-3)
+    np.testing.assert_allclose(spectra.second_moments() / scale, expected / scale, atol=2e-3)
 
 
 def test_weights_recover_from_a_poor_start():
     """With 1 mm and 1 mrad the upper bands contain only noise."""
     t, wrench, poses = record(Kind(place=1e-3, turn=1e-3, seed=1))
-    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
+    grid, splines = (
+        WrenchGrid.from_samples(t, wrench),
+        PoseSplines(poses.with_continuous_quaternions(), 0.1),
+    )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
+    spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
     zeta = splines.signals(grid.t + LATE, GRAVITY_W)
-    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
-    start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.estimate_pose_noise())
+    start = RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     fit = fit_rigid(
-        spectra.moments(), Q, Levels.flat(spectra.of), start, np.arange(23) < 17, spectra.fit()
+        spectra.second_moments(),
+        Q,
+        NoiseLevels.white_within_groups(spectra.of),
+        start,
+        np.arange(23) < 17,
+        spectra.fit_coefficients(),
     )
     assert not fit.one_weight
     assert np.abs(fit.state.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
@@ -362,10 +389,15 @@ def test_coloured_noise_does_not_select_the_finest_knots():
     assert estimate(kind).spacing >= 0.05
 
 
-def figures_of(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> ReadOff:
-    grid, splines = Grid.of(t, wrench_of_S), PoseSplines(poses.continued(), 0.1)
+def figures_of(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> UnitsAndAxes:
+    grid, splines = (
+        WrenchGrid.from_samples(t, wrench_of_S),
+        PoseSplines(poses.with_continuous_quaternions(), 0.1),
+    )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    return read_off(Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE).fit())
+    return read_units_and_axes(
+        FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE).fit_coefficients()
+    )
 
 
 def test_units_axes_and_sign_are_read_off():
@@ -375,7 +407,7 @@ def test_units_axes_and_sign_are_read_off():
     assert seen.kappa_deviation < 2e-5
     np.testing.assert_allclose(seen.masses, 1.7, atol=5 * seen.deviation)
     seen = figures_of(wrench[:, [1, 0, 2, 4, 3, 5]], poses, t)
-    assert seen.usable and seen.mirrored
+    assert seen.is_usable and seen.is_mirrored
     np.testing.assert_allclose(seen.R_SP, [[0, 1, 0], [1, 0, 0], [0, 0, 1]], atol=0.01)
     assert seen.kappa == pytest.approx(1.0, abs=5 * seen.kappa_deviation)
     np.testing.assert_allclose(figures_of(-wrench, poses, t).R_SP, -np.eye(3), atol=0.01)
@@ -387,47 +419,61 @@ def test_planar_gravity_determines_the_unit_but_not_the_axes():
     true = motion_at(t)
     s = true.specific_force + np.einsum("nji,j->ni", true.R_WS, GRAVITY_W - DOWN)
     noise = 0.01 * np.random.default_rng(7).normal(size=(len(t), 6))
-    grid = Grid.of(t, non_contact_wrench(s, true.omega, true.alpha, PHI) + noise)
-    splines, taper = PoseSplines(poses.continued(), 0.1), end_taper(t[::2], 0.3, SECONDS - 0.3)
-    seen = read_off(Window(grid, taper, DOWN, 20.0).spectra(splines, LATE).fit())
-    assert not seen.usable
+    grid = WrenchGrid.from_samples(t, non_contact_wrench(s, true.omega, true.alpha, PHI) + noise)
+    splines, taper = (
+        PoseSplines(poses.with_continuous_quaternions(), 0.1),
+        end_taper(t[::2], 0.3, SECONDS - 0.3),
+    )
+    seen = read_units_and_axes(
+        FitWindow(grid, taper, DOWN, 20.0).spectra_at_delay(splines, LATE).fit_coefficients()
+    )
+    assert not seen.is_usable
     assert seen.kappa == pytest.approx(1.0, abs=0.02)
 
 
 def test_gain_errors_cause_a_misfit_unless_they_are_stated():
     found = estimate_from_poses(*record(Kind(gain=0.01, seed=8)), GRAVITY_W, gain=0.01)
-    assert not found.fit.rigid and found.fit.one_weight
+    assert not found.fit.is_rigid and found.fit.one_weight
     assert np.abs(deviations(found)).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.02, rel=0.5)
     # Stated gain errors enter the deviations only once.
-    assert found.fit.explained and found.fit.inflation == 1.0
-    assert replace(found.fit, misfit_of_gains=0.0).inflation > 3.0
+    assert found.fit.is_explained_by_gains and found.fit.deviation_inflation == 1.0
+    assert replace(found.fit, misfit_of_gains=0.0).deviation_inflation > 3.0
 
 
 @pytest.mark.slow
 def test_stated_gains_explain_only_their_share():
     kind = Kind(gain=0.01, seed=8)
-    assert not estimate_from_poses(*record(kind), GRAVITY_W, gain=0.001).fit.explained
+    assert not estimate_from_poses(*record(kind), GRAVITY_W, gain=0.001).fit.is_explained_by_gains
     turned = Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4)
-    assert not estimate_from_poses(*record(turned), GRAVITY_W, gain=0.01).fit.explained
+    assert not estimate_from_poses(*record(turned), GRAVITY_W, gain=0.01).fit.is_explained_by_gains
 
 
 def test_gain_effects_predict_the_change_of_the_estimate():
     """One gain error changes the estimate by one column of the effects."""
     t, wrench, poses = record(Kind(seed=9))
-    grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
+    grid, splines = (
+        WrenchGrid.from_samples(t, wrench),
+        PoseSplines(poses.with_continuous_quaternions(), 0.1),
+    )
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
-    Z, levels, free = spectra.moments(), Levels.flat(spectra.of), np.ones(23, bool)
-    none, start = np.zeros_like(Z), State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
-    power = spectra.fit().power
-    solution = _solve(_Record(Z, none, levels, free, power), start)
+    spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
+    Z, levels, free = (
+        spectra.second_moments(),
+        NoiseLevels.white_within_groups(spectra.of),
+        np.ones(23, bool),
+    )
+    none, start = np.zeros_like(Z), RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    power = spectra.fit_coefficients().power
+    solution = _solve_rigid_fit(_FitData(Z, none, levels, free, power), start)
     effects = _gain_effects(solution.B, Z, solution.W, solution.inverse).reshape(23, 6, 6)
     size = np.sqrt(np.sum(effects**2, axis=(1, 2)))
     for d, k in ((0, 2), (2, 2), (4, 0), (1, 5)):
         A = np.eye(38)
         A[16 + d, 16 + k] += 1e-3 * UNITS[d, k]
-        other = _solve(_Record(A @ Z @ A.T, none, levels, free, power), solution.state).state
+        other = _solve_rigid_fit(
+            _FitData(A @ Z @ A.T, none, levels, free, power), solution.state
+        ).state
         moved = 1e3 * (other.theta - solution.state.theta)
         np.testing.assert_allclose(moved / size[:16], effects[:16, d, k] / size[:16], atol=0.1)
 
@@ -438,15 +484,15 @@ def test_wandering_channels_are_found_and_get_less_weight():
     walk = np.cumsum(np.random.default_rng(12).normal(size=(len(t), 6)), axis=0)
     both, step = np.repeat([0.1, 0.004], 3), 2.0 * np.pi * 1.6 / 200.0
     wrench = wrench + walk * both * step * np.array([0, 0, 1, 1, 0, 0])
-    grid, taper = Grid.of(t, wrench), end_taper(t[::2], 0.3, SECONDS - 0.3)
-    splines = PoseSplines(poses.continued(), 0.1)
-    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
-    levels = fit_levels(spectra.moments(), spectra.of)
-    at = spectra.of.sums(spectra.of.frequency) / spectra.of.sizes
+    grid, taper = WrenchGrid.from_samples(t, wrench), end_taper(t[::2], 0.3, SECONDS - 0.3)
+    splines = PoseSplines(poses.with_continuous_quaternions(), 0.1)
+    spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(splines, LATE)
+    levels = fit_noise_levels(spectra.second_moments(), spectra.of)
+    at = spectra.of.sums_over_bands(spectra.of.frequency) / spectra.of.sizes
     corner = np.sqrt(levels.shape - 1.0)[5] * at[5]
     assert (corner[[2, 3]] > 0.7).all() and (corner[[2, 3]] < 3.3).all()
     np.testing.assert_array_equal(corner[[0, 1, 4, 5]], 0.0)
-    power = fit_linear_model(spectra.moments(), levels).power
+    power = fit_linear_model(spectra.second_moments(), levels).power
     assert (power[0, 2:4] > 30.0 * power[-1, 2:4]).all()
     assert (np.diff(power[levels.group == 0, 2]) < 0.0).all()
 
@@ -454,12 +500,12 @@ def test_wandering_channels_are_found_and_get_less_weight():
 def test_deviations_include_estimated_weights():
     """One offset in white noise in four groups of similar weight: Meier's factor in closed form."""
     n, power = 10.0, 0.3
-    levels = Levels(np.full(4, n), np.arange(4), np.ones((4, 6)))
+    levels = NoiseLevels(np.full(4, n), np.arange(4), np.ones((4, 6)))
     Z = np.zeros((4, 38, 38))
     Z[:, 0, 0] = n
     for c in range(6):
         Z[:, 16 + c, 16 + c] = n * power
-    start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
+    start = RigidParameters(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     best = fit_linear_model(Z, levels)
     fit = fit_rigid(Z, np.zeros_like(Z), levels, start, np.arange(23) == 0, best)
     level = power * n / (n - 0.5 / 4)
@@ -488,10 +534,10 @@ def test_given_delay_is_kept():
 
 def test_best_delay_is_found_from_a_distant_start():
     t, wrench, poses = record(Kind(seed=10))
-    grid = Grid.of(t, wrench)
+    grid = WrenchGrid.from_samples(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
-    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(
-        PoseSplines(poses.continued(), 0.07), -0.05
+    spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(
+        PoseSplines(poses.with_continuous_quaternions(), 0.07), -0.05
     )
     assert best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
 
@@ -499,16 +545,16 @@ def test_best_delay_is_found_from_a_distant_start():
 @pytest.mark.parametrize("chopped", [False, True])
 def test_costs_of_many_delays_equal_single_costs(chopped):
     t, wrench, poses = record(Kind(seed=10))
-    grid = Grid.of(t, wrench)
+    grid = WrenchGrid.from_samples(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
     taper = exclude_from_taper(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
-    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(
-        PoseSplines(poses.continued(), 0.07), -0.02
+    spectra = FitWindow(grid, taper, GRAVITY_W, 20.0).spectra_at_delay(
+        PoseSplines(poses.with_continuous_quaternions(), 0.07), -0.02
     )
-    assert spectra.taper_fixed is chopped
+    assert spectra.is_taper_fixed is chopped
     delays = np.array([-0.05, -0.02, LATE])
-    alone = [spectra.at(delay).fit().cost for delay in delays]
-    np.testing.assert_allclose(spectra.costs(delays), alone, rtol=1e-9)
+    alone = [spectra.with_delay(delay).fit_coefficients().cost for delay in delays]
+    np.testing.assert_allclose(spectra.costs_at_delays(delays), alone, rtol=1e-9)
 
 
 def test_exclude_sets_the_taper_to_zero_with_edges():
@@ -542,15 +588,15 @@ def test_residual_only_where_the_load_moves_rejects_nothing(known, moving, push)
 
     wrench = signals(t + late) @ C.T + 0.02 * rng.normal(size=(len(t), 6))
     wrench[(t > 5.0) & (t < 6.0)] += push
-    grid = Grid(t, wrench, 1, C if known else None)
+    grid = WrenchGrid(t, wrench, 1, C if known else None)
     spectra = SimpleNamespace(
         of=SimpleNamespace(frequency=grid.frequency),
         grid=grid,
         taper=np.ones(len(t)),
-        signals=np.fft.rfft(signals(t), grid.length, axis=0),
-        wrench=np.fft.rfft(wrench, grid.length, axis=0),
+        signals=np.fft.rfft(signals(t), grid.transform_length, axis=0),
+        wrench=np.fft.rfft(wrench, grid.transform_length, axis=0),
     )
     rejected, note = find_disturbances(spectra, 0.05)
-    assert note == (NOTHING_REJECTED if late else "")
+    assert note == (NOTHING_REJECTED_NOTE if late else "")
     assert rejected[(t > 5.0) & (t < 6.0)].all() == bool(push)
     assert not rejected[(t < 4.6) | (t > 6.4)].any()

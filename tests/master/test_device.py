@@ -64,7 +64,7 @@ def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:
 def advance(state, wrench, torque, parameters, period, steps) -> np.ndarray:
     state, work, stages = state.copy(), np.empty((2, 6, 6)), np.empty((3, 12))
     for _ in range(steps):
-        dynamics.step(state, wrench, torque, parameters, period, work, stages)
+        dynamics.step_device(state, wrench, torque, parameters, period, work, stages)
     return state
 
 

@@ -13,7 +13,7 @@ from drake_teleop.station.master.force_display import (
     display_into,
     initial_display_state,
 )
-from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 
 DEVICE = Master().device(0.1, 1e-4)
 PERIOD = 5e-4
@@ -145,12 +145,12 @@ def test_wrench_fades_and_returns_without_a_step(part):
     shown, torque = displayed_over(commands, angles)
     force, fault = np.linalg.norm(shown[:, :3], axis=1), shown[:, 6]
     np.testing.assert_array_equal(shown[:40, :6], commands[:40])
-    np.testing.assert_allclose(np.diff(force[39:140]), -force[0] * PERIOD / STOP_TIME, rtol=1e-9)
+    np.testing.assert_allclose(np.diff(force[39:140]), -force[0] * PERIOD / STOP_TIME_S, rtol=1e-9)
     np.testing.assert_allclose(shown[140:160, :6], 0.0, atol=1e-12)
     held = phantom.gravity_torque(POSTURES[1])
     np.testing.assert_allclose(torque[140:160], np.tile(held, (20, 1)), atol=1e-12)
     growth = np.diff(force[159:])
-    assert 0.0 < growth.max() <= 37.5 * PERIOD / RESUME_TIME * (1 + 1e-9)
+    assert 0.0 < growth.max() <= 37.5 * PERIOD / RESUME_TIME_S * (1 + 1e-9)
     np.testing.assert_array_equal(shown[2400:, :6], commands[2400:])
     expected = Fault.WRENCH if part == "wrench" else Fault.HAND
     assert (fault[bad] == expected).all() and not fault[:40].any() and not fault[2400:].any()
@@ -166,6 +166,6 @@ def test_torque_returns_to_the_limit_of_the_strongest_motor():
     shown, _ = displayed_over(commands, np.tile(POSTURES[1], (2600, 1)))
     growth = np.diff(np.linalg.norm(shown[159:, 3:6], axis=1))
     assert (
-        0.0 < growth.max() <= phantom.WRIST_TORQUE_LIMIT.max() * PERIOD / RESUME_TIME * (1 + 1e-9)
+        0.0 < growth.max() <= phantom.WRIST_TORQUE_LIMIT.max() * PERIOD / RESUME_TIME_S * (1 + 1e-9)
     )
     np.testing.assert_array_equal(shown[2400:, :6], commands[2400:])

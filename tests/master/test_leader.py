@@ -72,7 +72,7 @@ def test_motion_equals_drakes_plant_of_the_file():
     device = leader(hand=(0.0, 0.0), damping=[0.01])
     held = Held(device)
     plant = MultibodyPlant(0.0)
-    LEADER.parse(plant)
+    LEADER.add_to_plant(plant)
     plant.Finalize()
     simulator = Simulator(plant)
     simulator.get_mutable_integrator().set_target_accuracy(1e-12)
@@ -156,7 +156,7 @@ def test_wrench_is_limited_by_the_motors_and_logged():
     assert 0.05 < shown[0] / F[0] < 4.9
     np.testing.assert_allclose(shown / F, shown[0] / F[0], rtol=1e-9)  # it keeps its direction
     plant = MultibodyPlant(0.0)
-    LEADER.parse(plant)
+    LEADER.add_to_plant(plant)
     plant.Finalize()
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, HOME)
@@ -173,7 +173,9 @@ def test_joints_have_end_stops():
     assert np.isfinite(q).all()
     assert (q > limits[0] - 0.1).all() and (q < limits[1] + 0.1).all()
     beyond = np.clip(q, *limits) + np.where(q > 0, 1e-9, -1e-9)
-    assert device.at_an_end(np.array([HOME, np.maximum(beyond, limits[1] + 1e-6)])).tolist() == [
+    assert device.is_at_end_stop(
+        np.array([HOME, np.maximum(beyond, limits[1] + 1e-6)])
+    ).tolist() == [
         False,
         True,
     ]

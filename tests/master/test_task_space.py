@@ -38,7 +38,7 @@ def smooth(model="omega_6", **figures) -> dynamics.HapticDevice:
 def advance(device, state, wrench, motor, steps, period=PERIOD) -> np.ndarray:
     state, work, stages = state.copy(), np.empty((2, 6, 6)), np.empty((3, 12))
     for _ in range(steps):
-        dynamics.step(state, wrench, motor, device.numbers, period, work, stages)
+        dynamics.step_device(state, wrench, motor, device.numbers, period, work, stages)
     return state
 
 
@@ -122,8 +122,10 @@ def test_end_of_workspace_is_reported_and_start_beyond_rejected():
     # An axis that does not turn is at its end all the time, which is nothing to say.
     wobbling = inside + 1e-3 * np.eye(6)[5]
     for model, ends in ((fixed, [False, False, True]), (omega, [False, False, True])):
-        np.testing.assert_array_equal(model.at_an_end(np.array([inside, wobbling, aside])), ends)
-    np.testing.assert_array_equal(omega.at_an_end(np.array([turned])), [True])
+        np.testing.assert_array_equal(
+            model.is_at_end_stop(np.array([inside, wobbling, aside])), ends
+        )
+    np.testing.assert_array_equal(omega.is_at_end_stop(np.array([turned])), [True])
     for pose in (aside, turned):
         with pytest.raises(DrakeTeleopError, match="the device's workspace is"):
             omega.inverse_kinematics(omega.forward_kinematics(pose))
@@ -204,8 +206,8 @@ def test_slow_device_holds_reading_and_force_at_its_rate():
         simulation__duration=0.04,
         force_scaling__sigma=1.0,
     )
-    assert scenario.master.own_period(2000.0) == 2e-3
-    assert scenario.master.own_period(500.0) is None
+    assert scenario.master.sampling_period(2000.0) == 2e-3
+    assert scenario.master.sampling_period(500.0) is None
     result = simulate(MakeTeleopStation(scenario), scenario.simulation, progress=False)
     for values in (result["pose_command"][:, 4:], result["force_to_master"][:, :3]):
         changes = np.flatnonzero(np.diff(values, axis=0).any(axis=1))

@@ -19,7 +19,7 @@ from drake_teleop.station.master import device, phantom
 from drake_teleop.station.master.data_sheets import JointFriction, Master
 from drake_teleop.station.master.force_display import ForceDisplay
 from drake_teleop.station.operator.operator import (
-    GRIPS,
+    GRIP_IMPEDANCES,
     MinimumJerk,
     Operator,
     OperatorConfig,
@@ -148,7 +148,7 @@ def test_hand_force_and_torque_are_limited():
     np.testing.assert_allclose(wrench[3:], [0, 0, 2.0], atol=1e-12)
 
 
-@pytest.mark.parametrize("grip", list(GRIPS))
+@pytest.mark.parametrize("grip", list(GRIP_IMPEDANCES))
 def test_hand_yields_to_the_displayed_force(grip):
     """At rest the hand deflects by F / K."""
     period, force = 5e-4, np.array([0.4, 0.3, -1.0])
@@ -200,7 +200,7 @@ def test_intent_loads_from_yaml():
         - !Sine {frequency: 3.0, rotation: [0.0, 0.2, 0.0]}
     """
     config = yaml_load_typed(schema=OperatorConfig, data=text)
-    assert config.hand is GRIPS["firm"]
+    assert config.hand is GRIP_IMPEDANCES["firm"]
     assert config.intent == [
         MinimumJerk(duration=2.0, translation=[0.0, 0.0, 0.1]),
         Sine(frequency=3.0, rotation=[0.0, 0.2, 0.0]),
@@ -213,4 +213,4 @@ def test_grips_in_docs_equal_the_code():
     rows = re.findall(r"^\| `(light|medium|firm)` \| (.*) \|$", text, re.MULTILINE)
     numbers = r"\d[\d.]*(?:e-\d)?"
     found = {name: tuple(float(x) for x in re.findall(numbers, row)) for name, row in rows}
-    assert found == {name: dataclasses.astuple(hand) for name, hand in GRIPS.items()}
+    assert found == {name: dataclasses.astuple(hand) for name, hand in GRIP_IMPEDANCES.items()}

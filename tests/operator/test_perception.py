@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.operator.perception import (
-    EXCESS,
-    NOTICED,
-    THRESHOLD,
+    CONTACT_NOTICED_INDEX,
+    EXCESS_FORCE_START,
+    THRESHOLD_INDEX,
     Perception,
-    perceive,
+    perceive_contact,
 )
 
 RATE = 200.0
@@ -34,8 +34,10 @@ def record(mass: float, steady: float, push: float, amplitude: float = 0.0):
 
 
 def noticed(mass: float, steady: float, push: float, amplitude: float = 0.0, hand_mass=0.0):
-    felt = perceive(T, *record(mass, steady, push, amplitude), HUMAN, hand_mass, attentive=3.0)
-    return felt[:, NOTICED] > 0.0
+    felt = perceive_contact(
+        T, *record(mass, steady, push, amplitude), HUMAN, hand_mass, attentive=3.0
+    )
+    return felt[:, CONTACT_NOTICED_INDEX] > 0.0
 
 
 @pytest.mark.long
@@ -60,11 +62,11 @@ def test_inertial_force_masks_a_contact(push):
 
 
 def test_moved_mass_is_learned_and_is_no_contact():
-    felt = perceive(T, *record(1.2, 2.0, 0.0, 0.1), HUMAN, 0.0, attentive=3.0)
+    felt = perceive_contact(T, *record(1.2, 2.0, 0.0, 0.1), HUMAN, 0.0, attentive=3.0)
     late = T > 3.0
-    assert np.abs(felt[late, EXCESS:THRESHOLD]).max() < 0.1
-    assert felt[late, THRESHOLD].min() > 0.4
-    assert not felt[:, NOTICED].any()
+    assert np.abs(felt[late, EXCESS_FORCE_START:THRESHOLD_INDEX]).max() < 0.1
+    assert felt[late, THRESHOLD_INDEX].min() > 0.4
+    assert not felt[:, CONTACT_NOTICED_INDEX].any()
 
 
 def test_inertial_force_of_the_hand_is_not_perceived():
@@ -75,15 +77,17 @@ def test_masking_fades_with_its_time_constant():
     """After a motion the threshold decays as exp(-t / masking_time)."""
     force, velocity = record(1.2, 0.0, 0.0, 0.1)
     moving = (T < 4.0)[:, np.newaxis]
-    felt = perceive(T, force * moving, velocity * moving, HUMAN, 0.0, attentive=6.0)
+    felt = perceive_contact(T, force * moving, velocity * moving, HUMAN, 0.0, attentive=6.0)
     a, b = np.searchsorted(T, [4.2, 4.5])
-    ratio = felt[b, THRESHOLD] / felt[a, THRESHOLD]
+    ratio = felt[b, THRESHOLD_INDEX] / felt[a, THRESHOLD_INDEX]
     assert ratio == pytest.approx(np.exp(-0.3 / HUMAN.masking_time), rel=0.02)
 
 
 def test_record_of_wrong_shape_is_rejected():
     with pytest.raises(DrakeTeleopError, match="velocity"):
-        perceive(T, np.zeros((len(T), 3)), np.zeros((len(T), 2)), HUMAN, 0.0)
+        perceive_contact(T, np.zeros((len(T), 3)), np.zeros((len(T), 2)), HUMAN, 0.0)
     for times in (T[:1], T[::-1]):
         with pytest.raises(DrakeTeleopError, match="t: is not increasing"):
-            perceive(times, np.zeros((len(times), 3)), np.zeros((len(times), 3)), HUMAN, 0.0)
+            perceive_contact(
+                times, np.zeros((len(times), 3)), np.zeros((len(times), 3)), HUMAN, 0.0
+            )

@@ -13,9 +13,19 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.data_sheets import JointFriction
 from drake_teleop.station.operator import decision
-from drake_teleop.station.operator.decision import DONE, OVER, PHASE, SEEKING, STOPPING
+from drake_teleop.station.operator.decision import (
+    OUTCOME_INDEX,
+    PHASE_INDEX,
+    PHASE_OVER,
+    PHASE_SEARCHING_SLOT,
+    PHASE_STOPPING,
+)
 from drake_teleop.station.operator.minimum_jerk import add_plan_into, plan_move
-from drake_teleop.station.operator.perception import NOTICED, Perception, perceive
+from drake_teleop.station.operator.perception import (
+    CONTACT_NOTICED_INDEX,
+    Perception,
+    perceive_contact,
+)
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Touch, check_task
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import simulate
@@ -59,8 +69,8 @@ def test_reaching_ends_in_the_target(reach):
     assert measures["success"] == 1.0
     assert 0.5 < measures["task_time_s"] < 2.0
     state = result["task_state"]
-    ended = np.argmax(state[:, DONE] != 0.0)
-    assert (state[ended:, PHASE] == OVER).all()
+    ended = np.argmax(state[:, OUTCOME_INDEX] != 0.0)
+    assert (state[ended:, PHASE_INDEX] == PHASE_OVER).all()
     assert np.isnan(measures["detection_time_s"]) and measures["contact_force_overshoot_N"] == 0.0
 
 
@@ -94,14 +104,14 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     """The base is rotated about all axes, and the force is scaled down."""
     R_WB = RollPitchYaw(0.4, -0.9, 1.3).ToRotationMatrix().matrix()
     task = Press(translation=[0.03, -0.02, -0.06])
-    training = decision.Training(R_WB, 1.5, 0.3, 0.0, 0.0, 0)
-    person = decision.pack_person(training, Perception(), Movement())
+    training = decision.OperatorTraining(R_WB, 1.5, 0.3, 0.0, 0.0, 0)
+    person = decision.pack_operator_parameters(training, Perception(), Movement())
     # As Python, so that nothing else is compiled.
     monkeypatch.setattr(
         decision, "_contact_force_along_axis", decision._contact_force_along_axis.py_func
     )
     force_W, across = np.array([3.0, -5.0, 8.0]), np.zeros(3)
-    packed, felt = decision.pack_task(task), 0.3 * R_WB.T @ force_W
+    packed, felt = decision.pack_task_parameters(task), 0.3 * R_WB.T @ force_W
     axis = np.array(task.translation) / np.linalg.norm(task.translation)
     assert decision._contact_force_along_axis(packed, person, felt) == pytest.approx(
         -force_W @ axis
@@ -113,9 +123,9 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
 
 @pytest.mark.parametrize(("length", "duration"), [(0.3, None), (1e-4, 0.2)])
 def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, length, duration):
-    training = decision.Training(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
+    training = decision.OperatorTraining(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
-    person, plans = decision.pack_person(training, Perception(), movement), []
+    person, plans = decision.pack_operator_parameters(training, Perception(), movement), []
     monkeypatch.setattr(decision, "_convert_to_hand", decision._convert_to_hand.py_func)
     monkeypatch.setattr(decision, "_random_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
@@ -175,8 +185,8 @@ def test_hand_stops_after_contact_detection(touch):
         force = contact_force(result)
         assert force[-1] > 0.5 and np.ptp(force[-200:]) < 2.0
         # A stop takes its time, and it rests for 0.3 s, the default.
-        stopping = result.t[result["task_state"][:, PHASE] == STOPPING]
-        assert np.ptp(stopping) > decision.STOP + 0.29
+        stopping = result.t[result["task_state"][:, PHASE_INDEX] == PHASE_STOPPING]
+        assert np.ptp(stopping) > decision.STOP_DURATION_S + 0.29
         # And the run ends with the task.
         assert 0.0 <= result.t[-1] - measures["task_time_s"] < 0.03
 
@@ -187,7 +197,7 @@ def test_rendered_weight_raises_threshold_and_slows_approach(touch):
     without, with_load = touch[0.0][1], touch[1.0][1]
     assert with_load["task_time_s"] > without["task_time_s"]
     assert with_load["effort_Ns"] > 2 * without["effort_Ns"]
-    limit = [result["task_state"][-1, decision.LIMIT] for result, _ in touch.values()]
+    limit = [result["task_state"][-1, decision.FORCE_LIMIT_INDEX] for result, _ in touch.values()]
     assert limit[0] == pytest.approx(0.06, abs=0.005)
     assert limit[1] == pytest.approx(0.1 * 3.13 * 9.81 / 17.5, rel=0.1)
 
@@ -199,7 +209,7 @@ def test_search_finds_the_slot_after_an_aim_error():
     task = Insert(translation=[0.0, 0.0085, -0.02], depth=0.04)
     result, measures = run("insert", **with_task(task))
     assert measures["success"] == 1.0
-    assert (result["task_state"][:, PHASE] == SEEKING).any()
+    assert (result["task_state"][:, PHASE_INDEX] == PHASE_SEARCHING_SLOT).any()
     # It stood on the top first: at the force of a push, above the mouth.
     assert measures["detection_time_s"] < 0.5
 
@@ -210,7 +220,7 @@ def test_operator_gives_up_without_contact():
     result, measures = run("touch", force_scaling__gamma=0.0, sheet_spring=None)
     assert measures["success"] == 0.0 and np.isnan(measures["task_time_s"])
     assert np.isnan(measures["detection_time_s"])
-    assert result["task_state"][-1, DONE] <= 0.0
+    assert result["task_state"][-1, OUTCOME_INDEX] <= 0.0
 
 
 @pytest.mark.long
@@ -229,7 +239,7 @@ def test_press_is_given_up_after_timeout():
     task = Press(translation=[0.0, 0.0, -0.08], timeout=1.0)
     result, measures = run("press", **with_task(task, simulation__duration=1.5))
     assert measures["success"] == 0.0
-    assert result["task_state"][-1, DONE] == -1.0
+    assert result["task_state"][-1, OUTCOME_INDEX] == -1.0
 
 
 @pytest.mark.long
@@ -242,7 +252,12 @@ def test_papers_contact_is_detected_without_false_detection():
     result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
     hand, velocity = result["hand_wrench_E"][:, :3], result["twist_master"][:, :3]
     mass = scenario.operator.hand.mass
-    noticed = perceive(result.t, hand, velocity, Perception(), mass, 1.0)[:, NOTICED] > 0.0
+    noticed = (
+        perceive_contact(result.t, hand, velocity, Perception(), mass, 1.0)[
+            :, CONTACT_NOTICED_INDEX
+        ]
+        > 0.0
+    )
     touching = contact_force(result) > 0.0
     assert not noticed[: np.argmax(touching)].any()
     assert detection_time(result.t, touching, noticed) < 0.03

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.html import content_security_policy, render_page
-from drake_teleop.station.film import Film
+from drake_teleop.station.film import ReplayFile
 
 CODE = "const a = 1;\nlet b = 'é';"
 
@@ -41,7 +41,7 @@ def test_policy_allows_connections_only_to_the_given_server():
 
 @pytest.mark.long
 def test_replays_and_reports_have_a_policy(tmp_path):
-    film = Film("x", np.arange(2.0), 1.0)
+    film = ReplayFile("x", np.arange(2.0), 1.0)
     film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)
     page = (tmp_path / "x.html").read_text(encoding="utf-8")
     head, _, rest = page.partition("<title>")

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.station.passivity.four_channel import FourChannelConfig
-from drake_teleop.station.passivity.memory import DAMPING, LIMIT, STIFFNESS
+from drake_teleop.station.passivity.memory import DAMPING, STIFFNESS, WRENCH_LIMIT
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     slave_step,
     steps_of,
 )
-from drake_teleop.station.passivity.packet import PACKET_SIZE, moved_pose_into, pose_difference_into
+from drake_teleop.station.passivity.packet import PACKET_SIZE, move_pose_into, pose_difference_into
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
@@ -22,11 +22,11 @@ START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, -0.2, 0.3])
 
 def test_motion_and_force_of_both_ends_with_local_feedback():
     own = FourChannelConfig([70.0, 0.7], [4.0, 0.03], slave_feedback=0.3, hand_feedback=-0.4)
-    p = parameters(
+    p = method_parameters(
         PassivityConfig("four_channel", force_limit=1e4, torque_limit=1e3, four_channel=own)
     )
     rng, zero = np.random.default_rng(0), np.zeros(6)
-    memory = [initial_memory("four_channel", p, START) for _ in range(2)]
+    memory = [initial_method_memory("four_channel", p, START) for _ in range(2)]
     packets = np.zeros((2, PACKET_SIZE))
     moved, twist, (hand, contact) = (
         0.1 * rng.normal(size=6),
@@ -34,7 +34,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
         rng.normal(size=(2, 6)),
     )
     pose, wrench, command = START.copy(), np.zeros(6), np.zeros(13)
-    moved_pose_into(START, moved, pose)  # the hand's; the slave is at the start
+    move_pose_into(START, moved, pose)  # the hand's; the slave is at the start
 
     slave_step(
         steps_of("four_channel"),
@@ -58,7 +58,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
         twist[0],
         zero,
         hand,
-        p[LIMIT],
+        p[WRENCH_LIMIT],
         T,
         p,
         memory[0],

@@ -25,12 +25,18 @@ from drake_teleop.lab.comparison.one_dof import (
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.ledger_slave import _BALANCE
-from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
+from drake_teleop.station.passivity.memory import (
+    DISSIPATED_ENERGY,
+    RECEIVED_ENERGY,
+    SENT_ENERGY,
+    STORED_ENERGY,
+    WRENCH_LIMIT,
+)
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     slave_step,
     steps_of,
 )
@@ -124,9 +130,9 @@ def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
 
 def test_ledger_is_input_minus_output_and_keeps_its_deficit():
     """At every step of both ends, also with a hand that is only pushed."""
-    p, method = parameters(CHARGED_BY_DRAG), steps_of("ledger")
+    p, method = method_parameters(CHARGED_BY_DRAG), steps_of("ledger")
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    ends = [initial_memory("ledger", p, start) for _ in range(2)]
+    ends = [initial_method_memory("ledger", p, start) for _ in range(2)]
     packets, still = [np.zeros(PACKET_SIZE) for _ in range(2)], np.zeros(6)
     felt, command, wrench, work = np.zeros(6), np.zeros(13), np.zeros(6), np.zeros((2, 2))
     rng, least = np.random.default_rng(3), 0.0
@@ -140,27 +146,32 @@ def test_ledger_is_input_minus_output_and_keeps_its_deficit():
             both = [np.array([part[:3].sum(), part[3:].sum()]) for part in steps]
             work[end] += both[0] if end == 0 else -np.minimum(*both)
         master_step(
-            method, given[1], True, start, dx[0] / 1e-3, dx[0], still, p[LIMIT], 1e-3, p, ends[0],
-            felt, packets[0],
+            method, given[1], True, start, dx[0] / 1e-3, dx[0], still, p[WRENCH_LIMIT], 1e-3, p,
+            ends[0], felt, packets[0],
         )  # fmt: skip
         slave_step(
             method, given[0], True, start, dx[1] / 1e-3, dx[1], wrench, 1e-3, p, ends[1], command,
             packets[1],
         )  # fmt: skip
         for end, memory in enumerate(ends):
-            books = memory[RECEIVED] - memory[SENT] - memory[LOST] - work[end]
-            np.testing.assert_allclose(memory[LEDGER], books, atol=1e-12)
-        least = min(least, ends[0][LEDGER].min(), ends[1][LEDGER].min())
+            books = (
+                memory[RECEIVED_ENERGY]
+                - memory[SENT_ENERGY]
+                - memory[DISSIPATED_ENERGY]
+                - work[end]
+            )
+            np.testing.assert_allclose(memory[STORED_ENERGY], books, atol=1e-12)
+        least = min(least, ends[0][STORED_ENERGY].min(), ends[1][STORED_ENERGY].min())
     assert least < 0.0, "there should have been a debt"
 
 
 def test_motors_cannot_use_the_kinetic_energy_of_the_slave():
     """A = L_s - m v^2 / 2 by group, with 1.05 times the configured mass."""
-    p = parameters(PassivityConfig(method="ledger", slave_mass=[4.0, 0.02]))
+    p = method_parameters(PassivityConfig(method="ledger", slave_mass=[4.0, 0.02]))
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    memory, zero = initial_memory("ledger", p, start), np.zeros(6)
+    memory, zero = initial_method_memory("ledger", p, start), np.zeros(6)
     twist = np.array([0.06, 0.08, 0.0, 0.0, 0.0, 0.5])
-    held = memory[LEDGER].copy()
+    held = memory[STORED_ENERGY].copy()
     slave_step(
         steps_of("ledger"), np.zeros(PACKET_SIZE), False, start, twist, PERIOD * twist, zero,
         PERIOD, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),

@@ -29,12 +29,18 @@ from drake_teleop.station.passivity.ledger_slave import (
     update_contact_direction,
     wrench_component_along,
 )
-from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOAD_WRENCH, LOST, SENT
+from drake_teleop.station.passivity.memory import (
+    DISSIPATED_ENERGY,
+    LOAD_WRENCH,
+    SENT_ENERGY,
+    STORED_ENERGY,
+    WRENCH_LIMIT,
+)
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     slave_step,
     steps_of,
 )
@@ -58,9 +64,9 @@ class Hand:
     """Master's end with its last received packet."""
 
     def __init__(self, wrench: np.ndarray, stiffness: float) -> None:
-        self.p = parameters(RICH)
-        self.memory = initial_memory("ledger", self.p, START)
-        self.memory[LEDGER] = 0.2  # more than it needs, and no more than it keeps in contact
+        self.p = method_parameters(RICH)
+        self.memory = initial_method_memory("ledger", self.p, START)
+        self.memory[STORED_ENERGY] = 0.2  # more than it needs, and no more than it keeps in contact
         self.pose, self.felt, self.packet = START.copy(), np.zeros(6), np.zeros(PACKET_SIZE)
         self.packet[POSE], self.packet[WRENCH] = START, wrench
         self.packet[CONTACT_STIFFNESS], self.packet[ROUND_TRIP] = stiffness / 1.1, 0.1
@@ -73,8 +79,8 @@ class Hand:
         self.packet[PACKET_NUMBER] += 1.0
         sent, still = np.zeros(PACKET_SIZE), np.zeros(6)
         master_step(
-            steps_of("ledger"), self.packet, True, self.pose, dx / T, dx, still, self.p[LIMIT], T,
-            self.p, self.memory, self.felt, sent,
+            steps_of("ledger"), self.packet, True, self.pose, dx / T, dx, still,
+            self.p[WRENCH_LIMIT], T, self.p, self.memory, self.felt, sent,
         )  # fmt: skip
         return self.felt.copy()
 
@@ -304,12 +310,12 @@ def test_released_hand_receives_at_most_its_ledger():
 def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
     """A hand that oscillates by one encoder step needs a force on the way in as well."""
     hand, got, step = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0), 0.0, 3e-5
-    hand.memory[LEDGER] = 0.0
+    hand.memory[STORED_ENERGY] = 0.0
     for k in range(600):
         way = step * ((k % 20 == 10) - float(k % 20 == 0))
         got += hand.felt[2] * way
         hand.step([0.0, 0.0, way, 0.0, 0.0, 0.0])
-        assert hand.memory[LEDGER][0] == pytest.approx(-got)
+        assert hand.memory[STORED_ENERGY][0] == pytest.approx(-got)
     assert got <= 0.0
 
 
@@ -333,7 +339,7 @@ def test_wrench_cross_fades_after_missing_packets():
 def test_wall_is_removed_if_its_motion_does_not_explain_the_lost_force(
     shown, stiffness, step, damping, speeds
 ):
-    memory = initial_memory("ledger", parameters(RICH), START)
+    memory = initial_method_memory("ledger", method_parameters(RICH), START)
     normal = np.array([0.6, 0.0, -0.8, 0.0, 0.0, 0.0])
     memory[NORMAL], memory[OWN_VELOCITY] = normal, -speeds[0] * normal
     memory[_LAST_SPEED], memory[_DISPLAYED_FORCE] = speeds[1], shown
@@ -345,8 +351,8 @@ def test_wall_is_removed_if_its_motion_does_not_explain_the_lost_force(
 
 def test_friction_that_changes_its_sign_does_not_soften_the_wall():
     """The tool slides back and forth on a wall of 200 N/m in contact."""
-    p, packet, command = parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
-    memory, received = initial_memory("ledger", p, START), np.zeros(PACKET_SIZE)
+    p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
+    memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
     pose, before = START.copy(), START.copy()
     received[POSE], received[LEDGER_LEVEL] = START, 1.0
     for k in range(3000):
@@ -372,8 +378,8 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
 
     The mean of force and friction is no normal, so that the slip is a step along it, by 0.3 N.
     """
-    p, packet, command = parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
-    memory, received = initial_memory("ledger", p, START), np.zeros(PACKET_SIZE)
+    p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
+    memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
     pose, received[POSE], received[LEDGER_LEVEL] = START.copy(), START, 1.0
     hand, felt = Hand(np.zeros(6), 0.0), []
     for k in range(2600):
@@ -401,8 +407,8 @@ def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
     contact = np.array([0.0, 0.0, 18.0, 0.0, 0.7, 0.0])
     sizes = []
     for motion in ((1.0, 1.0), (1.0, 0.1), (0.5, 1.5)):
-        p = parameters(config, motion_scale=motion)
-        memory = initial_memory("ledger", p, START)
+        p = method_parameters(config, motion_scale=motion)
+        memory = initial_method_memory("ledger", p, START)
         wrench = contact / 17.5 / np.repeat(motion, 3)
         size = update_contact_direction(wrench, 0.01, 1e-3, p, memory)
         sizes.append(size * motion[0])
@@ -418,11 +424,11 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
 
     A load that shakes is felt smoothed, over a round trip and the servo's lag.
     """
-    p, packet, command = parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
-    memory, received = initial_memory("ledger", p, START), np.zeros(PACKET_SIZE)
+    p, packet, command = method_parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
+    memory, received = initial_method_memory("ledger", p, START), np.zeros(PACKET_SIZE)
     pose, received[POSE] = START.copy(), START
     load = np.array([0.2, 0.0, -1.8, 0.0, 0.05, 0.0])
-    stored, depth = memory[LEDGER][0], 0.0
+    stored, depth = memory[STORED_ENERGY][0], 0.0
     for k in range(1000):
         dx = np.array([0.0, 0.0, -1e-5, 0.0, 0.0, 0.0])
         pose[6] += dx[2]
@@ -441,7 +447,9 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
     stiffness = packet[CONTACT_STIFFNESS]
     assert stiffness == pytest.approx(200.0, rel=0.05)
     # The packets take what is passed on to the hand, which has nothing here.
-    books = memory[LEDGER][0] + memory[SENT][0] + memory[LOST][0] - stored
+    books = (
+        memory[STORED_ENERGY][0] + memory[SENT_ENERGY][0] + memory[DISSIPATED_ENERGY][0] - stored
+    )
     assert books == pytest.approx(1.8 * 0.01 - 0.5 * 200.0 * depth**2, rel=3e-3)
     hand = Hand(packet[WRENCH], stiffness)
     hand.packet[LOAD] = load

@@ -21,20 +21,20 @@ from drake_teleop.station.passivity.force_limit import _LOCAL_LIMIT, ForceLimitC
 from drake_teleop.station.passivity.memory import (
     DAMPING,
     HELD_WRENCH,
-    LEDGER,
-    LIMIT,
     MASS,
     MEMORY_SIZE,
     MOTION_SCALE,
-    SENT,
+    SENT_ENERGY,
     STIFFNESS,
+    STORED_ENERGY,
+    WRENCH_LIMIT,
 )
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     slave_step,
     steps_of,
 )
@@ -44,7 +44,7 @@ from drake_teleop.station.passivity.packet import (
     PACKET_NUMBER,
     PACKET_SIZE,
     WRENCH,
-    moved_pose_into,
+    move_pose_into,
     pose_difference_into,
 )
 from drake_teleop.station.passivity.two_layer import TwoLayerConfig, _exchange_energy
@@ -60,7 +60,7 @@ def poses(rng: np.random.Generator, steps: int) -> np.ndarray:
     phase, rate = rng.uniform(0, 6, 6), rng.uniform(3, 12, 6)
     e = 0.05 * (np.sin(np.outer(t, rate) + phase) - np.sin(phase))
     for k in range(steps):
-        moved_pose_into(START, e[k], pose[k])
+        move_pose_into(START, e[k], pose[k])
     return pose
 
 
@@ -81,8 +81,8 @@ def run(method, config, master_poses, slave_poses, f_e, newest):
         increments of both ends (2, N, 6), both memories.
     """
     steps = len(f_e)
-    p = parameters(config)
-    memory = [initial_memory(method, p, ends[0]) for ends in (master_poses, slave_poses)]
+    p = method_parameters(config)
+    memory = [initial_method_memory(method, p, ends[0]) for ends in (master_poses, slave_poses)]
     sent = np.zeros((2, steps, PACKET_SIZE))
     wrench, command, dx = np.zeros((steps, 6)), np.zeros((steps, 13)), np.zeros((2, steps, 6))
     nothing = np.zeros(PACKET_SIZE)
@@ -96,8 +96,8 @@ def run(method, config, master_poses, slave_poses, f_e, newest):
             twist = dx[end, k] / T
             if end == 0:
                 master_step(
-                    m, received, fresh, pose[k], twist, dx[end, k], np.zeros(6), p[LIMIT], T, p,
-                    memory[end], wrench[k], sent[end, k],
+                    m, received, fresh, pose[k], twist, dx[end, k], np.zeros(6), p[WRENCH_LIMIT],
+                    T, p, memory[end], wrench[k], sent[end, k],
                 )  # fmt: skip
             else:
                 slave_step(
@@ -170,16 +170,20 @@ def test_the_world_axes_do_not_matter(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_input_not_finite_gives_zero_force_and_keeps_the_ledgers(method, bad):
-    p = parameters(PassivityConfig(method=method))
-    memory = initial_memory(method, p, START)
+    p = method_parameters(PassivityConfig(method=method))
+    memory = initial_method_memory(method, p, START)
     received, zero = np.zeros(PACKET_SIZE), np.zeros(6)
     wrench, command, packet = np.ones(6), np.zeros(13), np.zeros(PACKET_SIZE)
     m = steps_of(method)
-    master_step(m, received, False, START, zero, zero, zero, p[LIMIT], T, p, memory, wrench, packet)
+    master_step(
+        m, received, False, START, zero, zero, zero, p[WRENCH_LIMIT], T, p, memory, wrench, packet
+    )
     before = memory.copy()
     received[20] = bad
     wrench[:] = 1.0
-    master_step(m, received, True, START, zero, zero, zero, p[LIMIT], T, p, memory, wrench, packet)
+    master_step(
+        m, received, True, START, zero, zero, zero, p[WRENCH_LIMIT], T, p, memory, wrench, packet
+    )
     assert (wrench == 0).all() and packet[INPUTS_FINITE] == 0 and np.isfinite(packet).all()
     np.testing.assert_array_equal(memory[1:], before[1:])
     slave_step(m, received, True, START, zero, zero, zero, T, p, memory, command, packet)
@@ -199,11 +203,11 @@ def test_step_writes_only_into_its_arguments(method):
         around.append((wide, wide.copy()))
         return wide[8:-8]
 
-    p = guarded(parameters(PassivityConfig(method=method)))
-    ends = [guarded(initial_memory(method, p, START)) for _ in range(2)]
+    p = guarded(method_parameters(PassivityConfig(method=method)))
+    ends = [guarded(initial_method_memory(method, p, START)) for _ in range(2)]
     packets = [guarded(np.zeros(PACKET_SIZE)) for _ in range(2)]
     wrench, command, hand, limits = (guarded(x) for x in np.split(np.zeros(27), [6, 19, 25]))
-    limits[:] = p[LIMIT]
+    limits[:] = p[WRENCH_LIMIT]
     path = poses(rng, 200)
     for k in range(1, 200):
         pose, dx, f_e = guarded(path[k]), guarded(np.zeros(6)), guarded(rng.normal(size=6))
@@ -242,8 +246,8 @@ def test_limits_and_servo_have_their_own_scales(power, motion, limits):
         slave_mass=[15.0, 16.0],
         local_force_limit=ForceLimitConfig(force=0.5 * limits[0], torque=2.0 * limits[1]),
     )
-    p = parameters(config, power, motion)
-    np.testing.assert_allclose(p[LIMIT] * motion, limits)
+    p = method_parameters(config, power, motion)
+    np.testing.assert_allclose(p[WRENCH_LIMIT] * motion, limits)
     np.testing.assert_allclose(p[_LOCAL_LIMIT] * motion, np.multiply(limits, [0.5, 2.0]))
     for part, values in ((STIFFNESS, (11, 12)), (DAMPING, (13, 14)), (MASS, (15, 16))):
         np.testing.assert_allclose(p[part] / power, values)
@@ -258,10 +262,10 @@ def test_limits_are_those_of_the_default_device_unless_given():
 
 def test_unknown_method_is_rejected():
     with pytest.raises(DrakeTeleopError, match="there is no passivity method 'waves'"):
-        initial_memory("waves", np.zeros(1), START)
+        initial_method_memory("waves", np.zeros(1), START)
     with pytest.raises(DrakeTeleopError, match="method"):
         check_ranges(PassivityConfig(method="waves"), "passivity")
-    assert initial_memory("none", np.zeros(1), START).shape == (MEMORY_SIZE,)
+    assert initial_method_memory("none", np.zeros(1), START).shape == (MEMORY_SIZE,)
 
 
 @pytest.mark.slow
@@ -297,14 +301,18 @@ def test_slave_follows_while_its_inertia_is_rendered(sigma):
 )
 def test_wrench_drops_abruptly_only_without_energy(stored, left):
     """3 N, the hand yields 0.3 mm in a step, motion scale 2: 450 N/s."""
-    p = parameters(PassivityConfig(method="tdpa"), motion_scale=(2.0, 2.0))
-    memory, packet, wrench = initial_memory("tdpa", p, START), np.zeros(PACKET_SIZE), np.zeros(6)
+    p = method_parameters(PassivityConfig(method="tdpa"), motion_scale=(2.0, 2.0))
+    memory, packet, wrench = (
+        initial_method_memory("tdpa", p, START),
+        np.zeros(PACKET_SIZE),
+        np.zeros(6),
+    )
     received = packet.copy()
     received[WRENCH][1] = memory[HELD_WRENCH][1] = 3.0
-    memory[LEDGER][0] = stored
+    memory[STORED_ENERGY][0] = stored
     dx = np.array([0.1e-3, 0.3e-3, 0.0, 0.0, 0.0, 0.0])
     master_step(
-        steps_of("tdpa"), received, True, START, dx / T, dx, np.zeros(6), p[LIMIT], T, p,
+        steps_of("tdpa"), received, True, START, dx / T, dx, np.zeros(6), p[WRENCH_LIMIT], T, p,
         memory, wrench, packet,
     )  # fmt: skip
     np.testing.assert_allclose(wrench, [0.0, left, 0.0, 0.0, 0.0, 0.0], rtol=1e-12, atol=0.0)
@@ -312,21 +320,23 @@ def test_wrench_drops_abruptly_only_without_energy(stored, left):
 
 def test_tank_with_fastest_sending_is_not_overdrawn():
     """A thousand times its content in a second, each millisecond and each 10 ms."""
-    p = parameters(PassivityConfig(method="two_layer", two_layer=TwoLayerConfig(send_rate=1000.0)))
+    p = method_parameters(
+        PassivityConfig(method="two_layer", two_layer=TwoLayerConfig(send_rate=1000.0))
+    )
     for step in (T, 10 * T):
-        memory, packet = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
-        full = memory[LEDGER].copy()
+        memory, packet = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
+        full = memory[STORED_ENERGY].copy()
         assert np.all(full > 0.0)
         _exchange_energy(np.zeros(PACKET_SIZE), np.zeros(6), step, p, memory, packet)
-        assert np.all(memory[LEDGER] >= 0.0)
-        np.testing.assert_allclose(memory[LEDGER] + memory[SENT], full, rtol=1e-12)
+        assert np.all(memory[STORED_ENERGY] >= 0.0)
+        np.testing.assert_allclose(memory[STORED_ENERGY] + memory[SENT_ENERGY], full, rtol=1e-12)
 
 
 def test_overdrawn_tank_keeps_its_deficit():
     """Received energy repays it first."""
-    p = parameters(PassivityConfig(method="two_layer"))
-    memory, received = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
-    memory[LEDGER] = -1e-3
+    p = method_parameters(PassivityConfig(method="two_layer"))
+    memory, received = initial_method_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
+    memory[STORED_ENERGY] = -1e-3
     received[ENERGY] = 4e-4
     _exchange_energy(received, np.zeros(6), T, p, memory, np.zeros(PACKET_SIZE))
-    np.testing.assert_allclose(memory[LEDGER], -6e-4, rtol=1e-12)
+    np.testing.assert_allclose(memory[STORED_ENERGY], -6e-4, rtol=1e-12)

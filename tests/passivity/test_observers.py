@@ -13,12 +13,12 @@ from drake_teleop.station.passivity.energy import (
     energy_in_flight,
     port_work,
 )
-from drake_teleop.station.passivity.memory import LEDGER, LIMIT, MEMORY_SIZE
+from drake_teleop.station.passivity.memory import MEMORY_SIZE, STORED_ENERGY, WRENCH_LIMIT
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     steps_of,
 )
 from drake_teleop.station.passivity.packet import OTHER_ENERGY, PACKET_SIZE, POSE
@@ -65,16 +65,16 @@ def test_tdpa_ledger_is_the_work_at_the_hand():
 def test_drag_acts_only_below_the_reserve(short):
     """Full drag against the motion, above the fading speed."""
     config = PassivityConfig(method="charged_tdpa")
-    p, dx, wrench = parameters(config), np.zeros(6), np.zeros(6)
+    p, dx, wrench = method_parameters(config), np.zeros(6), np.zeros(6)
     dx[:3] = 1e-3 * np.array([2.0, -1.0, 2.0]) / 3
-    memory = initial_memory("charged_tdpa", p, poses(np.random.default_rng(0), 1)[0])
+    memory = initial_method_memory("charged_tdpa", p, poses(np.random.default_rng(0), 1)[0])
     received, packet = np.zeros(PACKET_SIZE), np.zeros(PACKET_SIZE)
     received[POSE] = [1, 0, 0, 0, 0, 0, 0]
     received[OTHER_ENERGY] = 0.0 if short == "slave" else 1.0
-    memory[LEDGER] = 0.0 if short == "master" else 1.0
+    memory[STORED_ENERGY] = 0.0 if short == "master" else 1.0
     master_step(
         steps_of("charged_tdpa"), received, True, received[POSE], dx / T, dx, np.zeros(6),
-        p[LIMIT], T, p, memory, wrench, packet,
+        p[WRENCH_LIMIT], T, p, memory, wrench, packet,
     )  # fmt: skip
     if short is None:
         np.testing.assert_array_equal(wrench, 0.0)

@@ -8,25 +8,25 @@ import pytest
 from drake_teleop.station.passivity import pspm
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
+    DISSIPATED_ENERGY,
     HELD_WRENCH,
-    LEDGER,
-    LIMIT,
-    LOST,
-    RECEIVED,
-    SENT,
+    RECEIVED_ENERGY,
+    SENT_ENERGY,
+    STORED_ENERGY,
+    WRENCH_LIMIT,
 )
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     slave_step,
     steps_of,
 )
 from drake_teleop.station.passivity.packet import (
     PACKET_SIZE,
     WRENCH,
-    moved_pose_into,
+    move_pose_into,
     pose_difference_into,
 )
 
@@ -58,10 +58,10 @@ def test_stored_energy_is_what_was_put_in(end):
         servo_damping=[2.0, 0.02],
         retreat=[1e3, 1e3],  # else the wrench does not tell the spring
     )
-    p, m = parameters(config), steps_of("pspm")
-    memory = initial_memory("pspm", p, START)
-    first, work = memory[LEDGER].copy(), np.zeros(2)
-    other = initial_memory("pspm", p, START)
+    p, m = method_parameters(config), steps_of("pspm")
+    memory = initial_method_memory("pspm", p, START)
+    first, work = memory[STORED_ENERGY].copy(), np.zeros(2)
+    other = initial_method_memory("pspm", p, START)
     held, before, e = np.zeros(6), START.copy(), np.zeros(6)
     ours, theirs = motion(rng), motion(rng)
     dx, dx_other, pose, target = np.zeros(6), np.zeros(6), START.copy(), START.copy()
@@ -71,10 +71,10 @@ def test_stored_energy_is_what_was_put_in(end):
     B = np.repeat(config.pspm.damping, 3)
     largest = 0.0
     for k in range(STEPS):
-        moved_pose_into(START, ours[k], pose)
+        move_pose_into(START, ours[k], pose)
         pose_difference_into(pose, before, dx)
         before[:] = pose
-        moved_pose_into(START, theirs[k], target)
+        move_pose_into(START, theirs[k], target)
         dx_other[:] = theirs[k] - theirs[max(k - 1, 0)]
         f_e = np.repeat([4.0, 0.05], 3) * np.sin(k * T * np.arange(3, 9))
         twist = dx / T
@@ -87,7 +87,7 @@ def test_stored_energy_is_what_was_put_in(end):
                     received,
                 )  # fmt: skip
             master_step(
-                m, received, fresh, pose, twist, dx, np.zeros(6), p[LIMIT], T, p, memory,
+                m, received, fresh, pose, twist, dx, np.zeros(6), p[WRENCH_LIMIT], T, p, memory,
                 wrench, packet,
             )  # fmt: skip
             held = wrench.copy()
@@ -96,16 +96,16 @@ def test_stored_energy_is_what_was_put_in(end):
         else:
             if fresh:
                 master_step(
-                    m, spare, True, target, dx_other / T, dx_other, np.zeros(6), p[LIMIT], T, p,
-                    other, wrench, received,
+                    m, spare, True, target, dx_other / T, dx_other, np.zeros(6), p[WRENCH_LIMIT],
+                    T, p, other, wrench, received,
                 )  # fmt: skip
             slave_step(m, received, fresh, pose, twist, dx, f_e, T, p, memory, output, packet)
             pose_difference_into(output[:7], pose, e)
             held = K * e - D * twist
             spring = 0.5 * K * e**2
-        left = memory[LEDGER] + groups(spring)
-        put_in = first + memory[RECEIVED] - work
-        put_in -= memory[SENT] + memory[LOST]
+        left = memory[STORED_ENERGY] + groups(spring)
+        put_in = first + memory[RECEIVED_ENERGY] - work
+        put_in -= memory[SENT_ENERGY] + memory[DISSIPATED_ENERGY]
         np.testing.assert_allclose(left, put_in, rtol=0, atol=1e-9)
         largest = max(largest, np.abs(work).max())
     assert largest > 0.01, "nothing happened"
@@ -114,12 +114,16 @@ def test_stored_energy_is_what_was_put_in(end):
 def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
     """The damper acts beyond the limit; a withheld wrench costs no energy."""
     p, m, rng = (
-        parameters(PassivityConfig(method="pspm")),
+        method_parameters(PassivityConfig(method="pspm")),
         steps_of("pspm"),
         np.random.default_rng(2),
     )
-    memory, packet, wrench = initial_memory("pspm", p, START), np.zeros(PACKET_SIZE), np.empty(6)
-    memory[LEDGER] = rich = np.array([10.0, 10.0])
+    memory, packet, wrench = (
+        initial_method_memory("pspm", p, START),
+        np.zeros(PACKET_SIZE),
+        np.empty(6),
+    )
+    memory[STORED_ENERGY] = rich = np.array([10.0, 10.0])
     received, limits = np.zeros(PACKET_SIZE), np.array([3.0, 0.02])
     shown = rng.normal(size=6)
     shown /= np.sqrt(np.repeat(groups(shown**2) / limits**2, 3))
@@ -130,23 +134,26 @@ def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
         np.repeat(x, 3) for x in (PassivityConfig().pspm.stiffness, PassivityConfig().pspm.damping)
     )
     np.testing.assert_allclose(wrench, shown - B * twist, rtol=1e-12)
-    spent = rich - memory[LEDGER] - memory[SENT]
+    spent = rich - memory[STORED_ENERGY] - memory[SENT_ENERGY]
     np.testing.assert_allclose(spent, groups(0.5 * shown**2 / K_h), rtol=1e-9)
 
 
 def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     """The ledger pays for additional energy of the spring, by group."""
-    monkeypatch.setattr(pspm, "dot", pspm.dot.py_func)
+    monkeypatch.setattr(pspm, "dot_of_group", pspm.dot_of_group.py_func)
     config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
-    p, rng = parameters(config), np.random.default_rng(1)
-    memory, before = initial_memory("pspm", p, START), initial_memory("pspm", p, START)[LEDGER]
+    p, rng = method_parameters(config), np.random.default_rng(1)
+    memory, before = (
+        initial_method_memory("pspm", p, START),
+        initial_method_memory("pspm", p, START)[STORED_ENERGY],
+    )
     pose, wanted, command = np.empty(7), np.empty(7), np.empty(7)
-    moved_pose_into(START, 0.1 * rng.normal(size=6), pose)
+    move_pose_into(START, 0.1 * rng.normal(size=6), pose)
     asked, left, twist = 0.2 * rng.normal(size=6), 0.1 * rng.normal(size=6), rng.normal(size=6)
-    moved_pose_into(pose, asked, wanted)
-    moved_pose_into(pose, left, command)
+    move_pose_into(pose, asked, wanted)
+    move_pose_into(pose, left, command)
     pspm.record_command.py_func(wanted, command, pose, twist, p, memory)
     np.testing.assert_allclose(memory[HELD_WRENCH], K * left - D * twist, rtol=1e-9)
     np.testing.assert_array_equal(memory[COMMAND_POSE], command)
     more = groups(0.5 * K * (left**2 - asked**2))
-    np.testing.assert_allclose(memory[LEDGER], before - more, rtol=1e-9)
+    np.testing.assert_allclose(memory[STORED_ENERGY], before - more, rtol=1e-9)

@@ -8,8 +8,8 @@ import pytest
 from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operator_intent, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.memory import HELD_WRENCH, MEMORY_SIZE
-from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters
-from drake_teleop.station.passivity.safe_state import retreat
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, method_parameters
+from drake_teleop.station.passivity.safe_state import limit_retreat_of_hand
 
 LET_GO = 9000
 
@@ -33,15 +33,15 @@ def test_released_hand_stays_slow(method, delay):
 def test_only_wrench_along_a_fast_hand_fades():
     """Speed and wrench by group, at the hand's scale; the inertial part stays."""
     config = PassivityConfig(method="tdpa", slave_mass=[2.0, 0.5])
-    p = parameters(config, motion_scale=[2.0, 1.0])
+    p = method_parameters(config, motion_scale=[2.0, 1.0])
     given = np.array([3.0, 4.0, 0.0, 0.0, 0.0, 2.0])
     along = np.array([0.6, 0.8, 0.0, 0.0, 0.0, 1.0])
 
     def left(before: np.ndarray, now: np.ndarray) -> np.ndarray:
         memory, wrench = np.zeros(MEMORY_SIZE), given.copy()
-        retreat(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
+        limit_retreat_of_hand(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
         wrench[:] = given
-        retreat(now, 1e-9, p, memory, wrench)
+        limit_retreat_of_hand(now, 1e-9, p, memory, wrench)
         np.testing.assert_array_equal(memory[HELD_WRENCH], wrench)
         return np.array([wrench[:3] @ along[:3], wrench[3:] @ along[3:]])
 
@@ -55,5 +55,7 @@ def test_only_wrench_along_a_fast_hand_fades():
 
 def test_wrench_is_unchanged_without_a_method():
     memory, wrench = np.zeros(MEMORY_SIZE), np.ones(6)
-    retreat(np.full(6, 50.0), 1.0, parameters(PassivityConfig()), memory, wrench)
+    limit_retreat_of_hand(
+        np.full(6, 50.0), 1.0, method_parameters(PassivityConfig()), memory, wrench
+    )
     np.testing.assert_array_equal(wrench, np.ones(6))

@@ -17,18 +17,18 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.phantom import FORCE_LIMIT
-from drake_teleop.station.passivity.memory import LIMIT
+from drake_teleop.station.passivity.memory import WRENCH_LIMIT
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     slave_step,
     steps_of,
 )
 from drake_teleop.station.passivity.packet import PACKET_SIZE
-from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 
 TIMEOUT = 0.1
 LEDGERS = ("wave", "tdpa")  # what leaves an end is paid for by what has come, to the last joule
@@ -57,9 +57,9 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
     t, felt, command = result.t, result.felt, result.command
     assert np.abs(felt[(t > 7.5) & (t < 8.0)]).min() > 0.3
     entered = 8.0 + 0.01 + TIMEOUT
-    assert np.abs(felt[(t > entered + STOP_TIME + 0.01) & (t < 9.0)]).max() < 1e-12
+    assert np.abs(felt[(t > entered + STOP_TIME_S + 0.01) & (t < 9.0)]).max() < 1e-12
     # The command is at rest soon, and stays.
-    at_rest = command[(t > entered + STOP_TIME + 0.01) & (t < 9.0)]
+    at_rest = command[(t > entered + STOP_TIME_S + 0.01) & (t < 9.0)]
     assert np.ptp(at_rest) < 1e-12
     # From the end of the silence on nothing steps.
     resumed = (t > entered) & (t < 11.0)
@@ -67,7 +67,7 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
     assert np.abs(np.diff(command[resumed])).max() < 2e-3
     # It is as it was before; but to push back a hand that went on in the silence takes energy, and
     # methods with an exact ledger have none that was not paid for: there the wall is pressed less.
-    again = (t > 9.0 + RESUME_TIME + 1.0) & (t < 11.4)
+    again = (t > 9.0 + RESUME_TIME_S + 1.0) & (t < 11.4)
     tolerance = 0.15 if method in LEDGERS else 0.05
     assert felt[again].mean() == pytest.approx(felt[(t > 7.5) & (t < 8.0)].mean(), rel=tolerance)
     assert np.isfinite(felt).all()
@@ -107,8 +107,8 @@ def test_motion_during_silence_is_not_replayed(tmp_path, method):
     # Never faster than the hand itself and the way that was missed, on the ramp of the resumption,
     # whose steepest rate is 15/8.
     missed = np.ptp(result.master)
-    fast = np.abs(np.diff(result.master)).max() + 15 / 8 * missed / RESUME_TIME * PERIOD
-    back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME_TIME))[:-1]
+    fast = np.abs(np.diff(result.master)).max() + 15 / 8 * missed / RESUME_TIME_S * PERIOD
+    back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME_TIME_S))[:-1]
     assert np.abs(np.diff(result.slave))[back].max() < fast
     if not METHODS[method].balance_at_motors:  # there the command is a pull, written as a pose
         assert np.abs(np.diff(result.command))[back].max() < fast
@@ -174,25 +174,25 @@ def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
         result = run_one_dof(OneDof(), config, forward, backward, timeout=TIMEOUT)
         silent, steps = result.silent[:, 0] > TIMEOUT, np.arange(len(result.t))
         since = steps - np.maximum.accumulate(np.where(silent, steps, -len(steps)))
-        resuming = (since > 0) & (since < round(RESUME_TIME / PERIOD))
+        resuming = (since > 0) & (since < round(RESUME_TIME_S / PERIOD))
         resumptions += int((np.diff(silent.astype(int)) < 0).sum())
         growth = np.diff(np.abs(result.felt), prepend=0.0)[resuming]
-        assert growth.max(initial=0.0) < 1.001 * FORCE_LIMIT * PERIOD / RESUME_TIME
+        assert growth.max(initial=0.0) < 1.001 * FORCE_LIMIT * PERIOD / RESUME_TIME_S
     assert resumptions >= 5
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_packet_does_not_contain_old_memory(method):
     """The sent packet is finite for any previous content of its memory."""
-    p = parameters(PassivityConfig(method=method))
+    p = method_parameters(PassivityConfig(method=method))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
     number, still = steps_of(method), np.zeros(6)
     for step, limits, out in (
-        (master_step, [p[LIMIT]], np.zeros(6)),
+        (master_step, [p[WRENCH_LIMIT]], np.zeros(6)),
         (slave_step, [], np.zeros(13)),
     ):
         packet = np.full(PACKET_SIZE, np.nan)
-        memory = initial_memory(method, p, pose)
+        memory = initial_method_memory(method, p, pose)
         received = np.zeros(PACKET_SIZE)
         motion = (pose, still, still, still, *limits)
         step(number, received, False, *motion, PERIOD, p, memory, out, packet)

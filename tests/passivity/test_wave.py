@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.station.passivity.memory import FILL_TIME, LEDGER, LIMIT, RECEIVED
+from drake_teleop.station.passivity.memory import (
+    FILL_TIME,
+    RECEIVED_ENERGY,
+    STORED_ENERGY,
+    WRENCH_LIMIT,
+)
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
-    initial_memory,
+    initial_method_memory,
     master_step,
-    parameters,
+    method_parameters,
     slave_step,
     steps_of,
 )
@@ -27,9 +32,11 @@ def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
     command x of the last step; packets travel for `forward` and `backward` steps. At the steps
     `missing` none comes to the hand; for the first `fills` the slave's command stays.
     """
-    p = parameters(PassivityConfig(method="wave", force_limit=1e3, retreat=[1e3, 1e3], wave=config))
+    p = method_parameters(
+        PassivityConfig(method="wave", force_limit=1e3, retreat=[1e3, 1e3], wave=config)
+    )
     start = np.array([1.0, 0, 0, 0, 0, 0, 0])
-    memory = [initial_memory("wave", p, start) for _ in range(2)]
+    memory = [initial_method_memory("wave", p, start) for _ in range(2)]
     memory[1][FILL_TIME] = (fills - 0.5) * T
     sent, command = np.zeros((2, len(motion), PACKET_SIZE)), np.zeros((len(motion), 13))
     nothing, zero, wrench = np.zeros(PACKET_SIZE), np.zeros(6), np.zeros((len(motion), 6))
@@ -40,8 +47,8 @@ def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
         if k not in missing:
             at_hand = sent[1, k - backward] if k >= backward else nothing
         master_step(
-            steps_of("wave"), at_hand, k not in missing, pose, dx / T, dx, zero, p[LIMIT], T, p,
-            memory[0], wrench[k], sent[0, k],
+            steps_of("wave"), at_hand, k not in missing, pose, dx / T, dx, zero, p[WRENCH_LIMIT],
+            T, p, memory[0], wrench[k], sent[0, k],
         )  # fmt: skip
         u[k] = (sent[0, k, INTEGRAL][0] - (sent[0, k - 1, INTEGRAL][0] if k else 0.0)) / T
         received = sent[0, k - forward] if k >= forward else nothing
@@ -126,13 +133,13 @@ def test_line_that_filled_in_contact_releases_only_its_energy(delay):
 def test_energy_that_fills_a_line_counts_once():
     """f^2 / 4 b returns, the store holds the filter's lag, received energy is used."""
     config, force, n = WaveConfig(), 5.0, 100
-    p = parameters(PassivityConfig(method="wave", wave=config))
+    p = method_parameters(PassivityConfig(method="wave", wave=config))
     start, zero, f_e = (
         np.array([1.0, 0, 0, 0, 0, 0, 0]),
         np.zeros(6),
         np.array([-force, *[0.0] * 5]),
     )
-    memory, received = initial_memory("wave", p, start), np.zeros(PACKET_SIZE)
+    memory, received = initial_method_memory("wave", p, start), np.zeros(PACKET_SIZE)
     memory[FILL_TIME], packet, command = (n - 0.5) * T, np.zeros(PACKET_SIZE), np.zeros(13)
     for k in range(n):
         received[ENERGY] = 0.01 * k
@@ -141,8 +148,8 @@ def test_energy_that_fills_a_line_counts_once():
         )  # fmt: skip
     power = force**2 / (4.0 * config.impedance[0])
     np.testing.assert_allclose(packet[ENERGY], [n * T * power, 0.0], rtol=1e-9)
-    np.testing.assert_allclose(memory[LEDGER], [(T + config.filter) * power, 0.0], rtol=1e-9)
-    np.testing.assert_allclose(memory[RECEIVED], 0.01 * (n - 1))
+    np.testing.assert_allclose(memory[STORED_ENERGY], [(T + config.filter) * power, 0.0], rtol=1e-9)
+    np.testing.assert_allclose(memory[RECEIVED_ENERGY], 0.01 * (n - 1))
 
 
 @pytest.mark.parametrize("missing", [1, 40, 90])
@@ -164,20 +171,31 @@ def test_wrench_rate_is_bounded_after_missing_packets(missing):
 @pytest.mark.parametrize(("touch", "rest"), [(0.0, (1 - 3 * T) ** 200), (1e-9, 1.0)])
 def test_drift_fades_unless_that_increases_contact_force(touch, rest):
     """The wave transmits velocities; the position error is corrected slowly."""
-    p = parameters(PassivityConfig(method="wave", wave=WaveConfig(drift_rate=3.0)))
+    p = method_parameters(PassivityConfig(method="wave", wave=WaveConfig(drift_rate=3.0)))
     start, zero = np.array([1.0, 0, 0, 0, 0, 0, 0]), np.zeros(6)
-    memory = [initial_memory("wave", p, start) for _ in range(2)]
+    memory = [initial_method_memory("wave", p, start) for _ in range(2)]
     sent, packet, command = np.zeros(PACKET_SIZE), np.zeros(PACKET_SIZE), np.zeros(13)
     nothing = np.zeros(PACKET_SIZE)
     aside = np.array([0.01, -0.02, 0.03])
     for _ in range(200):
         master_step(
-            steps_of("wave"), nothing, True, start, zero, zero, zero, p[LIMIT], T, p, memory[0],
-            zero.copy(), sent,
+            steps_of("wave"), nothing, True, start, zero, zero, zero, p[WRENCH_LIMIT], T, p,
+            memory[0], zero.copy(), sent,
         )  # fmt: skip
         sent[POSE][4:] = aside
         f_e = np.array([*(-touch * aside), 0.0, 0.0, 0.0])
         slave_step(
-            steps_of("wave"), sent, True, start, zero, zero, f_e, T, p, memory[1], command, packet
+            steps_of("wave"),
+            sent,
+            True,
+            start,
+            zero,
+            zero,
+            f_e,
+            T,
+            p,
+            memory[1],
+            command,
+            packet,
         )
     np.testing.assert_allclose(aside - command[4:7], rest * aside, rtol=1e-6)

@@ -19,7 +19,12 @@ from drake_teleop.cli.main import cli
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import errors_of, read_tolerance, sizes_of, values_of
+from drake_teleop.load.tolerance import (
+    derivatives_over_tolerances,
+    read_tolerance,
+    tolerances_in_units,
+    values_of_required,
+)
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.assembly import Parts
@@ -79,8 +84,8 @@ def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_pa
     assert last.found is not None and last.advice == "" and all(at.advice for at in looks[:-2])
     again = identify_log(path).identification
     np.testing.assert_array_equal(last.found.identification.phi, again.phi)
-    error = values_of(TOLERANCE, again.phi) - values_of(TOLERANCE, PHI)
-    assert (np.abs(error) < sizes_of(TOLERANCE, PHI)).all()
+    error = values_of_required(TOLERANCE, again.phi) - values_of_required(TOLERANCE, PHI)
+    assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()
     assert last.t == pytest.approx(identify_log(path).log.t[-1])
 
 
@@ -116,7 +121,9 @@ def evaluate(values: np.ndarray, until: str, path: Path) -> Evaluation:
 
 def test_rotation_about_one_axis_leaves_other_inertias_unknown(tmp_path: Path) -> None:
     at = evaluate(recorded(4.0, [1]), "mass 5 %, inertia 20 %", tmp_path / "log.parquet")
-    known = dict(zip(read_tolerance("mass 5 %, inertia 20 %").entries, at.sure, strict=True))
+    known = dict(
+        zip(read_tolerance("mass 5 %, inertia 20 %").required_entries, at.sure, strict=True)
+    )
     assert known["mass"] and known["inertia xy"]
     assert not any(known[f"inertia {axes}"] for axes in ("xx", "xz", "zz"))
     assert "about y" not in at.advice
@@ -174,11 +181,13 @@ def test_advice_is_the_missing_motion(axis: int) -> None:
     """At rest the advice is a rotation about a horizontal axis."""
     others = [k for k in range(3) if k != axis]
     t = DT * np.arange(1600)
-    errors = errors_of(read_tolerance("inertia 1 %"), PHI)
+    errors = derivatives_over_tolerances(read_tolerance("inertia 1 %"), PHI)
     words = best_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
     assert f"swing the wrist about {'xyz'[axis]}" in words
     rest = np.tile(9.81 * np.eye(3)[axis], (400, 1)), np.zeros((400, 3)), np.zeros((400, 3))
-    words = best_motion(rest, DT, 30.0, errors_of(read_tolerance("mass 1 %"), PHI), NOISE)
+    words = best_motion(
+        rest, DT, 30.0, derivatives_over_tolerances(read_tolerance("mass 1 %"), PHI), NOISE
+    )
     assert f"about {'xyz'[axis]}" not in words and "turn" in words
 
 
@@ -282,8 +291,10 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
     recorder.write(tmp_path / recorder.file)
     found = identify_log(tmp_path / recorder.file)
     assert found.identification.delay_s == pytest.approx(late, abs=1e-3)
-    error = values_of(TOLERANCE, found.identification.phi) - values_of(TOLERANCE, PHI)
-    assert (np.abs(error) < sizes_of(TOLERANCE, PHI)).all()
+    error = values_of_required(TOLERANCE, found.identification.phi) - values_of_required(
+        TOLERANCE, PHI
+    )
+    assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()
 
 
 @pytest.mark.long
@@ -305,5 +316,5 @@ def test_calibration_with_a_ur_and_a_rotated_and_shifted_sensor(tmp_path: Path) 
     assert summary["all_known"] and summary["seconds"] < 8.0
     asked = read_tolerance("mass 1 %, com 1 mm")
     phi = json.loads((tmp_path / "out" / "identification.json").read_text())["phi"]
-    error = values_of(asked, np.array(phi)) - values_of(asked, PHI)
-    assert (np.abs(error) < sizes_of(asked, PHI)).all()
+    error = values_of_required(asked, np.array(phi)) - values_of_required(asked, PHI)
+    assert (np.abs(error) < tolerances_in_units(asked, PHI)).all()

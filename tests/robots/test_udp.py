@@ -24,7 +24,7 @@ from test_compensator import DT, load, readings
 import drake_teleop.robots.udp as udp
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
-from drake_teleop.common.interruption import INTERRUPTED, delayed_signals, install_handlers
+from drake_teleop.common.interruption import INTERRUPTED_EVENT, delayed_signals, install_handlers
 from drake_teleop.robots import lines
 from drake_teleop.robots.compensate import TareRequestPort, compensate_command, compensate_stream
 from drake_teleop.robots.compensator import Compensator
@@ -322,7 +322,7 @@ def handlers() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     install_handlers()
     yield
-    INTERRUPTED.clear()
+    INTERRUPTED_EVENT.clear()
     for number, handler in before.items():
         signal.signal(number, handler)
 
@@ -355,7 +355,7 @@ def test_delayed_signals_are_handled_at_the_end(number: signal.Signals) -> None:
 
     with pytest.raises(KeyboardInterrupt, match="^SIGTERM$" if number == signal.SIGTERM else "^$"):
         call()
-    assert finished and INTERRUPTED.is_set()
+    assert finished and INTERRUPTED_EVENT.is_set()
 
 
 def test_control_port_answers_tare_requests() -> None:

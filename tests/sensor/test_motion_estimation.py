@@ -20,21 +20,21 @@ from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
     _update_filters,
-    estimate_into,
+    estimate_sample_into,
     estimated_motion_std,
+    fusion_filters,
     motion_estimator,
-    motion_gains,
     path_delays,
-    steady_state,
+    steady_state_kalman_filter,
 )
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
+    SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
@@ -83,13 +83,17 @@ def sampled(
 ) -> Array:
     """Return samples of sensor and estimation; `believed` is the nominal sensor."""
     n = truth.shape[1] - 15
-    noise = np.random.default_rng(seed).standard_normal((len(truth) // NOISE_BLOCK + 1, NOISE_SIZE))
+    noise = np.random.default_rng(seed).standard_normal(
+        (len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE)
+    )
     samples, reading = np.empty((len(truth), 16 + n)), np.empty(13 + n)
-    chain, chain_memory = sensor_chain(sensor, n, T)
+    chain, chain_memory = sensor_chain_constants(sensor, n, T)
     constants, memory = motion_estimator(config, believed or sensor, n, T)
     for k in range(len(truth)):
-        read_into(chain, chain_memory, noise[k // NOISE_BLOCK], truth[k], reading)
-        estimate_into(constants, memory, table, reading, samples[k])
+        read_sensor_into(
+            chain, chain_memory, noise[k // SAMPLES_PER_NOISE_BLOCK], truth[k], reading
+        )
+        estimate_sample_into(constants, memory, table, reading, samples[k])
     return samples
 
 
@@ -288,7 +292,7 @@ def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
 @given(st.floats(-7, -3), st.floats(-3, 1), st.floats(-4, 2), st.sampled_from([T, 1e-3, 1e-2]))
 def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period):
     position_std, white, walk = 10.0**position, 10.0**acceleration, 10.0**drift
-    found = steady_state(position_std, white, walk, period)
+    found = steady_state_kalman_filter(position_std, white, walk, period)
     # In samples and standard deviations of the position.
     F, h = np.array([[1.0, 1, 1], [0, 1, 1], [0, 0, 1]]), np.array([[1.0, 0, 0]])
     noise = white * period**2 / position_std * np.array([1.0, 1.0, 0.0])
@@ -311,7 +315,7 @@ def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period)
 def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
     """Only white noise: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
     position_std, acceleration_std = 5e-6, 1.5
-    gains = steady_state(position_std, acceleration_std, 1e-3, T).gains
+    gains = steady_state_kalman_filter(position_std, acceleration_std, 1e-3, T).gains
     crossover = np.sqrt(acceleration_std / position_std)
     assert gains[0] == pytest.approx(np.sqrt(2) * crossover * T, rel=0.05)
     assert gains[1] == pytest.approx(crossover**2 * T, rel=0.05)
@@ -319,7 +323,7 @@ def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
 
 def test_filter_errors_equal_the_predicted_deviations():
     position_std, white, walk, steps = 7e-6, 1.5, 3.0, 60000
-    found = steady_state(position_std, white, walk, T)
+    found = steady_state_kalman_filter(position_std, white, walk, T)
     random = np.random.default_rng(1)
     error = np.cumsum(walk * np.sqrt(T) * random.standard_normal((steps, 3)), axis=0)
     # True acceleration zero: what is measured is error and noise, and rate and angle stay zero.
@@ -338,7 +342,7 @@ def test_filter_errors_equal_the_predicted_deviations():
 
 
 def test_gains_of_the_jr3_equal_the_docs():
-    angular, linear = motion_gains(MotionEstimationConfig(), JR3, 6, T)
+    angular, linear = fusion_filters(MotionEstimationConfig(), JR3, 6, T)
     assert angular.crossover_hz == pytest.approx(28.9, abs=0.1)
     assert linear.crossover_hz == pytest.approx(18.4, abs=0.1)
 
@@ -404,7 +408,7 @@ def test_flag_stays_while_part_of_the_reading_is_delayed():
     reading[13:] = home()
     for k in range(40):
         reading[12] = float(k == 20)
-        estimate_into(constants, memory, ARM.table, reading, sample)
+        estimate_sample_into(constants, memory, ARM.table, reading, sample)
         flags.append(sample[15])
     assert np.flatnonzero(flags).tolist() == list(range(20, 29))
 

@@ -18,18 +18,18 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.sensor.presets import PRESETS, preset_of
+from drake_teleop.station.sensor.presets import PRESETS, preset_of_block
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
     NOISE_SIZE,
-    OFFSET,
+    OFFSET_CONSTANTS,
     PARTS,
     PRESET_NAMES,
+    SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     calibration_matrices,
     is_plausible,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
     without_parts,
 )
 
@@ -49,11 +49,15 @@ UR5_AT_REST = RECORDS / "ur5_imu_fts_contact"
 
 def readings(config, truths, noise=None, period=PERIOD):
     """Return (N, 13 + n) readings of `truths` (N, 15 + n); `noise` (blocks, NOISE_SIZE) or none."""
-    blocks = np.zeros((-(-len(truths) // NOISE_BLOCK), NOISE_SIZE)) if noise is None else noise
-    constants, memory = sensor_chain(config, truths.shape[1] - 15, period)
+    blocks = (
+        np.zeros((-(-len(truths) // SAMPLES_PER_NOISE_BLOCK), NOISE_SIZE))
+        if noise is None
+        else noise
+    )
+    constants, memory = sensor_chain_constants(config, truths.shape[1] - 15, period)
     out = np.empty((len(truths), truths.shape[1] - 2))
     for k, truth in enumerate(truths):
-        read_into(constants, memory, blocks[k // NOISE_BLOCK], truth, out[k])
+        read_sensor_into(constants, memory, blocks[k // SAMPLES_PER_NOISE_BLOCK], truth, out[k])
     return out
 
 
@@ -67,7 +71,7 @@ def random_truths(count, seed=0, joints=JOINTS):
 
 
 def random_noise(count, seed=1):
-    blocks = -(-count // NOISE_BLOCK)
+    blocks = -(-count // SAMPLES_PER_NOISE_BLOCK)
     return np.random.default_rng(seed).standard_normal((blocks, NOISE_SIZE))
 
 
@@ -215,7 +219,7 @@ def test_ramp_is_delayed_by_the_stated_delays(name):
 
 
 def test_noise_and_walk_scale_the_given_random_numbers():
-    count = 3 * NOISE_BLOCK + 5
+    count = 3 * SAMPLES_PER_NOISE_BLOCK + 5
     truths, noise = random_truths(count), random_noise(count)
     deviations = np.repeat([0.3, 0.02, 0.1, 2.0], 3)
     walks = np.repeat([0.4, 0.03, 0.2, 3.0], 3)
@@ -224,9 +228,11 @@ def test_noise_and_walk_scale_the_given_random_numbers():
         force_walk=0.4, torque_walk=0.03, acceleration_walk=0.2, angular_acceleration_walk=3.0,
     )  # fmt: skip
     white = noise[:, :-12].reshape(-1, 12)[:count]
-    steps = np.cumsum(noise[:, -12:], axis=0) * np.sqrt(NOISE_BLOCK * PERIOD)
+    steps = np.cumsum(noise[:, -12:], axis=0) * np.sqrt(SAMPLES_PER_NOISE_BLOCK * PERIOD)
     expected = as_read(truths)
-    expected[:, :12] += deviations * white + walks * np.repeat(steps, NOISE_BLOCK, 0)[:count]
+    expected[:, :12] += (
+        deviations * white + walks * np.repeat(steps, SAMPLES_PER_NOISE_BLOCK, 0)[:count]
+    )
     np.testing.assert_allclose(readings(config, truths, noise), expected, 1e-12, 1e-12)
 
 
@@ -240,10 +246,10 @@ def test_offset_drifts_and_may_change_during_a_run():
     expected += np.array([*offset, *bias])
     np.testing.assert_allclose(error, expected, atol=1e-12)
 
-    constants, memory = sensor_chain(part(offset=offset), JOINTS, PERIOD)
-    constants[OFFSET] += 5.0
+    constants, memory = sensor_chain_constants(part(offset=offset), JOINTS, PERIOD)
+    constants[OFFSET_CONSTANTS] += 5.0
     reading = np.empty(13 + JOINTS)
-    read_into(constants, memory, np.zeros(NOISE_SIZE), truths[0], reading)
+    read_sensor_into(constants, memory, np.zeros(NOISE_SIZE), truths[0], reading)
     np.testing.assert_allclose(reading[:6], truths[0, :6] + offset + 5.0, 1e-12)
 
 
@@ -285,7 +291,7 @@ def test_the_offset_counts_in_the_saturation(low_pass):
 
 
 def test_overload_including_offset_is_not_plausible():
-    constants, _ = sensor_chain(part(saturates=True), JOINTS, PERIOD)
+    constants, _ = sensor_chain_constants(part(saturates=True), JOINTS, PERIOD)
     truth, largest = np.zeros(15 + JOINTS), 10 * part().ranges()[0]
     assert is_plausible(constants, truth)
     truth[0] = 0.99 * largest
@@ -481,7 +487,7 @@ def test_invalid_sensor_is_rejected(changes, message):
 
 def loaded(text):
     config = yaml_load_typed(
-        schema=WristSensorConfig, data=text, defaults=preset_of(yaml_load(data=text))
+        schema=WristSensorConfig, data=text, defaults=preset_of_block(yaml_load(data=text))
     )
     check_ranges(config, "sensor")
     return config

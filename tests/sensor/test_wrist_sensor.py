@@ -17,7 +17,7 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.sensor import wrist_sensor
 from drake_teleop.station.sensor.sensor_chain import (
-    NOISE_BLOCK,
+    SAMPLES_PER_NOISE_BLOCK,
     WristSensorConfig,
     butterworth_sections,
     without_parts,
@@ -200,9 +200,11 @@ def test_one_sample_for_equal_instants_with_rounding():
 def test_samples_in_contact_wait_for_new_torque_or_noise():
     """Three calls per period; five periods share a torque, 128 a block of noise."""
     period, k = 1.25e-4, np.arange(3 * 1000)
-    sensor: Any = SimpleNamespace(_period=period, _event_periods=(5 * period, NOISE_BLOCK * period))
-    due = [WristSensor._is_due(sensor, time) for time in k * period / 3]
-    np.testing.assert_array_equal(due, (k % 15 == 0) | (k % (3 * NOISE_BLOCK) == 0))
+    sensor: Any = SimpleNamespace(
+        _period=period, _event_periods=(5 * period, SAMPLES_PER_NOISE_BLOCK * period)
+    )
+    due = [WristSensor._are_samples_due(sensor, time) for time in k * period / 3]
+    np.testing.assert_array_equal(due, (k % 15 == 0) | (k % (3 * SAMPLES_PER_NOISE_BLOCK) == 0))
 
 
 def test_noisy_sensor_does_not_evaluate_plant_contact(monkeypatch):

@@ -24,7 +24,7 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
-from drake_teleop.station.slave.arm import ROTOR
+from drake_teleop.station.slave.arm import ROTOR_COLUMN
 from drake_teleop.station.slave.joint_commands import SlaveMonitor, ik_method_name
 from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
@@ -253,7 +253,7 @@ def test_arm_without_inertia_gets_stated_rotor_inertias(folder, tmp_path):
     length += np.linalg.norm([0.01, 0.02, 0.1])
     expected = np.full(7, 0.14 * length**2)
     expected[3] = 5.0
-    np.testing.assert_allclose(nominal.arm.table[:-1, ROTOR], expected, rtol=1e-12)
+    np.testing.assert_allclose(nominal.arm.table[:-1, ROTOR_COLUMN], expected, rtol=1e-12)
     said = "; ".join(nominal.assumptions)
     assert f"a rotor inertia of {expected[0]:.3g} kg m^2, as the model has no inertia" in said
     assert "a moved mass of 5 kg, as the model has no inertia there, for j4" in said

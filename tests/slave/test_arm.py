@@ -11,8 +11,8 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import (
-    MOTION_SIZE,
-    SLIDES,
+    FRAME_STATE_SIZE,
+    IS_PRISMATIC_COLUMN,
     forward_dynamics,
     forward_kinematics,
     inverse_dynamics,
@@ -72,7 +72,7 @@ def test_pose_and_jacobian_equal_the_plant(case):
 def test_motion_of_the_sensor_equals_the_plant(case):
     plant, frame_S, arm = case
     context = plant.CreateDefaultContext()
-    out = np.full(MOTION_SIZE, np.nan)
+    out = np.full(FRAME_STATE_SIZE, np.nan)
     for q, v, vdot in random_states(arm):
         plant.SetPositions(context, plant_vector(plant, arm, q))
         plant.SetVelocities(context, plant_vector(plant, arm, v))
@@ -177,7 +177,7 @@ def test_weaker_of_two_motors_sets_effort_limit():
 
 def test_chain_continues_through_gripper_to_finger():
     arm = ArmModelFromPlant(*other_plant()[:2], "finger")
-    np.testing.assert_array_equal(arm.table[:, SLIDES], [0, 0, 0, 0, 0, 0, 0, 1, 0])
+    np.testing.assert_array_equal(arm.table[:, IS_PRISMATIC_COLUMN], [0, 0, 0, 0, 0, 0, 0, 1, 0])
 
 
 def test_non_serial_chain_is_rejected():

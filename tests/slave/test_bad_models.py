@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.home import check_strength, home_position, start_posture
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool
 
@@ -86,7 +86,7 @@ def read(slave):
     slave.check("slave")
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, slave)
-    finalize(plant)
+    finalize_plant(plant)
     model, assumed = parsed.arm()
     check_strength(model, start_posture(slave, model))
     return [*parsed.assumptions, *assumed]

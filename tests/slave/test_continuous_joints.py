@@ -27,7 +27,7 @@ from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
-from drake_teleop.station.slave.home import tool_down
+from drake_teleop.station.slave.home import positions_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, InverseKinematics
 from drake_teleop.station.slave.joint_commands import JointFollower, SlaveMonitor
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
@@ -169,8 +169,8 @@ def test_search_takes_the_turn_nearest_to_the_reference(chain, shares, turns):
     arm = ARMS[chain]
     n, endless = arm.num_joints, np.isinf(arm.upper)
     half = np.where(endless, np.pi, (arm.upper - arm.lower) / 2)
-    pose = pose_of(arm, arm.middle + half * shares[:n])
-    reference = np.where(endless, 2 * np.pi * np.array(turns[:n]), arm.middle)
+    pose = pose_of(arm, arm.middle_positions + half * shares[:n])
+    reference = np.where(endless, 2 * np.pi * np.array(turns[:n]), arm.middle_positions)
     q, status = find_posture(arm, pose, reference)
     assert status == IkStatus.OK
     assert pose_error(pose, pose_of(arm, q)) < 1e-7
@@ -202,8 +202,8 @@ def test_limits_of_a_joint(kind, limit, expected, words):
     arm, assumed = arm_of(text.replace(LIMIT, limit, 1))
     assert (arm.lower[1], arm.upper[1]) == pytest.approx(expected)
     assert any(words in each and "j2" in each for each in assumed) == bool(words)
-    assert np.isfinite(arm.middle).all()
-    assert arm.lower[1] <= arm.middle[1] <= arm.upper[1]
+    assert np.isfinite(arm.middle_positions).all()
+    assert arm.lower[1] <= arm.middle_positions[1] <= arm.upper[1]
     np.testing.assert_array_equal(arm.upper[[0, 2, 4, 6]], np.inf)
 
 
@@ -239,7 +239,7 @@ def test_endless_joints_follow_a_leader_over_many_turns():
 @pytest.mark.parametrize("position", [[0.4, 0.1, 0.3], [0.3, -0.3, 0.5]])
 def test_tool_down_is_found_with_endless_joints(chain, position):
     arm = ARMS[chain]
-    q, status = tool_down(arm, np.array(position))
+    q, status = positions_with_tool_down(arm, np.array(position))
     assert status == IkStatus.OK
     assert pose_error(pose_of(arm, q), np.array([0, 1, 0, 0, *position])) < 1e-7
     assert np.all(np.abs(q) <= np.pi)
@@ -268,9 +268,9 @@ def test_leader_has_no_stops_at_endless_joints(tmp_path):
     np.testing.assert_array_equal(device.home, np.zeros(7))
     q = np.where(np.isinf(ARMS[SEVEN].upper), 50.0, 0.1)
     device.check_limits(q)
-    assert not device.at_an_end(q[np.newaxis]).any()
+    assert not device.is_at_end_stop(q[np.newaxis]).any()
     q[1] = 2.3
-    assert device.at_an_end(q[np.newaxis]).all()
+    assert device.is_at_end_stop(q[np.newaxis]).all()
 
 
 @pytest.mark.long
@@ -293,4 +293,4 @@ def test_summary_of_a_run_and_frame_of_a_page_are_plain_json(tmp_path):
 
 def test_one_finite_limit_keeps_the_middle_finite():
     arm = dataclasses.replace(ARMS[SIX], lower=np.full(6, 1.0), upper=np.full(6, np.inf))
-    np.testing.assert_array_equal(arm.middle, np.ones(6))
+    np.testing.assert_array_equal(arm.middle_positions, np.ones(6))

@@ -58,7 +58,7 @@ def test_friction_is_in_dynamics_but_not_in_computed_torque(arm, speed):
         v, wanted = speed * random.normal(size=6), random.normal(size=6)
         inverse_dynamics(table, q, v, wanted, torque)
         arm.put(q, v, torque)
-        forward_dynamics(arm.slave.physics[0], q, v, torque, np.zeros(6), compiled)
+        forward_dynamics(arm.slave.physics_of_plant[0], q, v, torque, np.zeros(6), compiled)
         found = arm.acceleration()
         np.testing.assert_allclose(compiled, found, atol=1e-11 * np.abs(found).max())
         missing = np.empty(6)
@@ -110,7 +110,7 @@ def test_one_friction_value_applies_to_all_joints():
     for friction, expected in (([2.0], 6 * [2.0]), ([], 6 * [0.0])):
         builder = DiagramBuilder()
         slave = AddSlavePlant(builder, Slave(friction=friction), None)
-        np.testing.assert_array_equal(slave.physics[0][:-1, 24], expected)
+        np.testing.assert_array_equal(slave.physics_of_plant[0][:-1, 24], expected)
         assert len(builder.GetSystems()) == (2 if friction else 1)
 
 

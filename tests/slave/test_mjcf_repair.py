@@ -15,7 +15,7 @@ from pydrake.systems.framework import DiagramBuilder
 from test_model_repairs import pose, read, written
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.arm import DAMPING, PHI, ROTOR
+from drake_teleop.station.slave.arm import DAMPING_COLUMN, PHI_COLUMN, ROTOR_COLUMN
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.mjcf_masses import fitted_shape
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh
@@ -145,7 +145,7 @@ def test_effort_limit_is_the_largest_force_of_the_actuators(tmp_path, joint, act
     )
     _, model, _ = read(written(tmp_path, text, "a.xml"), "S")
     np.testing.assert_allclose(model.effort_limit[0], expected)
-    np.testing.assert_allclose(model.table[0, [ROTOR, DAMPING]], [0.3, 4.0])
+    np.testing.assert_allclose(model.table[0, [ROTOR_COLUMN, DAMPING_COLUMN]], [0.3, 4.0])
 
 
 # Volume, and principal moments by volume, of shapes.
@@ -211,7 +211,7 @@ def test_mass_of_shapes(tmp_path, shape, suffix):
     _, model, _ = read(written(tmp_path, text, "a.xml"), "S", shapes=True)
     volume, moments = SHAPES[shape]
     mass = 1000.0 * volume
-    joint_frame = model.table[0, PHI : PHI + 10]
+    joint_frame = model.table[0, PHI_COLUMN : PHI_COLUMN + 10]
     np.testing.assert_allclose(joint_frame[0], mass, rtol=1e-5)
     # The joint's axis, y, is z of its frame.
     np.testing.assert_allclose(joint_frame[9], mass * (moments[1] + 0.16), rtol=1e-5)
@@ -260,7 +260,7 @@ def test_drake_reads_a_mesh_itself_if_it_stays_as_it_is(tmp_path, attributes, fi
     path, report = written(tmp_path, mjcf(""), "a.xml"), RepairReport()
     reader = Mjcf(read_xml(path), path, ModelFiles(path, ()), report)
     mesh = Mesh(reader, Attributes(attributes, "mesh", report), Path(file))
-    assert mesh.is_plain == expected
+    assert mesh.is_readable_by_drake == expected
 
 
 @pytest.mark.parametrize(
@@ -285,7 +285,7 @@ def test_mass_of_a_mesh_that_is_not_convex(tmp_path, mode, expected):
     asset = f'<asset><mesh name="u" inertia="{mode}" vertex="{vertex}" face="{face}"/></asset>'
     geom = '<geom type="mesh" mesh="u" density="1"/>'
     _, model, _ = read(written(tmp_path, mjcf(arm(inside=geom, inertial=""), asset), "a.xml"), "S")
-    np.testing.assert_allclose(model.table[0, PHI], expected, rtol=1e-7)
+    np.testing.assert_allclose(model.table[0, PHI_COLUMN], expected, rtol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ def test_inertia_by_the_compiler(tmp_path, compiler, moments, expected):
     inertial = f'<inertial pos="0 0.1 0" mass="1" diaginertia="{moments}"/>'
     text = mjcf(arm(inertial=inertial), f"<compiler {compiler}/>")
     _, model, said = read(written(tmp_path, text, "a.xml"), "S")
-    np.testing.assert_allclose(model.table[0, PHI + 9], expected)
+    np.testing.assert_allclose(model.table[0, PHI_COLUMN + 9], expected)
     assert "inertia replaced" not in said
 
 
@@ -320,7 +320,7 @@ def test_mass_by_the_compiler(tmp_path, compiler, geoms, expected):
     cup = '<body><freejoint/><geom size="0.1" mass="0.3"/></body>'
     text = mjcf(arm(inside=geoms, inertial="") + cup, f"<compiler {compiler}/>")
     _, model, said = read(written(tmp_path, text, "a.xml"), "S")
-    np.testing.assert_allclose(model.table[:, PHI].sum(), expected)
+    np.testing.assert_allclose(model.table[:, PHI_COLUMN].sum(), expected)
     assert "left out, because the arm does not carry it: a body without name" in said
 
 
@@ -339,10 +339,10 @@ def test_site_as_sensor_frame(tmp_path, sensor, beyond):
     _, model, said = read(written(tmp_path, mjcf(arm(inside=hand), classes, tail), "a.xml"), "site")
     assert model.joint_names == ("j", "k")
     assert "in place of the site site" in said
-    np.testing.assert_allclose(model.table[:, PHI], [2.0, 3.0 - beyond, beyond])
+    np.testing.assert_allclose(model.table[:, PHI_COLUMN], [2.0, 3.0 - beyond, beyond])
     # Mass times centre: 0.1 m along -z of S, 0.2 m along -y.
     centre = beyond * np.array([0, -0.2, -0.1])
-    np.testing.assert_allclose(model.table[2, PHI + 1 : PHI + 4], centre, atol=1e-12)
+    np.testing.assert_allclose(model.table[2, PHI_COLUMN + 1 : PHI_COLUMN + 4], centre, atol=1e-12)
     turned = RigidTransform(degrees(0, 0, 90) @ degrees(40, 0, 0), [0, 0, 1])
     expected = turned @ RigidTransform(degrees(0, 90, 0), [0.1, 0.2, 0])
     found = pose(model, [0.0, np.radians(40)])

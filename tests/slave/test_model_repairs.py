@@ -447,10 +447,10 @@ def test_lengths_masses_and_inertias_are_at_most_1e6(tmp_path, value, allowed):
         check_quantities(link, "link l", report)
         repair_inertia(link, report, is_sdf=False, at_rest=False)
         if allowed and not (k == 2 and value[0] == "-"):
-            report.raise_causes(tmp_path)
+            report.raise_faults(tmp_path)
         else:
             with pytest.raises(DrakeTeleopError, match="link l"):
-                report.raise_causes(tmp_path)
+                report.raise_faults(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,9 @@ from drake_teleop.station.slave.inverse_kinematics import (
 )
 from drake_teleop.station.slave.joint_commands import IK_METHODS
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
-    MET,
-    SINGULAR,
-    STEPS,
+    MAX_STEPS,
+    MIN_SINGULAR_VALUE_M,
+    POSE_TOLERANCE_M,
     NumericInverseKinematics,
     find_posture,
     follow_pose,
@@ -100,7 +100,7 @@ def follow(case, pose, reference, *, max_step=np.inf, posture=None, pull=0.0):
     reference = np.array(reference, dtype=float)
     status = follow_pose(
         arm.table, orientation_length(arm), pose, reference, arm.lower, arm.upper, far, posture,
-        pull, SINGULAR, STEPS, q,
+        pull, MIN_SINGULAR_VALUE_M, MAX_STEPS, q,
     )  # fmt: skip
     return q, IkStatus(status)
 
@@ -115,7 +115,7 @@ def test_search_meets_random_poses(name, request):
         pose[:4] *= random.uniform(-3, 3)
         q, status = find_posture(case.arm, pose, (lower + upper) / 2)
         assert status == IkStatus.OK
-        assert max(case.errors(pose, q)) < MET
+        assert max(case.errors(pose, q)) < POSE_TOLERANCE_M
         assert np.all((lower <= q) & (q <= upper))
 
 
@@ -209,7 +209,7 @@ def test_null_space_motion_approaches_posture(seven, max_step, pull):
         for _ in range(1000):
             q, status = follow(seven, pose, q, max_step=max_step, posture=posture, pull=pull)
             assert status == IkStatus.OK
-        assert max(seven.errors(pose, q)) < 2 * MET
+        assert max(seven.errors(pose, q)) < 2 * POSE_TOLERANCE_M
         away.append(np.abs(q - home).max())
     assert away[0] > 0.1 and away[1] < 1e-3
 
@@ -345,7 +345,7 @@ def test_posture_rate_is_independent_of_period(seven, period, left):
         context.SetTime(k * period)
         context.SetDiscreteState(system.EvalUniquePeriodicDiscreteUpdate(context))
     q = context.get_discrete_state_vector().value()[:-1]
-    assert max(seven.errors(pose, q)) < 2 * MET
+    assert max(seven.errors(pose, q)) < 2 * POSE_TOLERANCE_M
     assert np.linalg.norm(away - home) > 0.1
     assert np.linalg.norm(q - home) / np.linalg.norm(away - home) == pytest.approx(left, abs=0.02)
 

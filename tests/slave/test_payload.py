@@ -14,7 +14,7 @@ from drake_teleop.lab.identification import (
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.scenario import Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Payload, Slave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
@@ -47,7 +47,7 @@ def test_sensor_wrench_includes_payload():
     weld = joints.index(plant.GetJointByName("sensor_weld").index())
     sizes = []
     for time in (0.001, 0.1, 0.22, 0.31):
-        advance(simulator, time)
+        advance_without_garbage_collection(simulator, time)
         port = plant.get_reaction_forces_output_port().Eval(plant.GetMyContextFromRoot(context))
         wrench = np.concatenate([port[weld].translational(), port[weld].rotational()])
         simulator.AdvancePendingEvents()

@@ -13,11 +13,11 @@ from drake_teleop.station.scenario import Scenario, ScenarioFromData, replace
 from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
 from drake_teleop.station.slave.joint_control import MakeJointControl, servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface
+from drake_teleop.station.slave.position_servo import POSITION_INTERFACES, PositionInterface
 
 HOME = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 PERIOD = 5e-4
-UR = INTERFACES["ur_servoj"]
+UR = POSITION_INTERFACES["ur_servoj"]
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_speed_and_acceleration_stay_within_the_limits(arm):
 
 def test_distant_target_is_reached_without_overshoot(arm):
     """With a fast interface of weak motors, a linear law would overshoot."""
-    franka = INTERFACES["franka_position"]
+    franka = POSITION_INTERFACES["franka_position"]
     states, _ = follow(arm, franka, lambda t: HOME + 0.3, 1600)
     moved = states[:, :6] - HOME
     assert np.abs(moved[-1] - 0.3).max() < 1e-4
@@ -131,7 +131,7 @@ def test_invalid_interface_raises_one_error(changes, where):
 def test_scenario_overrides_single_interface_fields():
     data = {"joint_control": {"servo": "franka_position", "interface": {"dead_time": 0.01}}}
     found = ScenarioFromData(data, "x").joint_control.position_interface
-    assert found == dataclasses.replace(INTERFACES["franka_position"], dead_time=0.01)
+    assert found == dataclasses.replace(POSITION_INTERFACES["franka_position"], dead_time=0.01)
     scenario = replace(Scenario(), joint_control__interface=UR)
     with pytest.raises(DrakeTeleopError, match="leave it out"):
         scenario.check()

@@ -13,10 +13,14 @@ from drake_teleop.station.slave.joint_control import (
     JointControl,
     JointControlConfig,
     joint_control_torque,
-    servo_numbers,
+    servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import AddSlavePlant, start_pose
-from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event, torque_line
+from drake_teleop.station.slave.sampled_servo import (
+    SampledServo,
+    samples_per_event,
+    torque_line_into,
+)
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -98,15 +102,15 @@ def test_sensor_uses_torque_line_inside_step():
 def test_one_sample_equals_joint_control_exactly():
     slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
     n, random = slave.arm.num_joints, np.random.default_rng(0)
-    servo, torque = servo_numbers(slave.arm, CONFIG), np.zeros(6)
+    servo, torque = servo_gains_and_limits(slave.arm, CONFIG), np.zeros(6)
     for _ in range(20):
         command = slave.start + random.normal(0.0, 0.05, n)
         state = np.concatenate([slave.start, np.zeros(n)]) + random.normal(0.0, 0.3, 2 * n)
         scratch, line = np.zeros(3 * n), np.zeros(3 * n)
         joint_control_torque(slave.arm.table, command, state, *servo, scratch, torque)
-        torque_line(
-            slave.arm.table, command, state, np.zeros(2), servo, slave.physics, 1, 5e-4, scratch,
-            line,
+        torque_line_into(
+            slave.arm.table, command, state, np.zeros(2), servo, slave.physics_of_plant, 1, 5e-4,
+            scratch, line,
         )  # fmt: skip
         assert line.tobytes() == np.concatenate([torque, np.zeros(n), torque]).tobytes()
 
@@ -114,13 +118,13 @@ def test_one_sample_equals_joint_control_exactly():
 def test_line_stays_within_torque_limits_and_survives_invalid_command():
     slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
     arm, n = slave.arm, slave.arm.num_joints
-    servo, rest = servo_numbers(arm, CONFIG), np.concatenate([slave.start, np.zeros(n)])
+    servo, rest = servo_gains_and_limits(arm, CONFIG), np.concatenate([slave.start, np.zeros(n)])
     line = np.zeros(3 * n)
 
     def torques(command):
-        torque_line(
-            arm.table, command, rest, np.zeros(2), servo, slave.physics, 5, 1e-4, np.zeros(3 * n),
-            line,
+        torque_line_into(
+            arm.table, command, rest, np.zeros(2), servo, slave.physics_of_plant, 5, 1e-4,
+            np.zeros(3 * n), line,
         )  # fmt: skip
         return line[:n], line[:n] + 5e-4 * line[n : 2 * n], line[2 * n :].copy()
 

@@ -52,10 +52,10 @@ def test_mass_bounds_kinetic_energy(arm, home):
 
 
 def test_ledger_uses_arm_mass_by_default(arm, home, monkeypatch):
-    told, parameters = [], channel.methods.parameters
+    told, parameters = [], channel.methods.method_parameters
     monkeypatch.setattr(
         channel.methods,
-        "parameters",
+        "method_parameters",
         lambda config, *more: told.append(config) or parameters(config, *more),
     )
     for passivity in (

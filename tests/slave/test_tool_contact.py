@@ -10,7 +10,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.point_contact import ContactPairs, separation
+from drake_teleop.station.environment.point_contact import ContactPairs, min_distance_of_boxes
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
@@ -51,11 +51,18 @@ def test_wrench_equals_drakes(leaf, most):
         sheet = np.array([0.01 * random.uniform(-1, 1), 0.1 * random.normal()])
         plant.SetPositions(context, slave.instance, q)
         plant.SetVelocities(context, slave.instance, v)
-        plant.SetPositions(context, slave.sheet, sheet[:1])
-        plant.SetVelocities(context, slave.sheet, sheet[1:])
+        plant.SetPositions(context, slave.sheet_instance, sheet[:1])
+        plant.SetVelocities(context, slave.sheet_instance, sheet[1:])
         expected = drake_wrench(plant, context, slave.tool)
         environment_wrench(
-            slave.arm.table, *slave.contact.law, np.zeros(6), q, v, sheet, np.zeros(0), found
+            slave.arm.table,
+            *slave.contact.compiled_law_arguments,
+            np.zeros(6),
+            q,
+            v,
+            sheet,
+            np.zeros(0),
+            found,
         )
         # A stiffness of 2e5 N/m makes 1e-10 N of the rounding of a position.
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
@@ -80,7 +87,14 @@ def test_peg_in_slot_equals_drakes_with_many_pairs():
         results = plant.get_contact_results_output_port().Eval(context)
         most = max(most, results.num_point_pair_contacts())
         environment_wrench(
-            slave.arm.table, *slave.contact.law, np.zeros(6), q, v, np.zeros(2), np.zeros(0), found
+            slave.arm.table,
+            *slave.contact.compiled_law_arguments,
+            np.zeros(6),
+            q,
+            v,
+            np.zeros(2),
+            np.zeros(0),
+            found,
         )
         np.testing.assert_allclose(
             found, drake_wrench(plant, context, slave.tool), rtol=1e-9, atol=1e-9
@@ -93,7 +107,14 @@ def test_applied_wrench_is_shifted_to_world_origin():
     push, found = np.array([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), np.zeros(6)
     q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
     environment_wrench(
-        slave.arm.table, *slave.contact.law, push, q, 0 * q, np.zeros(2), np.zeros(0), found
+        slave.arm.table,
+        *slave.contact.compiled_law_arguments,
+        push,
+        q,
+        0 * q,
+        np.zeros(2),
+        np.zeros(0),
+        found,
     )
     np.testing.assert_array_equal(found[:3], push[:3])
     expected = push[3:] + np.cross([0.55, 0.0, 0.36], push[:3])
@@ -148,7 +169,7 @@ def test_distance_of_separate_boxes():
         rest = [moved.rotation().matrix().ravel(), moved.translation(), half[1], leaf, np.zeros(6)]
         own = [X_SOwn.rotation().matrix().ravel(), half[0]]
         pair = np.concatenate([X_SOwn.translation(), [0.0], *rest, *own])
-        found = separation(
+        found = min_distance_of_boxes(
             pair, pair[:28], X_WS.translation(), X_WS.rotation().matrix(), deflection
         )
         told = query.Eval(context).ComputeSignedDistancePairClosestPoints(*shapes).distance

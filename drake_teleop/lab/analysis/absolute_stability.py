@@ -173,12 +173,13 @@ class ImpedanceRange:
 
 
 def impedance_range_of_grips() -> ImpedanceRange:
-    from drake_teleop.station.operator.operator import GRIPS
+    from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
     mass, damping, stiffness = (
         (min(values), max(values))
         for values in zip(
-            *((hand.mass, hand.damping, hand.stiffness) for hand in GRIPS.values()), strict=True
+            *((hand.mass, hand.damping, hand.stiffness) for hand in GRIP_IMPEDANCES.values()),
+            strict=True,
         )
     )
     return ImpedanceRange(mass, damping, stiffness)

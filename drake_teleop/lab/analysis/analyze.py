@@ -12,7 +12,7 @@ from pydrake.math import RollPitchYaw
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import make_folder, output_folder, write_json
 from drake_teleop.common.numeric import one_blas_thread
-from drake_teleop.common.progress import Stage, show_progress
+from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.analysis import figures
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
 from drake_teleop.lab.analysis.linearization import (
@@ -28,7 +28,7 @@ from drake_teleop.lab.analysis.task_direction import TaskDirection, task_directi
 from drake_teleop.lab.analysis.two_port import absorb_impedances, hybrid_matrix
 from drake_teleop.lab.analysis.verdict import verdict_sentences
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
@@ -62,14 +62,16 @@ def analyze_command(
 
 
 def analyze(
-    scenario: Scenario, direction: str = "z", progress: bool | Stage = True
+    scenario: Scenario, direction: str = "z", progress: bool | StartStage = True
 ) -> tuple[dict[str, Any], Curves]:
     """Analyse a scenario without its passivity method; return summary and curves of the report."""
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
 
 
-def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str, Any], Curves]:
+def _analyze(
+    scenario: Scenario, direction: str, stage: StartStage
+) -> tuple[dict[str, Any], Curves]:
     method = scenario.passivity.method
     linear = replace(scenario, passivity=PassivityConfig())
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
@@ -141,7 +143,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     summary = _replace_nonfinite_and_arrays(summary)
     summary["verdict"] = verdict_sentences(summary)
     nyquist = {}
-    for grip in GRIPS:
+    for grip in GRIP_IMPEDANCES:
         loop = cut_loop(figures.axis_with_grip(contact, grip), sampling)
         nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
     return summary, Curves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)

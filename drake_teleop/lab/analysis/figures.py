@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.progress import Stage
+from drake_teleop.common.progress import StartStage
 from drake_teleop.lab.analysis import absolute_stability, sampled_wall, transparency
 from drake_teleop.lab.analysis.cut_loop import (
     count_unstable_multipliers,
@@ -33,7 +33,7 @@ from drake_teleop.lab.analysis.two_port import (
     transmitted_impedance,
 )
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.scenario import Scenario, replace
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def axis_with_grip(axis: OneAxis, grip: str) -> OneAxis:
-    hand = GRIPS[grip]
+    hand = GRIP_IMPEDANCES[grip]
     return dataclasses.replace(
         axis, hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness
     )
@@ -101,7 +101,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
     """Return the sampled loop's margins for each grip and wall; `own_wall` in N/m."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
-    for grip in GRIPS:
+    for grip in GRIP_IMPEDANCES:
         for wall in sorted({*WALLS, own_wall}):
             held = dataclasses.replace(axis_with_grip(axis, grip), wall_stiffness=wall)
             loop = cut_loop(held, sampling)
@@ -142,7 +142,10 @@ def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, 
     """Return the stiffest stable wall [N/m]: for all hands between light and firm, and per grip."""
     hands = absolute_stability.impedance_range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
-    each = {grip: _stiffest_stable_wall(axis_with_grip(axis, grip), sampling) for grip in GRIPS}
+    each = {
+        grip: _stiffest_stable_wall(axis_with_grip(axis, grip), sampling)
+        for grip in GRIP_IMPEDANCES
+    }
     return {"grips": limit if min(each.values()) > 0 else 0.0, "each": each}
 
 
@@ -238,7 +241,7 @@ def measured_figures(
 
 
 def parameter_maps(
-    axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
+    axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: StartStage
 ) -> dict[str, dict[str, StabilityMap]]:
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
     n, tool = _MAP_POINTS, axis.tool_mass
@@ -259,7 +262,8 @@ def parameter_maps(
     progress, found = stage("Maps"), {}
     for done, (title, (base, *grid)) in enumerate(parameters.items()):
         found[title] = {
-            grip: stability_map(axis_with_grip(base, grip), sampling, *grid) for grip in GRIPS
+            grip: stability_map(axis_with_grip(base, grip), sampling, *grid)
+            for grip in GRIP_IMPEDANCES
         }
         progress((done + 1) / len(parameters))
     return found

@@ -37,15 +37,15 @@ from drake_teleop.common.vectors import (
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port_matrix
 from drake_teleop.station.channel.channel import Channel
-from drake_teleop.station.environment.point_contact import FRICTION
+from drake_teleop.station.environment.point_contact import FRICTION_COLUMNS
 from drake_teleop.station.master.force_display import initial_display_state
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.sensor.sensor_chain import without_parts
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.joint_commands import AUTOMATIC, ik_method_name
-from drake_teleop.station.slave.plant import ARM, NominalSlave
+from drake_teleop.station.slave.joint_commands import AUTOMATIC_METHOD, ik_method_name
+from drake_teleop.station.slave.plant import ARM_INSTANCE_NAME, NominalSlave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 Array = NDArray[np.float64]
@@ -276,7 +276,7 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 def network_delay_periods(scenario: Scenario) -> tuple[int, int]:
     """Return the network delays of pose and wrench in hand periods."""
-    lines = scenario.channel.lines()
+    lines = scenario.channel.networks_of_directions()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
         return 0, 0
     ahead, back = (
@@ -327,7 +327,7 @@ class _States:
 class _Period:
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rates(scenario)
-        own_period = scenario.master.own_period(scenario.rates.hand_hz)
+        own_period = scenario.master.sampling_period(scenario.rates.hand_hz)
         if own_period is not None:
             raise DrakeTeleopError(
                 f"the device's own rate of {1 / own_period:g} Hz is below the hand's rate",
@@ -400,7 +400,7 @@ class _Period:
         joints = self._context("slave_plant").num_continuous_states() // 2
         axes = self._device.num_joints
         # The sensor's memory contains angles, which must stay small.
-        remembered = np.full(len(self._sensor.remembered), _ANGLE_STEP)
+        remembered = np.full(len(self._sensor.motion_dependent_indices), _ANGLE_STEP)
         return [
             whole_group("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
             whole_group("master_device", 1, np.full(7, _ANGLE_STEP)),
@@ -411,7 +411,7 @@ class _Period:
             _States(
                 "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
             ),
-            _States("wrist_sensor", 0, self._sensor.remembered, remembered),
+            _States("wrist_sensor", 0, self._sensor.motion_dependent_indices, remembered),
             *self._ik_state(),
         ]
 
@@ -451,7 +451,7 @@ class _Period:
         self._fix_input("wrist_sensor", "applied_wrench_W", push)
 
     def _slave_state(self) -> Array:
-        return self._evaluate_output("slave_plant", f"{ARM}_state")
+        return self._evaluate_output("slave_plant", f"{ARM_INSTANCE_NAME}_state")
 
     def _run_one_period(self) -> Array:
         # At this time no event of noise or log interferes.
@@ -493,7 +493,7 @@ class _Period:
             np.append(q, np.zeros(len(q))),
             pose_B,
             np.zeros(6),
-            initial_display_state(self._device.display_coordinates(q), self._device.numbers),
+            initial_display_state(self._device.coordinates_for_display(q), self._device.numbers),
         )
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
@@ -594,13 +594,13 @@ def _without_nonlinear_parts(scenario: Scenario) -> Scenario:
         slave__friction=[],
         load_estimator__enabled=False,
         # The closed form, if the arm has one, has no state.
-        slave__inverse_kinematics=AUTOMATIC,
+        slave__inverse_kinematics=AUTOMATIC_METHOD,
     )
 
 
 def _check_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
-    if beyond := sensor.beyond or sensor.moves:
+    if beyond := sensor.reason_beyond_contact_law or sensor.moving_bodies_sentence:
         raise DrakeTeleopError(
             f"this environment cannot be linearised: {beyond}",
             where="environment",
@@ -616,7 +616,7 @@ def _remove_friction(diagram: Diagram) -> None:
         properties = inspector.GetProximityProperties(geometry)
         properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(0.0, 0.0))
         scene_graph.AssignRole(source, geometry, properties, RoleAssign.kReplace)
-    GetBlock(diagram, "wrist_sensor").contact_pairs[:, FRICTION] = 0.0
+    GetBlock(diagram, "wrist_sensor").contact_pairs[:, FRICTION_COLUMNS] = 0.0
 
 
 def _check_rates(scenario: Scenario) -> None:

@@ -17,7 +17,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import finite_array
 from drake_teleop.lab.analysis.one_axis import OneAxis
-from drake_teleop.station.environment.point_contact import STIFFNESS
+from drake_teleop.station.environment.point_contact import STIFFNESS_COLUMN
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.arm import forward_kinematics, jacobian
@@ -94,7 +94,7 @@ def task_direction(
     servo, sheet = scenario.joint_control, scenario.leaf
     servo.check_computed_torque("the model of one axis")
     scenario.master.check_pose_mode("the model of one axis")
-    forward, backward = scenario.channel.lines()
+    forward, backward = scenario.channel.networks_of_directions()
     axis = OneAxis(
         hand_mass=hand.mass,
         hand_damping=hand.damping,
@@ -124,7 +124,7 @@ def _wall_stiffness(scenario: Scenario) -> float:
     if not isinstance(wall, Wall):
         return 0.0
     pairs = AddSlavePlant(DiagramBuilder(), scenario.slave, wall).contact_pairs
-    return float(pairs[:, STIFFNESS].sum())
+    return float(pairs[:, STIFFNESS_COLUMN].sum())
 
 
 def _device_mass_and_damping(

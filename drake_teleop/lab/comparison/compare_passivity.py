@@ -18,7 +18,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
-from drake_teleop.common.progress import Stage, show_progress
+from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.comparison.decision import decision_table
 from drake_teleop.lab.comparison.delayed_contact import (
     LEAF_SPRINGS,
@@ -39,11 +39,15 @@ from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_ta
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
-from drake_teleop.station.oscillation import fast_part
+from drake_teleop.station.oscillation import high_pass
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, steps_of
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+)
 from drake_teleop.station.station import MakeTeleopStation
 
 NETWORKS = ("lan", "wan", "internet", "geostationary", "lunar")
@@ -172,7 +176,7 @@ def station_run(
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
-    fast = fast_part(result.t[held], result["force_to_master"][held, :3])
+    fast = high_pass(result.t[held], result["force_to_master"][held, :3])
     additional = {
         "fast_force": float(np.sqrt((fast**2).sum(axis=1).mean())),
         "pressed_force": abs(float(shown["pressed"][held].mean())),
@@ -191,8 +195,10 @@ def _run_to_end_or_hold(
     simulator.Initialize()
     hold = dataclasses.replace(task, end=task.release)
     for part in (hold, task):
-        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # exactly to the event
-        result = read_log(simulator, settle)
+        advance_without_garbage_collection(
+            simulator, 1e-3 * round(1e3 * (settle + part.end))
+        )  # exactly to the event
+        result = read_recorded_signals(simulator, settle)
         found = station_figures(result, scenario, part)
         if not found.stable:
             break
@@ -201,7 +207,7 @@ def _run_to_end_or_hold(
 
 
 def _one_dof_study(
-    methods: Sequence[str], seed: int, jobs: int, stage: Stage
+    methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
     # Compile here once, so that the parallel processes read the cache.
@@ -229,7 +235,7 @@ def _one_dof_study(
 
 
 def _hands_study(
-    networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
+    networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: StartStage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
     found = _run_parallel(
@@ -252,7 +258,7 @@ def _station_study(
     methods: Sequence[str],
     seed: int,
     jobs: int,
-    stage: Stage,
+    stage: StartStage,
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
     base = station_base(scenario, seed)
     estimate = identified_load(base, stage).estimate
@@ -281,7 +287,7 @@ def _station_study(
     return rows, traces
 
 
-def _covering_study(stage: Stage) -> list[dict[str, Any]]:
+def _covering_study(stage: StartStage) -> list[dict[str, Any]]:
     progress, rows = stage("Energy added by the elimination"), []
     for done, (sigma, round_trip, wall) in enumerate(_COVERING_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)

@@ -56,7 +56,7 @@ def delayed_contact(
     `leaf` is a key of `LEAF_SPRINGS` or a stiffness [N/m]; `depth` [m] is the hand's intended
     displacement beyond the contact.
     """
-    task = task or task_for_round_trip(sum(line.delay for line in channel.lines()))
+    task = task or task_for_round_trip(sum(line.delay for line in channel.networks_of_directions()))
     settle = 0.5
     swing = Sine(
         t_start=settle + task.swing,
@@ -131,7 +131,7 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
     """Return the energy (N,) from hand and environment, plus the method's initial energy [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
-    if any(scenario.force_scaling.scales().shares):
+    if any(scenario.force_scaling.scales().as_array):
         accounts += load_work(result, scenario)
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 

@@ -1,6 +1,6 @@
 """One degree of freedom of the station: plant, task and measures.
 
-The station's own `channel_step` connects hand and slave along x at 1 kHz, with held forces.
+The station's own `step_channel` connects hand and slave along x at 1 kHz, with held forces.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.lab.analysis.one_axis import Axis
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.channel import (
-    MEMORY_M,
-    MEMORY_S,
-    PORTS,
-    channel_step,
-    initial_ends,
+    MASTER_METHOD_MEMORY,
+    NUM_PORT_SIGNALS,
+    SLAVE_METHOD_MEMORY,
+    initial_state_of_ends,
+    step_channel,
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.memory import LEDGER
+from drake_teleop.station.passivity.memory import STORED_ENERGY
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
@@ -173,7 +173,7 @@ def run_one_dof(
         servo_damping=[model.believed_damping * model.servo_damping] * 2,
         slave_mass=[model.believed_mass * model.slave_mass] * 2,
     )
-    p = methods.parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
+    p = methods.method_parameters(passivity, [scale * (model.gamma or 1.0)] * 2)
     intent = operator_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
     # The channel's command belongs to the next step; here it is used at once.
@@ -183,15 +183,17 @@ def run_one_dof(
         (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
     )
     lines = [
-        network.parameters(line, seed, direction, PERIOD, least=1, delays=travels)
+        network.network_parameters(line, seed, direction, PERIOD, least=1, delays=travels)
         for line, direction, travels in (
             (forward_line, network.FORWARD, forward_delays),
             (forward if backward is None else backward, network.BACKWARD, backward_delays),
         )
     ]
-    states = [network.initial_state(line, np.zeros(PACKET_SIZE)) for line in lines]
-    ends = initial_ends(passivity.method, p, start)
-    stored = float(ends[MEMORY_M][LEDGER][0] + ends[MEMORY_S][LEDGER][0])
+    states = [network.initial_network_state(line, np.zeros(PACKET_SIZE)) for line in lines]
+    ends = initial_state_of_ends(passivity.method, p, start)
+    stored = float(
+        ends[MASTER_METHOD_MEMORY][STORED_ENERGY][0] + ends[SLAVE_METHOD_MEMORY][STORED_ENERGY][0]
+    )
     numbers = (
         model.device_mass, model.device_friction, model.slave_mass, model.servo_stiffness,
         model.servo_damping, model.ideal_servo, model.slave_friction, model.motor_lag,
@@ -341,7 +343,7 @@ def _simulate(
     frame[0] = frame[4] = frame[8] = frame[9] = frame[10] = 1.0
     pose_m, pose_s, received = start.copy(), start.copy(), start.copy()
     wrench, load, hand = np.zeros(6), np.zeros(6), np.zeros(6)
-    felt, ports = np.zeros(7), np.zeros(PORTS)
+    felt, ports = np.zeros(7), np.zeros(NUM_PORT_SIGNALS)
     rows, accounts = np.empty((course.shape[0], 13)), np.zeros(4)
     x = x_s = x_before = start[4]
     v = v_s = a_s = motor = 0.0
@@ -361,7 +363,7 @@ def _simulate(
         accounts[HAND] -= felt[0] * (x - x_before)
         before, x_before = received[4], x
         # A literal False would compile the whole channel once more.
-        channel_step(
+        step_channel(
             steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout,
             frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
         )  # fmt: skip

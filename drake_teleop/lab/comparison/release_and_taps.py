@@ -47,7 +47,7 @@ def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> Relea
             PassivityConfig(method=method),
             PRESETS[network],
             seed=seed,
-            timeout=Channel(network=network).silent_after(PERIOD),
+            timeout=Channel(network=network).timeout_s(PERIOD),
             intent=intent,
             grip=grip,
         )

@@ -18,7 +18,7 @@ from drake_teleop.station.passivity.energy import energy_balance, port_work
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import (
-    GRAVITY,
+    GRAVITY_COLUMN,
     inverse_dynamics,
     jacobian,
     pose_into,
@@ -76,8 +76,8 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
     held = scenario.force_scaling.gripper_phi
     of_gripper = arm.phi_load if held is None else np.asarray(held)
     R_WS = motion[:, np.newaxis, 12:].reshape(-1, 1, 3, 3)
-    gravity = arm.table[-1, GRAVITY : GRAVITY + 3] @ R_WS[:, 0]
-    inertias, weights = np.split(np.array(scenario.force_scaling.scales().shares), 2)
+    gravity = arm.table[-1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3] @ R_WS[:, 0]
+    inertias, weights = np.split(np.array(scenario.force_scaling.scales().as_array), 2)
     kept, excess = (
         part[0] * of_gripper + part[1] * (arm.phi_load - of_gripper)
         for part in (inertias, weights - inertias)
@@ -94,9 +94,11 @@ def start_energy(scenario: Scenario) -> Array:
     """Return the passivity method's initial energy (2,) [J]."""
     scales = _motion_scale(scenario)
     power = scenario.force_scaling.force_scale / scales
-    p = methods.parameters(scenario.passivity, list(power), list(scales))
+    p = methods.method_parameters(scenario.passivity, list(power), list(scales))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return 2 * energy_balance(methods.initial_memory(scenario.passivity.method, p, pose)).stored
+    return (
+        2 * energy_balance(methods.initial_method_memory(scenario.passivity.method, p, pose)).stored
+    )
 
 
 def _motion_scale(scenario: Scenario) -> Array:

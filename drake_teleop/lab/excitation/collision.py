@@ -41,7 +41,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, write_link_motions
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.plant import finalize
+from drake_teleop.station.slave.plant import finalize_plant
 
 # Vertices of the circumscribed polygon of a cylinder.
 _NUM_RIM_POINTS = 24
@@ -152,7 +152,7 @@ class Scene:
         _make_solid(self.plant, self.scene_graph, visuals_count)
         _check_sizes(self.plant, self.scene_graph, where)
         _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE)
-        finalize(self.plant)
+        finalize_plant(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
         self._rows = self._link_rows()

@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.progress import Stage, show_progress
+from drake_teleop.common.progress import StartStage, show_progress
 from drake_teleop.lab.excitation.check import RATE, LimitUse, check_trajectory
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
 from drake_teleop.lab.excitation.limits import (
@@ -68,7 +68,7 @@ def excite(
     seed: int = 0,
     starts: int = 4,
     seconds: float | None = None,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
 ) -> Excitation:
     """Design an excitation trajectory with `harmonics` harmonics in Eq. (9), and check it.
 
@@ -176,7 +176,7 @@ def _feasible_candidates(found: list[Iterate], robot: Robot) -> Iterator[Fourier
             continue
         last[iterate.start] = iterate.value
         for factor in _SHRINK_FACTORS:
-            trajectory = iterate.trajectory.scaled(factor)
+            trajectory = iterate.trajectory.with_scaled_amplitudes(factor)
             if _largest_uses(robot, trajectory).max() <= 1:
                 yield trajectory
                 checks += 1
@@ -196,7 +196,7 @@ def _small_motions(
     motions += [problem.trajectory(x) for x in random]
     for factor in _SMALL_FACTORS:
         for motion in motions:
-            small = replace(motion.scaled(factor), q0=robot.home)
+            small = replace(motion.with_scaled_amplitudes(factor), q0=robot.home)
             # `check_trajectory` measures the true clearance.
             if _largest_uses(robot, small)[:-1].max() <= 1:
                 yield small

@@ -22,7 +22,7 @@ from drake_teleop.common.vectors import (
     transposed,
     vector_at,
 )
-from drake_teleop.station.slave.arm import MOTION_SIZE, SLIDES
+from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, IS_PRISMATIC_COLUMN
 
 #: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
 SEED_SIZE = 21
@@ -88,7 +88,7 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
         p = here
         if row < n:
             along = scale_vector(c[row], (motion[14], motion[17], motion[20]))
-            if table[row, SLIDES] != 0.0:
+            if table[row, IS_PRISMATIC_COLUMN] != 0.0:
                 v = plus(v, along)
             else:
                 w = plus(w, along)
@@ -116,7 +116,7 @@ def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)
-    still = np.zeros(MOTION_SIZE)
+    still = np.zeros(FRAME_STATE_SIZE)
     for row in range(n, -1, -1):
         motion, seed = motions[row], seeds[row]
         inboard = motions[row - 1] if row > 0 else still
@@ -125,7 +125,7 @@ def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
         ga, gp = plus(ga, vector_at(seed, _ALPHA)), plus(gp, vector_at(seed, _P))
         gt, gv = plus(gt, vector_at(seed, _THETA)), plus(gv, vector_at(seed, _V))
         go = plus(go, vector_at(seed, _W))
-        z, slides = (motion[14], motion[17], motion[20]), table[row, SLIDES] != 0.0
+        z, slides = (motion[14], motion[17], motion[20]), table[row, IS_PRISMATIC_COLUMN] != 0.0
         if row < n and slides:
             gz = plus(scale_vector(qdd[row], gs), scale_vector(2.0 * qd[row], cross(gs, w)))
             gz = plus(gz, scale_vector(c[row], gv))

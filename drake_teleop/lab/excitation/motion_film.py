@@ -18,12 +18,12 @@ from drake_teleop.lab.excitation.excite import Excitation, sensor_motion
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.film import (
-    Film,
-    Reading,
-    Show,
+    DisplayedNumber,
+    ReplayFile,
+    ShowFrame,
     add_shapes,
+    colour_to_rgba,
     frame_times,
-    rgba,
     set_plain_background,
 )
 
@@ -47,20 +47,20 @@ def write_motion_film(path: Path, found: Excitation) -> None:
         non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.phi)[:, :3], axis=1
     )
     samples = np.minimum(np.rint(times * RATE).astype(int), len(force) - 1)
-    film = Film(
+    film = ReplayFile(
         f"Excitation of {robot.name}",
         times,
         slow_motion,
         readings=[
-            Reading("Force of the heaviest load", "N", force[samples], BLUE),
-            Reading("Speed of the sensor", "m/s", speed),
+            DisplayedNumber("Force of the heaviest load", "N", force[samples], BLUE),
+            DisplayedNumber("Speed of the sensor", "m/s", speed),
         ],
         notes=("Line: path of the sensor, from rest to rest.",),
         clock="of the motion",
         curves="force at the sensor, 0 to {top} N",
     )
 
-    def make_scene(meshcat: Meshcat) -> Show:
+    def make_scene(meshcat: Meshcat) -> ShowFrame:
         _add_surroundings(
             meshcat, path_S, np.array([X_WB.translation() for X_WB in poses[0][0].values()])
         )
@@ -124,5 +124,5 @@ def _add_surroundings(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
     meshcat.SetObject("/room/table", Box(2 * size, 2 * size, _TABLE_THICKNESS_M), _TABLE_COLOUR)
     meshcat.SetTransform("/room/table", RigidTransform([0.0, 0.0, -_TABLE_THICKNESS_M / 2]))
-    meshcat.SetLine("/way", path_S.T, 3.0, rgba(BLUE))
+    meshcat.SetLine("/way", path_S.T, 3.0, colour_to_rgba(BLUE))
     meshcat.SetCameraPose(middle + size * _CAMERA_POSITION, middle)

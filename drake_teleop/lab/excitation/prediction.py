@@ -15,8 +15,8 @@ from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    SteadyState,
-    motion_gains,
+    SteadyStateFilter,
+    fusion_filters,
 )
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
@@ -50,7 +50,7 @@ def sensor_noise(
     if estimation.source == "accelerometer":
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
-        angular, linear = motion_gains(estimation, sensor, num_joints, period)
+        angular, linear = fusion_filters(estimation, sensor, num_joints, period)
         filters = _error_filter(linear, period), _error_filter(angular, period)
     place = sensor.accelerometer()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
@@ -93,7 +93,7 @@ def _covariance_of_influence(influence: Array, variances: Array) -> Array:
     return rows.T @ rows
 
 
-def _error_filter(filter_: SteadyState, period: float) -> tuple[Array, Array]:
+def _error_filter(filter_: SteadyStateFilter, period: float) -> tuple[Array, Array]:
     denominator = np.array([1.0, *(filter_.gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]
     return numerator, denominator

@@ -27,7 +27,7 @@ from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParseModel
-from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
+from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 _NUM_POSTURES = 1000  # random postures for distances of shapes
@@ -185,7 +185,7 @@ def _make_robot(
     folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
     arm = scene.arm
-    middle, half = arm.middle, (arm.upper - arm.lower) / 2
+    middle, half = arm.middle_positions, (arm.upper - arm.lower) / 2
     random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
     postures = middle + half_ranges_for_sampling(half) * random
     candidates, touching = scene.find_collision_candidates(postures, start)
@@ -235,7 +235,7 @@ def _make_robot(
 def _read_arm(parse: Parse) -> ArmModel:
     plant = MultibodyPlant(0.0)
     instance, frame = parse(plant)
-    finalize(plant)
+    finalize_plant(plant)
     return ArmModelFromPlant(plant, instance, frame.name())
 
 

@@ -47,7 +47,11 @@ from drake_teleop.lab.excitation.prediction import (
 )
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
-from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
+from drake_teleop.load.tolerance import (
+    Tolerance,
+    derivatives_over_tolerances,
+    deviations_over_tolerances,
+)
 from drake_teleop.load.trajectory import FourierTrajectory
 
 RELIABLE_PROBABILITY = 0.95
@@ -95,7 +99,9 @@ def design_shortest_motion(
     Raises:
         DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
-    errors = errors_of(tolerance, robot.limits.phi) * sidak_factor(len(tolerance.entries))
+    errors = derivatives_over_tolerances(tolerance, robot.limits.phi) * sidak_factor(
+        len(tolerance.required_entries)
+    )
     factor = np.ones(len(errors))
     task = Task(
         robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
@@ -118,7 +124,7 @@ def design_shortest_motion(
         trajectory, uses = find_best_within_limits(robot, found)
         motion = sensor_motion(robot, trajectory)
         covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
-        reached = deviations_of(errors, covariance)
+        reached = deviations_over_tolerances(errors, covariance)
         worst = float(reached.max())
         around = problem.best if worst < _MAX_START_MISFIT else None
         if worst <= 1.0:

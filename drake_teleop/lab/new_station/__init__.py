@@ -17,7 +17,7 @@ from drake_teleop.lab.new_station.picture import start_picture
 from drake_teleop.lab.new_station.plan import Plan, plan_station
 from drake_teleop.lab.new_station.text import round_to_four_digits, scenario_text
 from drake_teleop.lab.run import run_command
-from drake_teleop.station.master.data_sheets import FIGURES, LEADER, PHANTOM
+from drake_teleop.station.master.data_sheets import FIGURES, LEADER_NAME, PHANTOM_NAME
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.presets import PRESETS
 
@@ -29,7 +29,7 @@ def new_command(
     *,
     package_paths: tuple[Path, ...] = (),
     tool: Path | None = None,
-    device: str = PHANTOM,
+    device: str = PHANTOM_NAME,
     sensor: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -52,12 +52,12 @@ def new_command(
             "already exists", where=str(scenario), remedy="edit it, or give another folder"
         )
     for kind, name, known in (
-        ("device", device, (PHANTOM, *FIGURES)),
+        ("device", device, (PHANTOM_NAME, *FIGURES)),
         ("sensor", sensor, (None, *PRESETS)),
     ):
         if name not in known:
             remedy = f"choose one of {', '.join(filter(None, known))}"
-            if name == LEADER:
+            if name == LEADER_NAME:
                 remedy += "; add a leader arm to station.yaml afterwards, as master.leader"
             raise DrakeTeleopError(f"there is no {kind} {name!r}", where=f"--{kind}", remedy=remedy)
     plan = plan_station(arm, sensor_frame, package_paths, tool, device)
@@ -73,7 +73,7 @@ def new_command(
         with whole_file(scenario) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
             slave = LoadScenario(unfinished).slave
-            read = [slave.path, *slave.packages, *(slave.files()[1:] if tool else ())]
+            read = [slave.path, *slave.packages, *(slave.model_files()[1:] if tool else ())]
             given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
             if read != given or slave.sensor_frame != sensor_frame:
                 raise DrakeTeleopError(

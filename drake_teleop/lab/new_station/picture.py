@@ -79,9 +79,9 @@ def _caption(plan: Plan) -> str:
 
 
 def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
-    anchored, rank = shapes.anchored(), 0
+    anchored, rank = shapes.anchored_bodies(), 0
     triangles, colours = [], []
-    for body in sorted(shapes.moving() | anchored, key=int):
+    for body in sorted(shapes.moving_bodies() | anchored, key=int):
         hulls = shapes.hulls(body, visual=True)
         if body in shapes.tool_bodies:
             colour = _TOOL_COLOUR

@@ -34,13 +34,13 @@ from drake_teleop.lab.new_station.random_postures import (
 )
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, NewInstance
 from drake_teleop.station.slave.arm import (
-    ROTATION,
-    TRANSLATION,
+    ROTATION_COLUMN,
+    TRANSLATION_COLUMN,
     ArmModel,
     holding_torque,
     pose_into,
 )
-from drake_teleop.station.slave.home import R_WS_HOME, tool_down
+from drake_teleop.station.slave.home import R_WS_HOME, positions_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.posture_shapes import MIN_DEPTH_M, PostureShapes, overlap_texts
@@ -265,7 +265,7 @@ def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Ar
         R_WA = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
         pose = np.array([*R_WA.ToQuaternion().wxyz(), *position])
         if yaw_deg == 0.0 or has_closed_form(arm):
-            usual, status = tool_down(arm, position, R_WA)
+            usual, status = positions_with_tool_down(arm, position, R_WA)
             if status == IkStatus.OK:
                 yield usual, pose, yaw_deg == 0.0
         if not has_closed_form(arm):
@@ -281,7 +281,10 @@ def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Regio
     shapes.move_to(place.q)
     walls = _move_walls(shapes)
     depths = dict.fromkeys(walls, 0.0)
-    cost = max(region.plane - shapes.points(shapes.moving())[:, 2].min(initial=np.inf), 0.0)
+    cost = max(
+        region.plane - shapes.points_on_bodies(shapes.moving_bodies())[:, 2].min(initial=np.inf),
+        0.0,
+    )
     overlaps = False
     for first, second, distance in shapes.overlaps():
         pair = {first.index(), second.index()}
@@ -314,7 +317,7 @@ def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
 
 def lowest_tool_point(shapes: PostureShapes) -> Array:
     """Return the tool's lowest point p_W (3,) [m]; without shapes its centre of mass."""
-    points = shapes.points(shapes.tool_bodies)
+    points = shapes.points_on_bodies(shapes.tool_bodies)
     if not len(points):
         phi = shapes.arm.phi_load
         points = (shapes.X_WS @ (phi[1:4] / phi[0]))[np.newaxis]
@@ -324,7 +327,7 @@ def lowest_tool_point(shapes: PostureShapes) -> Array:
 
 def extent_beyond_sensor(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
     """Return the reach of bodies beyond S along an axis of S [m]."""
-    points = shapes.X_WS.inverse() @ shapes.points(bodies).T
+    points = shapes.X_WS.inverse() @ shapes.points_on_bodies(bodies).T
     return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
 
 
@@ -383,8 +386,8 @@ def nearest_axis(direction: Array) -> str:
 def last_joint_axis(arm: ArmModel) -> str:
     """Return the axis of S along the last joint, away from it; empty if none is."""
     row = arm.table[arm.num_joints]
-    along = row[ROTATION:TRANSLATION].reshape(3, 3)[2]
-    return nearest_axis(-along if row[TRANSLATION + 2] < -_ROUNDING_M else along)
+    along = row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)[2]
+    return nearest_axis(-along if row[TRANSLATION_COLUMN + 2] < -_ROUNDING_M else along)
 
 
 def tool_frame_advice(arm: ArmModel, model: Path, sensor_frame: str, axis: str) -> str:

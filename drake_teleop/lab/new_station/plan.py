@@ -23,7 +23,7 @@ from drake_teleop.lab.new_station.place import (
     nearest_axis,
     tool_frame_advice,
 )
-from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM
+from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM_NAME
 from drake_teleop.station.master.phantom import FORCE_LIMIT
 from drake_teleop.station.slave.arm import ArmModel, holding_torque
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
@@ -90,7 +90,7 @@ def plan_station(
     sensor_frame: str,
     package_paths: tuple[Path, ...] = (),
     tool: Path | None = None,
-    device: str = PHANTOM,
+    device: str = PHANTOM_NAME,
 ) -> Plan:
     """Choose start, scales and motions for an arm and a device."""
     stand_in = _stand_in_tool("z", _LENGTH_M)
@@ -193,7 +193,7 @@ def base_plane(shapes: PostureShapes) -> float:
 
     Without such shapes: the base, but not above the first joint.
     """
-    heights = shapes.points(shapes.anchored())[:, 2]
+    heights = shapes.points_on_bodies(shapes.anchored_bodies())[:, 2]
     return float(heights.min()) if len(heights) else min(float(shapes.arm.table[0, 11]), 0.0)
 
 

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.slave.arm import ROTATION, SLIDES, TRANSLATION, ArmModel
+from drake_teleop.station.slave.arm import (
+    IS_PRISMATIC_COLUMN,
+    ROTATION_COLUMN,
+    TRANSLATION_COLUMN,
+    ArmModel,
+)
 from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
 from drake_teleop.station.slave.posture_shapes import sampled_range
 
@@ -92,11 +97,11 @@ def postures_at(arm: ArmModel, q: Array) -> Postures:
     R, p = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
     origins, axes = [], []
     for row, angle in zip(arm.table, [*q.T, np.zeros(len(q))], strict=True):
-        p = p + R @ row[TRANSLATION : TRANSLATION + 3]
-        R = R @ row[ROTATION:TRANSLATION].reshape(3, 3)
+        p = p + R @ row[TRANSLATION_COLUMN : TRANSLATION_COLUMN + 3]
+        R = R @ row[ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)
         origins.append(p)
         axes.append(R[:, :, 2])
-        if row is not arm.table[-1] and row[SLIDES]:
+        if row is not arm.table[-1] and row[IS_PRISMATIC_COLUMN]:
             p = p + angle[:, None] * R[:, :, 2]
         else:
             R = R @ _rotations_about_z(angle)
@@ -191,7 +196,7 @@ def joint_margins(arm: ArmModel, q: Array) -> Array:
 
 def _singular_values(arm: ArmModel, postures: Postures) -> Array:
     """Return the singular values (k, min(n, 6)) of the Jacobian, rotations times L [m]."""
-    slides = (arm.table[:-1, SLIDES] != 0.0)[:, None]
+    slides = (arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0)[:, None]
     arms = postures.p_WS[:, None] - postures.origins
     linear = np.where(slides, postures.axes, np.cross(postures.axes, arms))
     angular = np.where(slides, 0.0, orientation_length(arm) * postures.axes)
@@ -233,6 +238,6 @@ def elbow_up_share(postures: Postures, reach: float) -> Array:
 def with_tool_axis(arm: ArmModel, R_SA: Array) -> ArmModel:
     """Return the arm with the frame A instead of S."""
     table = arm.table.copy()
-    R = table[-1, ROTATION:TRANSLATION].reshape(3, 3) @ R_SA
-    table[-1, ROTATION:TRANSLATION] = R.ravel()
+    R = table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3) @ R_SA
+    table[-1, ROTATION_COLUMN:TRANSLATION_COLUMN] = R.ravel()
     return replace(arm, table=table)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.lab.new_station.plan import SWING_HZ, WALL_STIFFNESS, Plan
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
@@ -75,7 +75,7 @@ def scenario_text(
         "operator": {"grip": "medium", "intent": [swing_motion, press_motion]},
     }
     head = "Made by drake-teleop new. All fields and defaults: drake-teleop scenario station.yaml"
-    return yaml_text(data, head=[head], comments=comments)
+    return to_yaml_text(data, head=[head], comments=comments)
 
 
 def wall_of_plan(plan: Plan) -> Wall:
@@ -89,7 +89,7 @@ def wall_of_plan(plan: Plan) -> Wall:
 
 
 def _device_rates(device: str) -> dict[str, Any]:
-    own = Master(model=device).own_period(Rates().hand_hz)
+    own = Master(model=device).sampling_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 

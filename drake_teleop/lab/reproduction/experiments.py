@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.progress import Progress, Stage
+from drake_teleop.common.progress import StartStage, UpdateProgress
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
 from drake_teleop.lab.run_summary import FILTER_TAIL_S, is_in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
@@ -17,7 +17,12 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.simulation import (
+    MakeSimulator,
+    advance_without_garbage_collection,
+    read_recorded_signals,
+    simulate,
+)
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 Values = dict[str, Any]
@@ -78,14 +83,16 @@ class ContactMotion:
     threshold: float
 
 
-def simulate_free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
+def simulate_free_motion(
+    scenario: Scenario, estimate: Array, progress: UpdateProgress
+) -> FreeMotion:
     """Simulate a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
     scaled = {sigma: _scaled_wrench_at_slave(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
-def simulate_contact(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
+def simulate_contact(scenario: Scenario, estimate: Array, stage: StartStage) -> ContactMotion:
     """Simulate the contact transition with and without the leaf spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
@@ -104,7 +111,7 @@ def simulate_contact(scenario: Scenario, estimate: Array, stage: Stage) -> Conta
     )
 
 
-def simulate_ideal_motion(progress: Progress) -> IdealMotion:
+def simulate_ideal_motion(progress: UpdateProgress) -> IdealMotion:
     """Simulate a movement along and about all axes."""
     scenario = replace(
         LoadScenario("ideal_sensor"), operator__intent=[_ALL_AXES], simulation__duration=0.4
@@ -120,13 +127,15 @@ def simulate_ideal_motion(progress: Progress) -> IdealMotion:
     place = list(plant.GetJointIndices()).index(weld.index())
     wrenches = np.empty((round((simulation.settle + simulation.duration) * rate) + 1, 6))
     for k in range(len(wrenches)):
-        advance(simulator, k * (1 / rate))  # the same product as Drake's event times
+        advance_without_garbage_collection(
+            simulator, k * (1 / rate)
+        )  # the same product as Drake's event times
         reaction = reactions.Eval(context)[place]
         wrenches[k] = *reaction.translational(), *reaction.rotational()
         if k % 256 == 0:
             progress(k / len(wrenches))
     progress(1.0)
-    result = read_log(simulator, simulation.settle)
+    result = read_recorded_signals(simulator, simulation.settle)
     taken = np.rint((result["sample_time"][:, 0] + simulation.settle) * rate).astype(int)
     started = taken >= 0
     _, s, omega, alpha = (part[started] for part in sensor_samples(result))
@@ -224,7 +233,7 @@ def without_leaf_spring(scenario: Scenario) -> Scenario:
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
 
-def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> SimulationResult:
+def _simulate(scenario: Scenario, estimate: Array, progress: UpdateProgress) -> SimulationResult:
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     return simulate(station, scenario.simulation, progress=progress)
 

@@ -15,7 +15,7 @@ from drake_teleop.common.files import (
     write_table,
     write_text,
 )
-from drake_teleop.common.progress import Progress, show_progress
+from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.common.style import PAGE_DPI
 from drake_teleop.lab.identification import (
     LoadIdentification,
@@ -139,7 +139,7 @@ def _log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
     return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
 
 
-def _measure_speed(progress: Progress) -> Values:
+def _measure_speed(progress: UpdateProgress) -> Values:
     scenario = LoadScenario("free_motion_force")
     cost = cpu_seconds(
         {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress

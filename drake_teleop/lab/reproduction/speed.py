@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.progress import Progress
+from drake_teleop.common.progress import UpdateProgress
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.scenario import Scenario, Simulation
-from drake_teleop.station.simulation import MakeSimulator, advance
+from drake_teleop.station.simulation import MakeSimulator, advance_without_garbage_collection
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -44,7 +44,7 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
-    advance(simulator, scenario.simulation.settle)
+    advance_without_garbage_collection(simulator, scenario.simulation.settle)
     return simulator
 
 
@@ -52,14 +52,16 @@ def cpu_seconds(
     simulators: Mapping[str, Simulator],
     *,
     repetitions: int = 11,
-    progress: Progress = lambda done: None,
+    progress: UpdateProgress = lambda done: None,
 ) -> dict[str, float]:
     """Return the least CPU time per simulated second of each simulator."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
     for k in range(repetitions):
         for name, simulator in simulators.items():
             start = time.thread_time()
-            advance(simulator, simulator.get_context().get_time() + _RUN_S)
+            advance_without_garbage_collection(
+                simulator, simulator.get_context().get_time() + _RUN_S
+            )
             times_s[name].append((time.thread_time() - start) / _RUN_S)
         progress((k + 1) / repetitions)
     return {name: min(times) for name, times in times_s.items()}

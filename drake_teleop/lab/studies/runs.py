@@ -18,7 +18,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.numeric import Array, one_blas_thread
-from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.design import Study, Values
 from drake_teleop.lab.studies.processes import Chunk, open_executor
@@ -55,7 +55,7 @@ def run_study(
     executor: Executor | None = None,
     shard: str | None = None,
     merge: bool = False,
-    progress: bool | Stage = True,
+    progress: bool | StartStage = True,
 ) -> pl.DataFrame:
     """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
@@ -135,7 +135,7 @@ class StudyProgress:
         self.total, self.done, self._num_timed = total, 0, 0
         self._recent: deque[float] = deque(maxlen=_NUM_RECENT_RUNS)
 
-    def start(self, progress: Progress, processes: int) -> None:
+    def start(self, progress: UpdateProgress, processes: int) -> None:
         self._progress, self._processes = progress, processes
 
     def add_earlier_runs(self, runs: int) -> None:

@@ -29,9 +29,9 @@ from drake_teleop.lab.studies.design import Values
 from drake_teleop.lab.tuning.stated_set import StatedSet
 from drake_teleop.station.master.data_sheets import FIGURES
 from drake_teleop.station.master.phantom import FORCE_LIMIT
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.tdpa import charged
+from drake_teleop.station.passivity.tdpa import charged_tdpa_config
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
@@ -64,9 +64,9 @@ class Settings:
     low_pass_hz: float
 
     def passivity(self, stated: StatedSet) -> PassivityConfig:
-        hand = GRIPS[stated.hands[-1]]
+        hand = GRIP_IMPEDANCES[stated.hands[-1]]
         stiffness = [hand.stiffness, hand.rotational_stiffness]
-        known = dataclasses.replace(charged(), hand_stiffness=stiffness)
+        known = dataclasses.replace(charged_tdpa_config(), hand_stiffness=stiffness)
         return PassivityConfig(method=self.method, charged_tdpa=known)
 
     def apply(self, base: Scenario, stated: StatedSet) -> Scenario:
@@ -113,7 +113,7 @@ class StationTrial:
             scenario = settings_from_values(values).apply(self.base, self.stated)
         scenario = replace(scenario, operator__grip=grip, simulation__seed=seed)
         channel = self.base.channel
-        task = short_task(sum(line.delay for line in channel.lines()))
+        task = short_task(sum(line.delay for line in channel.networks_of_directions()))
         setup, _ = delayed_contact(
             scenario,
             channel,
@@ -211,8 +211,8 @@ class GammaSearch:
         self, axis: Axis, settings: Settings, gamma: float, grip: str, wall: float, seed: int
     ) -> float:
         """Return the rendered share of the contact force; 0: unstable."""
-        forward, backward = self.base.channel.lines()
-        hand = GRIPS[grip]
+        forward, backward = self.base.channel.networks_of_directions()
+        hand = GRIP_IMPEDANCES[grip]
         shown = {entry.name: getattr(axis, entry.name) for entry in dataclasses.fields(Axis)}
         model = OneDof(**shown | {
             "hand_mass": hand.mass, "hand_damping": hand.damping,
@@ -254,7 +254,7 @@ def press_depth(base: Scenario, grip: str) -> float:
     """Return the displacement [m] into a wall that the device can render to the grip."""
     sheet = base.master.figures or FIGURES.get(base.master.model)
     peak = FORCE_LIMIT if sheet is None else sheet.peak_force
-    return min(_MAX_DEPTH, _DEVICE_SHARE * peak / GRIPS[grip].stiffness)
+    return min(_MAX_DEPTH, _DEVICE_SHARE * peak / GRIP_IMPEDANCES[grip].stiffness)
 
 
 def rms_above(x: Array, period: float, frequency: float) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.progress import Progress, show_progress
+from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.lab.studies.design import Factor, Study, Value
 from drake_teleop.lab.studies.runs import run_study
 from drake_teleop.lab.tuning.press_trial import (
@@ -175,7 +175,7 @@ def make_study_executor(out: Path, basis: dict[str, Any], jobs: int, progress: b
     def execute(name: str, study: Study, work: Any) -> list[Row]:
         with show_progress(progress) as stage:
 
-            def name_progress(_: str) -> Progress:
+            def name_progress(_: str) -> UpdateProgress:
                 return stage(f"Trials {name}")
 
             found = run_study(study, out / name, work, basis, jobs=jobs, progress=name_progress)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS
-from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
@@ -67,7 +67,10 @@ class StatedSet:
 
 def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> StatedSet:
     """Return the set of these grips, walls [kN/m] and this task."""
-    for what, names, known in (("hands", hands, tuple(GRIPS)), ("task", (task,), tuple(TASKS))):
+    for what, names, known in (
+        ("hands", hands, tuple(GRIP_IMPEDANCES)),
+        ("task", (task,), tuple(TASKS)),
+    ):
         for name in names:
             if name not in known:
                 remedy = suggest_name(name, known, f"choose among {', '.join(known)}")
@@ -86,7 +89,7 @@ def stated_set(hands: Sequence[str], walls: Sequence[float], task: str) -> State
         raise DrakeTeleopError(
             "no wall stiffness is given", where="walls", remedy="give kN/m, such as 0.5,20"
         )
-    ordered = tuple(name for name in GRIPS if name in hands)
+    ordered = tuple(name for name in GRIP_IMPEDANCES if name in hands)
     return StatedSet(ordered, (1e3 * min(walls), 1e3 * max(walls)), task)
 
 

@@ -30,7 +30,7 @@ from drake_teleop.lab.tuning.search import (
 )
 from drake_teleop.lab.tuning.stated_set import StatedSet, stated_set, without_task_and_method
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
-from drake_teleop.station.scenario_reference import commented, write_scenario
+from drake_teleop.station.scenario_reference import to_commented_yaml, write_scenario
 
 
 def tune(
@@ -74,8 +74,8 @@ def tune(
     own = replace(own, simulation=base.simulation, operator=base.operator, channel=base.channel)
     trial = StationTrial(own, base, stated, load.estimate)
     basis = {
-        "given": commented(given),
-        "base": commented(base),
+        "given": to_commented_yaml(given),
+        "base": to_commented_yaml(base),
         "stated": dataclasses.asdict(stated),
         "estimate": load.estimate.tolist(),
     }

@@ -14,13 +14,13 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, pseudo_inertia
 
-_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
-_CONSTRAINT = [np.zeros((4, 4)), *_BASIS]
-_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_BASIS, (10, 16)).T)  # (10, 16)
+_PSEUDO_INERTIA_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
+_CONSTRAINT_MATRICES = [np.zeros((4, 4)), *_PSEUDO_INERTIA_BASIS]
+_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_PSEUDO_INERTIA_BASIS, (10, 16)).T)  # (10, 16)
 _MIN_LENGTH_M = 1e-3  # lower bound of the length unit L [m]
 # Eigenvalues relative to the largest: limit of information, and replacement of smaller ones.
 _MIN_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
-_PRIORS = ("entropic", "geodesic")
+_PRIOR_KINDS = ("entropic", "geodesic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +39,11 @@ class Prior:
     kind: str = "entropic"
 
     def __post_init__(self) -> None:
-        if self.kind not in _PRIORS:
+        if self.kind not in _PRIOR_KINDS:
             raise DrakeTeleopError(
                 f"{self.kind!r} is unknown",
                 where="prior.kind",
-                remedy=f"choose {' or '.join(_PRIORS)}",
+                remedy=f"choose {' or '.join(_PRIOR_KINDS)}",
             )
         if not 0.0 < self.weight < np.inf:
             raise DrakeTeleopError(
@@ -58,9 +58,11 @@ class Prior:
                 remedy="give a body with mass, and inertia about all axes",
             )
 
-    def information(self, samples: int) -> Array:
+    def inverse_covariance(self, samples: int) -> Array:
         """Return the inverse covariance (10, 10) of phi that the prior contributes."""
-        parts = np.linalg.solve(pseudo_inertia(finite_array("prior.phi", self.phi, 10)), _BASIS)
+        parts = np.linalg.solve(
+            pseudo_inertia(finite_array("prior.phi", self.phi, 10)), _PSEUDO_INERTIA_BASIS
+        )
         return np.asarray(samples * self.weight * np.einsum("aij,bji->ab", parts, parts))
 
 
@@ -76,7 +78,7 @@ class Ellipsoid:
     center: ArrayLike
     matrix: ArrayLike
 
-    def row(self) -> Array:
+    def constraint_row(self) -> Array:
         """Return a (10,) such that a^T phi >= 0 for each phi whose mass is inside the ellipsoid."""
         A, c = (
             finite_array("ellipsoid.matrix", self.matrix, 3, 3),
@@ -89,7 +91,7 @@ class Ellipsoid:
                 remedy="give a symmetric matrix with positive eigenvalues",
             )
         E = np.block([[-A, (A @ c)[:, None]], [A @ c, 1.0 - c @ A @ c]])
-        return np.array([np.sum(unit * E) for unit in _BASIS])
+        return np.array([np.sum(unit * E) for unit in _PSEUDO_INERTIA_BASIS])
 
 
 def consistent_least_squares(
@@ -104,7 +106,7 @@ def consistent_least_squares(
     `theta` (16,) is the unconstrained solution of the weighted normal equations `gram` and
     `right`.
     """
-    row = None if ellipsoid is None else ellipsoid.row()
+    row = None if ellipsoid is None else ellipsoid.constraint_row()
     inside = row is None or row @ theta[6:] >= 0.0
     if prior is None and inside and is_physically_consistent(theta[6:]):
         return theta
@@ -118,7 +120,7 @@ def consistent_least_squares(
     if prior is None and np.abs(reduced).max() <= _MIN_EIGENVALUE * largest_diagonal:
         return theta  # the record cannot separate load and offsets
     linear = (right[6:] - cross.T @ offsets[:, 0]) * unit
-    phi = unit * _solve(0.5 * (reduced + reduced.T), linear, unit, prior, row)
+    phi = unit * _solve_consistent_fit(0.5 * (reduced + reduced.T), linear, unit, prior, row)
     return np.concatenate([offsets[:, 0] - offsets[:, 1:] @ phi, phi])
 
 
@@ -135,12 +137,14 @@ def _parameter_units(phi: Array) -> Array:
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])
 
 
-def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None) -> Array:
+def _solve_consistent_fit(
+    H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None
+) -> Array:
     """Return phi / unit of the consistent load with the least phi^T H phi / 2 - b^T phi + prior."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(finite_array("prior.phi", prior.phi, 10) / unit))
-        scaled = [J0_inverse @ part for part in _BASIS]
+        scaled = [J0_inverse @ part for part in _PSEUDO_INERTIA_BASIS]
         pull = prior.weight * np.array([np.trace(part) for part in scaled])
         if prior.kind == "geodesic":
             H = H + prior.weight * np.einsum("aij,bji->ab", scaled, scaled)
@@ -148,7 +152,7 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
     if not entropic and row is None:
         problem = _distance_program(get_ident())
     else:
-        problem = _make_program(distance=not entropic)
+        problem = _make_cone_program(distance=not entropic)
     program, x, cone, solver = problem
     if row is not None:
         normalised = row * unit / np.abs(row * unit).max()
@@ -168,18 +172,18 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
             remedy="check the sign of the wrench, and that the load moves",
         )
     # The solver's tolerance leaves eigenvalues of about -1e-9.
-    values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _BASIS, 1))
+    values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _PSEUDO_INERTIA_BASIS, 1))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
 
 
-def _make_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
+def _make_cone_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
     # Imported here because the rest of the package starts ten times faster without Drake.
     from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
     program, cone = MathematicalProgram(), None
     x = program.NewContinuousVariables(10)
-    program.AddLinearMatrixInequalityConstraint(_CONSTRAINT, x)
+    program.AddLinearMatrixInequalityConstraint(_CONSTRAINT_MATRICES, x)
     if distance:
         t = program.NewContinuousVariables(1)
         program.AddLinearCost([1.0], t)
@@ -190,7 +194,7 @@ def _make_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
 
 @cache
 def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
-    return _make_program(distance=True)
+    return _make_cone_program(distance=True)
 
 
 def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:

@@ -14,35 +14,35 @@ from drake_teleop.common.numeric import Array, broadcast_to_rows, to_float
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.batch.total_least_squares import (
-    Fit,
+    EstimatorFit,
+    EstimatorOptions,
     NormalForm,
-    Options,
-    Record,
+    SampleRecord,
     total_least_squares,
 )
 from drake_teleop.load.batch.uncertainty import (
-    covariance_of,
-    gain_covariance,
-    walk_covariance,
-    white_covariance,
-    with_prior,
+    covariance_for_gain_errors,
+    covariance_for_random_walks,
+    covariance_for_white_noise,
+    covariance_of_solution,
+    covariance_with_prior,
 )
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.moments import (
-    CHUNK,
-    Moments,
-    Noise,
+    CHUNK_ROWS,
+    NoiseStd,
+    SecondMoments,
     excited_columns,
-    inverse_root,
     normal_equations,
     residual_covariance,
+    root_of_pseudo_inverse,
 )
 from drake_teleop.load.normal_equations import NormalEquations
 
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
 _MIN_RELATIVE_NOISE = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_NOISE_SHARE = 0.01
+_MIN_NOISE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
@@ -73,21 +73,23 @@ class BatchResult:
     equations: NormalEquations
 
 
-def _ordinary(record: Record, options: Options) -> Fit:
-    form = total_least_squares(record.moments, Noise(), np.ones(6), offsets=options.offsets)
-    return Fit(form, np.ones(6), record.moments, np.zeros(len(record.s), bool))
+def _fit_ordinary(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+    form = total_least_squares(record.moments, NoiseStd(), np.ones(6), offsets=options.offsets)
+    return EstimatorFit(form, np.ones(6), record.moments, np.zeros(len(record.s), bool))
 
 
-def _whitened(record: Record, options: Options) -> Fit:
-    return _fit_moments(record.moments, replace(options, noise=Noise(options.noise.wrench)), record)
+def _fit_whitened(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+    return _fit_moments(
+        record.moments, replace(options, noise=NoiseStd(options.noise.wrench)), record
+    )
 
 
-def _total(record: Record, options: Options) -> Fit:
+def _fit_total_least_squares(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
     return _fit_moments(record.moments, options, record)
 
 
-def _consistent(record: Record, options: Options) -> Fit:
-    fit = _robust(record, options)
+def _fit_consistent(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+    fit = _fit_robust(record, options)
     gram, right, theta = fit.form[:3]
     if theta[6] < 0.0:
         # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
@@ -96,20 +98,20 @@ def _consistent(record: Record, options: Options) -> Fit:
     return replace(fit, form=fit.form._replace(theta=theta))
 
 
-def _robust(record: Record, options: Options) -> Fit:
-    whole = _total(record, options)
+def _fit_robust(record: SampleRecord, options: EstimatorOptions) -> EstimatorFit:
+    whole = _fit_total_least_squares(record, options)
     n = len(record.s)
     if n < _MIN_SAMPLES_TO_REJECT:
         return whole
     # A subset of the samples is sufficient as a starting point.
-    form = _huber(record.every(max(1, n // _MAX_START_SAMPLES)), options)
+    form = _fit_huber(record.decimate(max(1, n // _MAX_START_SAMPLES)), options)
     rejected = np.zeros(n, bool)
     for _ in range(_MAX_FITS):
         previous = rejected
         rejected = _relative_residuals(record, form.theta, options.shared_noise) > _REJECTION_LIMIT
-        moments = Moments()
-        moments.add(*record.arrays, weights=~rejected)
-        if _std_growth(whole, moments) > _MAX_STD_GROWTH:
+        moments = SecondMoments()
+        moments.add(*record.wrench_and_motion, weights=~rejected)
+        if _std_growth_by_rejection(whole, moments) > _MAX_STD_GROWTH:
             return replace(whole, note=_NOTE_NOTHING_REJECTED)
         fit = _fit_moments(moments, options, record)
         form = fit.form
@@ -118,7 +120,7 @@ def _robust(record: Record, options: Options) -> Fit:
     return replace(fit, rejected=rejected)
 
 
-def _huber(record: Record, options: Options) -> NormalForm:
+def _fit_huber(record: SampleRecord, options: EstimatorOptions) -> NormalForm:
     moments, weights = record.moments, np.ones(len(record.s))
     for _ in range(_MAX_FITS):
         before = weights
@@ -127,19 +129,19 @@ def _huber(record: Record, options: Options) -> NormalForm:
         weights = np.minimum(1.0, _HUBER_LIMIT / np.maximum(distances, _HUBER_LIMIT))
         if np.abs(weights - before).max() < 0.01:
             break
-        moments = Moments()
-        moments.add(*record.arrays, weights=weights)
+        moments = SecondMoments()
+        moments.add(*record.wrench_and_motion, weights=weights)
     return form
 
 
-def _std_growth(whole: Fit, kept: Moments) -> float:
-    if kept.samples < _MIN_SAMPLES_TO_REJECT:
+def _std_growth_by_rejection(whole: EstimatorFit, kept: SecondMoments) -> float:
+    if kept.num_samples < _MIN_SAMPLES_TO_REJECT:
         return np.inf
-    used = excited_columns(whole.moments.mean)
+    used = excited_columns(whole.moments.mean_products)
     variances = []
     for moments in (whole.moments, kept):
-        gram = moments.samples * normal_equations(moments.mean, whole.form.weights)[0]
-        variances.append(np.sum(inverse_root(gram, used) ** 2, axis=1)[used])
+        gram = moments.num_samples * normal_equations(moments.mean_products, whole.form.weights)[0]
+        variances.append(np.sum(root_of_pseudo_inverse(gram, used) ** 2, axis=1)[used])
     return float(np.sqrt(np.max(variances[1] / variances[0])))
 
 
@@ -147,17 +149,17 @@ class Method(NamedTuple):
     """Batch estimator: name for results, and fitting function."""
 
     name: str
-    fit: Callable[[Record, Options], Fit]
+    fit: Callable[[SampleRecord, EstimatorOptions], EstimatorFit]
 
 
 METHODS = Registry(
     "estimator",
     {
-        "ordinary": Method("batch least squares", _ordinary),
-        "whitened": Method("whitened least squares", _whitened),
-        "robust": Method("robust least squares", _robust),
-        "total": Method("total least squares", _total),
-        "consistent": Method("physically consistent least squares", _consistent),
+        "ordinary": Method("batch least squares", _fit_ordinary),
+        "whitened": Method("whitened least squares", _fit_whitened),
+        "robust": Method("robust least squares", _fit_robust),
+        "total": Method("total least squares", _fit_total_least_squares),
+        "consistent": Method("physically consistent least squares", _fit_consistent),
     },
 )
 """Estimators by name."""
@@ -172,7 +174,7 @@ def identify_batch(
     alpha: ArrayLike,
     *,
     method: str = DEFAULT_METHOD,
-    noise: Noise | None = None,
+    noise: NoiseStd | None = None,
     offsets: bool = True,
     shared_noise: bool = False,
     resolution: tuple[float, float] = (0.0, 0.0),
@@ -191,7 +193,7 @@ def identify_batch(
         gain_std: relative standard deviation of the sensor's 36 gains.
     """
     METHODS.check(method, "method")
-    expect((Noise, type(None)), noise, "noise")
+    expect((NoiseStd, type(None)), noise, "noise")
     if not to_float("gain_std", gain_std) >= 0.0:
         raise DrakeTeleopError(f"{gain_std} is negative", where="gain_std", remedy="give 0 or more")
     if method != "consistent" and (prior, ellipsoid) != (None, None):
@@ -199,9 +201,9 @@ def identify_batch(
             f"{method!r} takes no prior and no ellipsoid", where="method", remedy="use consistent"
         )
     _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
-    record = Record(*rows)
+    record = SampleRecord(*rows)
     fit = METHODS[method].fit(
-        record, Options(noise or Noise(), offsets, shared_noise, prior, ellipsoid)
+        record, EstimatorOptions(noise or NoiseStd(), offsets, shared_noise, prior, ellipsoid)
     )
     equations = NormalEquations(
         np.diag(fit.form.weights) ** -0.5, resolution=resolution if shared_noise else None
@@ -209,16 +211,22 @@ def identify_batch(
     kept = ~fit.rejected
     equations.add(*(rows if kept.all() else [table[kept] for table in rows]))
     plain = equations.solve(delay_s)
-    theta, Z = fit.form.theta, fit.moments.mean
-    steps = residual_covariance(Moments.walk_covariance(noise or Noise()), theta)
-    white = white_covariance(plain.covariance, equations, fit)
-    covariance = covariance_of(white + walk_covariance(record, kept, fit, steps), fit.form, offsets)
+    theta, Z = fit.form.theta, fit.moments.mean_products
+    steps = residual_covariance(SecondMoments.walk_covariance(noise or NoiseStd()), theta)
+    white = covariance_for_white_noise(plain.covariance, equations, fit)
+    covariance = covariance_of_solution(
+        white + covariance_for_random_walks(record, kept, fit, steps), fit.form, offsets
+    )
     if gain_std > 0.0:
         known = np.isfinite(np.diag(covariance))
-        covariance += np.outer(known, known) * gain_std**2 * gain_covariance(fit, offsets)
+        covariance += (
+            np.outer(known, known) * gain_std**2 * covariance_for_gain_errors(fit, offsets)
+        )
     dominated = np.zeros(16, bool)
     if prior is not None:
-        covariance, dominated = with_prior(covariance, prior.information(plain.samples))
+        covariance, dominated = covariance_with_prior(
+            covariance, prior.inverse_covariance(plain.samples)
+        )
     deviations = np.sqrt(np.diag(covariance))
     identification = replace(
         plain,
@@ -233,15 +241,17 @@ def identify_batch(
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
 
 
-def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
-    noise, Z = options.noise, moments.mean
+def _fit_moments(
+    moments: SecondMoments, options: EstimatorOptions, record: SampleRecord
+) -> EstimatorFit:
+    noise, Z = options.noise, moments.mean_products
     if noise.wrench is not None:
         std = np.asarray(noise.wrench, np.float64)
     else:
         std = np.ones(6)
         floor = _MIN_RELATIVE_NOISE * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
         floor = np.where(floor > 0.0, floor, 1.0)
-        for known in (Noise(), noise):
+        for known in (NoiseStd(), noise):
             theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
             squares = np.diag(residual_covariance(Z, theta))
             motion = moments.noise_covariance(noise, np.zeros(6))
@@ -250,12 +260,14 @@ def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
                 squares, explained = (
                     x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
                 )
-            std = np.sqrt(np.maximum(squares - explained, _NOISE_SHARE * squares).clip(floor**2))
+            std = np.sqrt(
+                np.maximum(squares - explained, _MIN_NOISE_SHARE * squares).clip(floor**2)
+            )
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
-    return Fit(form, std, moments, np.zeros(len(record.s), bool))
+    return EstimatorFit(form, std, moments, np.zeros(len(record.s), bool))
 
 
-def _relative_residuals(record: Record, theta: Array, shared: bool) -> Array:
+def _relative_residuals(record: SampleRecord, theta: Array, shared: bool) -> Array:
     n = len(record.s)
     magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
     median = np.median(magnitudes, axis=0)
@@ -265,7 +277,7 @@ def _relative_residuals(record: Record, theta: Array, shared: bool) -> Array:
     scale = np.maximum(_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
-    for start in range(0, n, CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, n, CHUNK_ROWS):
+        part = slice(start, start + CHUNK_ROWS)
         out[part] = (np.abs(record.residual(theta, part)) / scale).max(axis=1)
     return out

@@ -16,12 +16,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior
 from drake_teleop.load.moments import (
-    Moments,
-    Noise,
+    NoiseStd,
+    SecondMoments,
     excited_columns,
-    inverse_root,
     normal_equations,
     residual_covariance,
+    root_of_pseudo_inverse,
 )
 from drake_teleop.load.regressor import non_contact_wrench
 
@@ -51,13 +51,13 @@ class NormalForm(NamedTuple):
 
 
 def total_least_squares(
-    moments: Moments, noise: Noise, wrench_noise: Array, *, offsets: bool = True
+    moments: SecondMoments, noise: NoiseStd, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
     """Return the load and offsets that allow for noise of the motion.
 
     `wrench_noise` (6,) [N, N m] are standard deviations; `offsets` False fixes the offsets at 0.
     """
-    Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
+    Z, Q = moments.mean_products, moments.noise_covariance(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:
         raise DrakeTeleopError(
             "the wrench is 0 throughout: the mass cannot be identified",
@@ -65,10 +65,10 @@ def total_least_squares(
             remedy="check that the sensor is connected and that its orientation changes",
         )
     W: Array = np.diag(wrench_noise**-2.0)
-    excess = _NOISE_DEVIATIONS * np.sqrt(2.0 / moments.samples)
+    excess = _NOISE_DEVIATIONS * np.sqrt(2.0 / moments.num_samples)
     previous, min_gain = np.zeros(16), excess / (1.0 + excess)
     for _ in range(_MAX_ITERATIONS):
-        form = _solve(Z, Q, W, offsets, min_gain)
+        form = _solve_compensated_equations(Z, Q, W, offsets, min_gain)
         change = np.linalg.norm(form.theta - previous)
         if not noise.motion.any() or change <= _THETA_TOLERANCE * np.linalg.norm(previous):
             break
@@ -77,17 +77,21 @@ def total_least_squares(
     return form
 
 
-def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> NormalForm:
+def _solve_compensated_equations(
+    Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float
+) -> NormalForm:
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
         right[:6] = 0.0
     compensation, _ = normal_equations(Q, W)
-    root = inverse_root(gram, excited_columns(Z))
+    root = root_of_pseudo_inverse(gram, excited_columns(Z))
     # In these coordinates G is the identity; nu is the noise share of each direction.
     nu, vectors = np.linalg.eigh(root.T @ compensation @ root)
     basis = root @ vectors
-    scale = _min_root(basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7]))
+    scale = _min_singular_noise_scale(
+        basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7])
+    )
     gain = 1.0 - scale * nu
     kept = gain > (min_gain if nu[-1] > 0.0 else 0.0)
     inverse = (basis[:, kept] / gain[kept]) @ basis[:, kept].T
@@ -107,27 +111,30 @@ def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> Norm
     )
 
 
-def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """Return the smallest noise scale at which the augmented normal equations are singular."""
+def _min_singular_noise_scale(right: Array, nu: Array, squares: float, noise: float) -> float:
 
-    def excess(ratio: float) -> float:
+    def determinant_condition(ratio: float) -> float:
         return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))
 
     highest = squares / noise
     if highest * nu[-1] >= 1.0:
         highest = (1.0 - _POLE_DISTANCE) / nu[-1]
-    if excess(0.0) <= 0.0:  # no residual
+    if determinant_condition(0.0) <= 0.0:  # no residual
         return 0.0
     from scipy.optimize import brentq  # 0.2 s, which a study with known loads saves
 
-    return highest if excess(highest) >= 0.0 else float(brentq(excess, 0.0, highest, rtol=1e-14))
+    return (
+        highest
+        if determinant_condition(highest) >= 0.0
+        else float(brentq(determinant_condition, 0.0, highest, rtol=1e-14))
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Options:
+class EstimatorOptions:
     """Options of a batch estimator, as for `identify_batch`."""
 
-    noise: Noise
+    noise: NoiseStd
     offsets: bool = True
     shared_noise: bool = False
     prior: Prior | None = None
@@ -135,7 +142,7 @@ class Options:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class SampleRecord:
     """Checked samples: wrench (N, 6), motion s, omega and alpha (N, 3)."""
 
     wrench: Array
@@ -144,29 +151,29 @@ class Record:
     alpha: Array
 
     @property
-    def arrays(self) -> tuple[Array, Array, Array, Array]:
+    def wrench_and_motion(self) -> tuple[Array, Array, Array, Array]:
         return self.wrench, self.s, self.omega, self.alpha
 
     @cached_property
-    def moments(self) -> Moments:
-        moments = Moments()
-        moments.add(*self.arrays)
+    def moments(self) -> SecondMoments:
+        moments = SecondMoments()
+        moments.add(*self.wrench_and_motion)
         return moments
 
-    def every(self, step: int) -> Record:
-        return Record(*(table[::step] for table in self.arrays))
+    def decimate(self, step: int) -> SampleRecord:
+        return SampleRecord(*(table[::step] for table in self.wrench_and_motion))
 
     def residual(self, theta: Array, part: slice) -> Array:
-        F, s, omega, alpha = (table[part] for table in self.arrays)
+        F, s, omega, alpha = (table[part] for table in self.wrench_and_motion)
         return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class EstimatorFit:
     """Result of an estimator: solution, noise (6,) [N, N m], rejected samples (N,), note."""
 
     form: NormalForm
     wrench_noise: Array
-    moments: Moments
+    moments: SecondMoments
     rejected: NDArray[np.bool_]
     note: str = ""

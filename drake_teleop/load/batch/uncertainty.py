@@ -11,25 +11,25 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.load.batch.total_least_squares import Fit, NormalForm, Record
+from drake_teleop.load.batch.total_least_squares import EstimatorFit, NormalForm, SampleRecord
 from drake_teleop.load.identification import (
-    PARAMETERS,
-    WORTH_STATING,
+    MAX_IDENTIFIED_DEVIATION,
+    PARAMETER_NAMES,
     Identification,
-    natural_scale,
+    natural_scales,
 )
 from drake_teleop.load.moments import (
-    CHUNK,
-    coefficients,
+    CHUNK_ROWS,
     excited_columns,
-    inverse_root,
     normal_equations,
+    regressor_coefficients,
+    root_of_pseudo_inverse,
 )
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
-_NORMAL_DEGREES = 1e6  # Student's t is then normal to six digits
-CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+_MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
+CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
 _UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
@@ -40,19 +40,19 @@ _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
 _NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
 
 
-def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
+def confidence_intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
     """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi]."""
     if not 0.0 < level < 1.0:
         raise DrakeTeleopError(
             f"{level} is not between 0 and 1", where="level", remedy="give, say, 0.95"
         )
-    degrees = np.minimum(load.degrees_of_freedom, _NORMAL_DEGREES)
+    degrees = np.minimum(load.degrees_of_freedom, _MAX_DEGREES_OF_FREEDOM)
     half = stdtrit(degrees, 0.5 + 0.5 * level) * load.standard_deviations
     theta = np.concatenate([load.offsets, load.phi])
     return theta - half, theta + half
 
 
-def prior_dominated(
+def is_prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
@@ -71,7 +71,7 @@ class Combination:
 
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
-        leading: index of the leading parameter in `PARAMETERS`.
+        leading: index of the leading parameter in `PARAMETER_NAMES`.
         share: standard deviation relative to the natural scale of the combination.
         words: the sum as text.
     """
@@ -104,11 +104,11 @@ class BaseParameters:
     slow_noise: tuple[str, ...]
 
     @property
-    def rank(self) -> int:
+    def num_combinations(self) -> int:
         return len(self.combinations)
 
-    def lines(self) -> list[str]:
-        lines = [f"{self.rank} of 16 combinations of offsets and load are determined"]
+    def text_lines(self) -> list[str]:
+        lines = [f"{self.num_combinations} of 16 combinations of offsets and load are determined"]
         if self.without_influence:
             names = ", ".join(self.without_influence)
             lines.append(f"without influence on this record: {names}")
@@ -116,7 +116,7 @@ class BaseParameters:
             f"only together: {c}" for c in self.combinations if np.count_nonzero(c.coefficients) > 1
         ]
         for c in self.directions:
-            if np.count_nonzero(c.coefficients) == 1 or c.share > WORTH_STATING:
+            if np.count_nonzero(c.coefficients) == 1 or c.share > MAX_IDENTIFIED_DEVIATION:
                 percentage = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
                 lines.append(f"weak: {c} ({percentage} the natural scale of the load)")
             else:
@@ -130,10 +130,10 @@ class BaseParameters:
 def base_parameters(equations: NormalEquations) -> BaseParameters:
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
-    covariance, natural = equations.covariance(), natural_scale(load.phi)
-    unexcited = equations.unexcited
+    covariance, natural = equations.covariance(), natural_scales(load.phi)
+    unexcited = equations.unexcited_directions
 
-    def combination(coefficients: Array, leading: int) -> Combination:
+    def scaled_combination(coefficients: Array, leading: int) -> Combination:
         c = coefficients / coefficients[leading]
         deviation = float(np.sqrt(max(0.0, c @ covariance @ c)))
         size = float(np.linalg.norm(c * natural))
@@ -159,7 +159,7 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
         for column, j in enumerate(others):
             if dependence[row, column] != 0.0:
                 c[j] = dependence[row, column] * scale[i] / scale[j]
-        combinations.append(combination(c, int(i)))
+        combinations.append(scaled_combination(c, int(i)))
     combinations.sort(key=lambda c: c.leading)
 
     # Principal directions of determined but not identified parameters.
@@ -169,20 +169,20 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     for direction in np.linalg.eigh(scaled)[1].T:
         c = np.zeros(16)
         c[weak] = direction / natural[weak]
-        directions.append(combination(c, int(weak[np.argmax(np.abs(direction))])))
-    names = tuple(PARAMETERS[i] for i in np.flatnonzero(unexcited))
-    slow = tuple(CHANNELS[i] for i in np.flatnonzero(equations.slow_noise()))
+        directions.append(scaled_combination(c, int(weak[np.argmax(np.abs(direction))])))
+    names = tuple(PARAMETER_NAMES[i] for i in np.flatnonzero(unexcited))
+    slow = tuple(CHANNEL_NAMES[i] for i in np.flatnonzero(equations.has_slow_noise()))
     return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
 def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     weights = weights / weights.max()
-    text = PARAMETERS[leading]
+    text = PARAMETER_NAMES[leading]
     for i in np.flatnonzero(weights >= _NUMBER_SHARE):
         if i != leading:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
-            text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETERS[i]}"
+            text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETER_NAMES[i]}"
     small = (weights < _NUMBER_SHARE) & (weights >= _ELLIPSIS_SHARE)
     return text + " + ..." if small.any() else text
 
@@ -191,7 +191,7 @@ TORQUE_ARM_M = 0.06
 """Length that relates gain errors of forces to those of torques [m]."""
 
 
-def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
+def covariance_with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the covariance (16, 16) of data and prior; (16,) True where the prior dominates."""
     determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
     used = determined | (np.arange(16) >= 6)
@@ -208,32 +208,36 @@ def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np
     posterior[used_block] = inverse * np.outer(scale, scale)[used_block]
     prior_share = np.zeros(16)
     prior_share[used] = 1.0 - np.diag(inverse @ data[used_block])
-    return posterior, prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
+    return posterior, is_prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
 
 
-def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
+def covariance_for_white_noise(
+    plain: Array, equations: NormalEquations, fit: EstimatorFit
+) -> Array:
     """Return the covariance (16, 16) of a fit with noise that is correlated between channels."""
-    W, Z = fit.form.weights, fit.moments.mean
+    W, Z = fit.form.weights, fit.moments.mean_products
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
         return plain
     scale = np.sqrt(equations.long_run_variances(fit.form.theta)[0] / np.diag(predicted))
     of_sums = W @ (predicted * np.outer(scale, scale)) @ W
     inverse = _inverse_gram(fit)
-    covariance = inverse @ (fit.moments.samples * normal_equations(Z, of_sums)[0]) @ inverse
+    covariance = inverse @ (fit.moments.num_samples * normal_equations(Z, of_sums)[0]) @ inverse
     unknown = np.isinf(np.diag(plain))
     covariance[unknown], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
     return covariance
 
 
-def _inverse_gram(fit: Fit) -> Array:
-    Z = fit.moments.mean
-    root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
-    return np.asarray(root @ root.T / fit.moments.samples)
+def _inverse_gram(fit: EstimatorFit) -> Array:
+    Z = fit.moments.mean_products
+    root = root_of_pseudo_inverse(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
+    return np.asarray(root @ root.T / fit.moments.num_samples)
 
 
-def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
+def covariance_for_random_walks(
+    record: SampleRecord, kept: NDArray[np.bool_], fit: EstimatorFit, steps: Array
+) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
     `steps` (6, 6) is the covariance of the wrench change per sample.
@@ -241,13 +245,13 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
     covariance = np.zeros((16, 16))
     if not steps.any():
         return covariance
-    backwards, used = record.every(-1), kept[::-1]
+    backwards, used = record.decimate(-1), kept[::-1]
     after = np.zeros((6, 16))
-    for start in range(0, len(used), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(used), CHUNK_ROWS):
+        part = slice(start, start + CHUNK_ROWS)
         rows = np.zeros((len(used[part]), 6, 16))
         rows[:, np.arange(6), np.arange(6)] = 1.0
-        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
+        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.wrench_and_motion[1:]))
         rows = fit.form.weights @ (rows * used[part, None, None])
         sums = after + np.cumsum(rows, axis=0)
         after = sums[-1]
@@ -257,7 +261,7 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
     return inverse @ covariance @ inverse
 
 
-def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
+def parameter_errors_by_gains(products: Array, W: Array, inverse: Array) -> Array:
     """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains."""
     right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
     length = np.repeat([1.0, TORQUE_ARM_M], 3)
@@ -265,17 +269,17 @@ def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
     return np.asarray(effect.reshape(len(inverse), 36))
 
 
-def gain_covariance(fit: Fit, offsets: bool) -> Array:
+def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] for gain errors of standard deviation 1."""
-    Z, W = fit.moments.mean, fit.form.weights
+    Z, W = fit.moments.mean_products, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
-    root = inverse_root(normal_equations(Z, W)[0], used)
-    products = (coefficients() @ Z)[:, :, 1:7]
-    effects = fit.form.transfer @ gain_effects(products[None], W[None], root @ root.T)
+    root = root_of_pseudo_inverse(normal_equations(Z, W)[0], used)
+    products = (regressor_coefficients() @ Z)[:, :, 1:7]
+    effects = fit.form.transfer @ parameter_errors_by_gains(products[None], W[None], root @ root.T)
     return np.asarray(effects @ effects.T)
 
 
-def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:
+def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Array:
     """Return the covariance (16, 16) of the solution `form`, from that of least squares."""
     unknown = np.isinf(np.diag(plain))
     covariance = np.where(unknown[:, None] | unknown, 0.0, plain)

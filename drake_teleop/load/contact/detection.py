@@ -19,37 +19,43 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, positive_array
 from drake_teleop.load.contact.noise_floor import (
-    HELD_A,
-    HELD_ALPHA,
-    LENGTHS,
-    WINDOW,
+    HELD_ACCELERATION_INDEX,
+    HELD_ALPHA_INDEX,
+    MAX_SUMMED_SAMPLES,
+    NUM_SUM_LENGTHS,
+    DetectorSamples,
     NoiseFloor,
-    Samples,
-    checked_samples,
-    hold_peaks,
-    parameter_variance,
+    check_samples,
+    hold_acceleration_peaks,
+    noise_std_into,
     statistic_index,
-    write_sigmas,
+    wrench_variance_by_parameters_into,
 )
 
 # Indices into the memory: sample count; held |a|^2 and |alpha|^2 (in `noise_floor`); flag; samples
 # below `leave`; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6); sum of all
 # e (6); ring of its last WINDOW values.
-COUNT, FLAG, QUIET_FOR, FIRST_STATISTIC = 0, 3, 4, 5
-Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
-SIZE = RING + 6 * WINDOW
-"""Length of the memory of `detection_update`."""
+SAMPLE_COUNT_INDEX, FLAG_INDEX, QUIET_SAMPLES_INDEX, STATISTICS_START = 0, 3, 4, 5
+NORMALIZED_WRENCH_START, MEAN_START, CUMULATIVE_SUM_START, TOTAL_SUM_START, RING_BUFFER_START = (
+    8,
+    14,
+    20,
+    26,
+    32,
+)
+MEMORY_SIZE = RING_BUFFER_START + 6 * MAX_SUMMED_SAMPLES
+"""Length of the memory of `update_statistics`."""
 DEFAULT_SLACK = 1.0
 """Default slack of the cumulative sum [standard deviations]. In white noise, half of the smallest
 shift to be detected is best; this value tolerates lasting errors of the load."""
 MAX_NOISE_LEVEL = 6.2
 """Level that normal noise reaches once in a million samples."""
-END_LEVEL = 0.7 * MAX_NOISE_LEVEL
+CONTACT_END_LEVEL = 0.7 * MAX_NOISE_LEVEL
 """Level below which contact may end."""
 
 
 @njit(cache=True)
-def detection_update(
+def update_statistics(
     memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
 ):
     """Process one sample and write level, cusum and glr to memory[5:8].
@@ -58,120 +64,134 @@ def detection_update(
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
-    hold_peaks(memory, acceleration, alpha, fade)
-    parameter_variance(s, omega, alpha, P, V, scaled)
+    hold_acceleration_peaks(memory, acceleration, alpha, fade)
+    wrench_variance_by_parameters_into(s, omega, alpha, P, V, scaled)
     for c in range(6):
-        moving = growth[c, 0] * memory[HELD_A] + growth[c, 1] * memory[HELD_ALPHA]
+        moving = (
+            growth[c, 0] * memory[HELD_ACCELERATION_INDEX] + growth[c, 1] * memory[HELD_ALPHA_INDEX]
+        )
         variance = variances[c] + max(scaled[c], 0.0) + moving
-        scaled[c] = (contact[c] - memory[MEAN + c]) / math.sqrt(variance)
-    count = int(memory[COUNT])
+        scaled[c] = (contact[c] - memory[MEAN_START + c]) / math.sqrt(variance)
+    count = int(memory[SAMPLE_COUNT_INDEX])
     level, length = 0.0, 0.0
     for i in range(6):
         z = 0.0
         for j in range(i + 1):
             z += root[i, j] * scaled[j]
         # The first sample has no predecessor.
-        e = z if count == 0 else (z - rho[i] * memory[Z + i]) / math.sqrt(1.0 - rho[i] * rho[i])
-        memory[Z + i] = z
+        e = (
+            z
+            if count == 0
+            else (z - rho[i] * memory[NORMALIZED_WRENCH_START + i])
+            / math.sqrt(1.0 - rho[i] * rho[i])
+        )
+        memory[NORMALIZED_WRENCH_START + i] = z
         level += z * z
-        memory[SUM + i] += e
-        length += memory[SUM + i] * memory[SUM + i]
-        memory[TOTAL + i] += e
+        memory[CUMULATIVE_SUM_START + i] += e
+        length += memory[CUMULATIVE_SUM_START + i] * memory[CUMULATIVE_SUM_START + i]
+        memory[TOTAL_SUM_START + i] += e
     level, length = math.sqrt(level), math.sqrt(length)
     if level < quiet:
         for c in range(6):
-            memory[MEAN + c] += following * (contact[c] - memory[MEAN + c])
+            memory[MEAN_START + c] += following * (contact[c] - memory[MEAN_START + c])
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
     for i in range(6):
-        memory[SUM + i] *= shrink
+        memory[CUMULATIVE_SUM_START + i] *= shrink
     # The sum before the first sample is zero, as is the initial ring.
-    here = RING + 6 * (count % WINDOW)
+    here = RING_BUFFER_START + 6 * (count % MAX_SUMMED_SAMPLES)
     best, n = 0.0, 1
-    for m in range(LENGTHS):
+    for m in range(NUM_SUM_LENGTHS):
         if n > count + 1:
             break
-        before = RING + 6 * ((count + WINDOW - n) % WINDOW)
+        before = RING_BUFFER_START + 6 * ((count + MAX_SUMMED_SAMPLES - n) % MAX_SUMMED_SAMPLES)
         total = 0.0
         for i in range(6):
-            difference = memory[TOTAL + i] - memory[before + i]
+            difference = memory[TOTAL_SUM_START + i] - memory[before + i]
             total += difference * difference
         best = max(best, total / (n * widths[m] * widths[m]))
         n *= 2
     for i in range(6):
-        memory[here + i] = memory[TOTAL + i]
-    memory[COUNT] += 1.0
-    memory[FIRST_STATISTIC] = level
-    memory[FIRST_STATISTIC + 1] = length * shrink
-    memory[FIRST_STATISTIC + 2] = math.sqrt(best)
+        memory[here + i] = memory[TOTAL_SUM_START + i]
+    memory[SAMPLE_COUNT_INDEX] += 1.0
+    memory[STATISTICS_START] = level
+    memory[STATISTICS_START + 1] = length * shrink
+    memory[STATISTICS_START + 2] = math.sqrt(best)
 
 
 @njit(cache=True)
-def _statistics(rows, parameters, slack, following, quiet, out):
+def _statistics_of_rows(rows, parameters, slack, following, quiet, out):
     contact, s, omega, alpha, acceleration = rows
-    memory = np.zeros(SIZE)
+    memory = np.zeros(MEMORY_SIZE)
     for k in range(contact.shape[0]):
         sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
-        detection_update(memory, *sample, parameters, slack, following, quiet)
-        out[k] = memory[FIRST_STATISTIC : FIRST_STATISTIC + 3]
+        update_statistics(memory, *sample, parameters, slack, following, quiet)
+        out[k] = memory[STATISTICS_START : STATISTICS_START + 3]
 
 
-def statistics(
+def statistics_of_log(
     floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK, following: float = 0.0
 ) -> Array:
     """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations."""
-    rows = checked_samples(*samples)
+    rows = check_samples(*samples)
     out = np.empty((len(rows[0]), 3))
-    sums = float(positive_array("slack", slack)), float(following), END_LEVEL
-    _statistics(tuple(rows), floor.parameters, *sums, out)
+    sums = float(positive_array("slack", slack)), float(following), CONTACT_END_LEVEL
+    _statistics_of_rows(tuple(rows), floor.compiled_parameters, *sums, out)
     return out
 
 
 @njit(cache=True)
-def _last_sum(memory, hold, widths):
+def _sum_of_last_innovations(memory, hold, widths):
     m = 0
-    while 2 << m <= min(hold, WINDOW // 2):
+    while 2 << m <= min(hold, MAX_SUMMED_SAMPLES // 2):
         m += 1
     # Sum before that window; zero if there was no sample yet.
-    before = RING + 6 * ((int(memory[COUNT]) + WINDOW - 1 - (1 << m)) % WINDOW)
+    before = RING_BUFFER_START + 6 * (
+        (int(memory[SAMPLE_COUNT_INDEX]) + MAX_SUMMED_SAMPLES - 1 - (1 << m)) % MAX_SUMMED_SAMPLES
+    )
     total = 0.0
     for i in range(6):
-        difference = memory[TOTAL + i] - memory[before + i]
+        difference = memory[TOTAL_SUM_START + i] - memory[before + i]
         total += difference * difference
     return math.sqrt(total / (1 << m)) / widths[m]
 
 
 @njit(cache=True)
-def hysteresis_update(memory, statistic, enter, leave, hold, widths):
-    """Return whether there is contact, after `detection_update` of the same memory."""
-    if memory[FLAG] == 0.0:
-        if memory[FIRST_STATISTIC + statistic] >= enter:
-            memory[FLAG], memory[QUIET_FOR] = 1.0, 0.0
+def update_hysteresis(memory, statistic, enter, leave, hold, widths):
+    """Return whether there is contact, after `update_statistics` of the same memory."""
+    if memory[FLAG_INDEX] == 0.0:
+        if memory[STATISTICS_START + statistic] >= enter:
+            memory[FLAG_INDEX], memory[QUIET_SAMPLES_INDEX] = 1.0, 0.0
     else:
-        memory[QUIET_FOR] = memory[QUIET_FOR] + 1.0 if memory[FIRST_STATISTIC] < leave else 0.0
-        if memory[QUIET_FOR] > hold and _last_sum(memory, hold, widths) < leave:
+        memory[QUIET_SAMPLES_INDEX] = (
+            memory[QUIET_SAMPLES_INDEX] + 1.0 if memory[STATISTICS_START] < leave else 0.0
+        )
+        if (
+            memory[QUIET_SAMPLES_INDEX] > hold
+            and _sum_of_last_innovations(memory, hold, widths) < leave
+        ):
             # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
-            memory[FLAG] = 0.0
-            memory[SUM:] = 0.0
-            memory[COUNT] = 1.0
-    return memory[FLAG] != 0.0
+            memory[FLAG_INDEX] = 0.0
+            memory[CUMULATIVE_SUM_START:] = 0.0
+            memory[SAMPLE_COUNT_INDEX] = 1.0
+    return memory[FLAG_INDEX] != 0.0
 
 
 @njit(cache=True)
-def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
+def update_contact_flag(memory, contact, s, omega, alpha, acceleration, parameters, decision):
     """Process one sample and return whether there is contact."""
     slack, following, statistic, enter, leave, hold = decision
-    detection_update(
+    update_statistics(
         memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
     )
-    return hysteresis_update(memory, statistic, enter, leave, hold, parameters[5])
+    return update_hysteresis(memory, statistic, enter, leave, hold, parameters[5])
 
 
 @njit(cache=True)
-def _flags(memory, rows, settings, out):
+def _contact_flags_of_rows(memory, rows, settings, out):
     contact, s, omega, alpha, acceleration = rows
     for k in range(contact.shape[0]):
         sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
-        out[k] = flag_update(memory, *sample, *settings)
+        out[k] = update_contact_flag(memory, *sample, *settings)
 
 
 class ContactDetector:
@@ -192,7 +212,7 @@ class ContactDetector:
         threshold: float,
         *,
         statistic: str = "cusum",
-        leave: float = END_LEVEL,
+        leave: float = CONTACT_END_LEVEL,
         hold: int = 20,
         slack: float = DEFAULT_SLACK,
         following: float = 0.0,
@@ -210,28 +230,28 @@ class ContactDetector:
             )
         sums = float(positive_array("slack", slack)), float(following)
         decision = column, enter, exit_level, int(hold)
-        #: Last arguments of `flag_update`.
-        self.settings = (floor.parameters, (*sums, *decision))
+        #: Last arguments of `update_contact_flag`.
+        self.settings = (floor.compiled_parameters, (*sums, *decision))
         self._memory = self.initial_memory()
 
     @staticmethod
     def initial_memory() -> Array:
-        return np.zeros(SIZE)
+        return np.zeros(MEMORY_SIZE)
 
     def update(self, *sample: ArrayLike) -> bool:
-        named = zip(Samples._fields, sample, strict=True)
+        named = zip(DetectorSamples._fields, sample, strict=True)
         arrays = [finite_array(name, x, 6 if name == "contact" else 3) for name, x in named]
-        return bool(flag_update(self._memory, *arrays, *self.settings))
+        return bool(update_contact_flag(self._memory, *arrays, *self.settings))
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
         """Process N samples of a log; return (N,) True for contact."""
-        rows = checked_samples(*samples)
+        rows = check_samples(*samples)
         out = np.empty(len(rows[0]), np.bool_)
-        _flags(self._memory, tuple(rows), self.settings, out)
+        _contact_flags_of_rows(self._memory, tuple(rows), self.settings, out)
         return out
 
 
-def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
+def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
     """Return direction, point nearest to So and pitch [m] of the central axis of wrenches in S."""
     w = finite_array("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
@@ -244,7 +264,7 @@ def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
 # Lower limit of a noise floor [N, N m], as in `logs.contact`.
 _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
 _MAX_FITS, _FIT_TOLERANCE = 20, 1e-4
-_MAX_RHO, _MIN_WIDTH, _RARE_SHARE = 0.999, 0.1, 1e-3
+_MAX_LAG_ONE_CORRELATION, _MIN_WIDTH, _RARE_SHARE = 0.999, 0.1, 1e-3
 
 
 def fit_noise_floor(
@@ -259,7 +279,7 @@ def fit_noise_floor(
 ) -> NoiseFloor:
     from scipy.optimize import nnls
 
-    rows = checked_samples(contact, s, omega, alpha, acceleration)
+    rows = check_samples(contact, s, omega, alpha, acceleration)
     if len(rows[0]) < 100:
         raise DrakeTeleopError(
             f"{len(rows[0])} samples are too few for a noise floor",
@@ -268,11 +288,11 @@ def fit_noise_floor(
         )
     P = finite_array("covariance", covariance, 16, 16)
     parameter_std, no_growth = np.empty_like(rows[0]), np.zeros((6, 2))
-    write_sigmas(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)
+    noise_std_into(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)
     held = np.empty((2, *rows[0].shape))
     for unit, out in zip(np.eye(2), held, strict=True):
         growth = np.tile(unit, (6, 1))
-        write_sigmas(*rows[1:], np.zeros(6), np.zeros((16, 16)), growth, fade, out)
+        noise_std_into(*rows[1:], np.zeros(6), np.zeros((16, 16)), growth, fade, out)
     fitted = np.zeros((6, 3))
     for c in range(6):
         square, explained = rows[0][:, c] ** 2, parameter_std[:, c] ** 2
@@ -290,7 +310,7 @@ def fit_noise_floor(
     floor = NoiseFloor(
         np.sqrt(fitted[:, 0]), P, np.sqrt(fitted[:, 1:]), np.eye(6), np.zeros(6), fade=fade
     )
-    scaled = rows[0] / floor.sigma(*rows[1:])
+    scaled = rows[0] / floor.noise_std_along(*rows[1:])
     deviations = np.sqrt(np.mean(scaled**2, axis=0))
     scales = np.maximum(deviations, 1e-6)
     power = scaled.T @ scaled / len(scaled) / np.outer(scales, scales)
@@ -299,10 +319,10 @@ def fit_noise_floor(
     np.fill_diagonal(correlation, 1.0)
     z = scaled @ np.linalg.inv(np.linalg.cholesky(correlation)).T
     energy = np.maximum(np.sum(z**2, axis=0), 1e-12)
-    rho = np.clip(np.sum(z[1:] * z[:-1], axis=0) / energy, 0.0, _MAX_RHO)
+    rho = np.clip(np.sum(z[1:] * z[:-1], axis=0) / energy, 0.0, _MAX_LAG_ONE_CORRELATION)
     e = (z[1:] - rho * z[:-1]) / np.sqrt(1.0 - rho**2)
     sums = np.cumsum(np.vstack([np.zeros(6), e]), axis=0)
-    lengths = [min(2**m, len(e)) for m in range(LENGTHS)]
+    lengths = [min(2**m, len(e)) for m in range(NUM_SUM_LENGTHS)]
     squares = [np.sum((sums[n:] - sums[:-n]) ** 2, axis=1) / n for n in lengths]
     power = np.array([square.mean() for square in squares]) / 6.0
     rare = np.array([np.quantile(square, 1.0 - _RARE_SHARE) for square in squares])
@@ -310,4 +330,4 @@ def fit_noise_floor(
     rare /= max(rare[0], 1e-12)
     widths = np.sqrt(np.maximum(np.maximum(power, rare), _MIN_WIDTH**2))
     floor = replace(floor, correlation=correlation, rho=rho, widths=widths)
-    return replace(floor, reached=statistics(floor, *rows).max(axis=0))
+    return replace(floor, reached=statistics_of_log(floor, *rows).max(axis=0))

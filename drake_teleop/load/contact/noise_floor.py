@@ -17,34 +17,37 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, finite_array, positive_array
-from drake_teleop.load.identification import natural_scale
+from drake_teleop.load.identification import natural_scales
 from drake_teleop.load.regressor import regressor_into
 
-WINDOW = 128
+MAX_SUMMED_SAMPLES = 128
 """Longest window of the likelihood ratio [samples], a power of two."""
-LENGTHS = WINDOW.bit_length()
+NUM_SUM_LENGTHS = MAX_SUMMED_SAMPLES.bit_length()
 """Number of windows: 1, 2, 4 ... WINDOW samples."""
 
-HELD_A, HELD_ALPHA = 1, 2  # indices of held squares in the memory of a detector
+HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = (
+    1,
+    2,
+)  # indices of held squares in the memory of a detector
 
-STATISTICS = ("level", "cusum", "glr")
+STATISTIC_NAMES = ("level", "cusum", "glr")
 """Names of the statistics: columns of `statistics`, and choices of `ContactDetector`."""
-MARGIN = 1.25
+THRESHOLD_MARGIN = 1.25
 """Ratio of threshold to the largest value in free motion. Normal noise exceeds it hundreds of times
 less often than that value, which is reached about once in a record of the same length."""
 
 
 def statistic_index(statistic: str) -> int:
-    if statistic not in STATISTICS:
+    if statistic not in STATISTIC_NAMES:
         raise DrakeTeleopError(
             f"{statistic!r} is not a statistic",
             where="statistic",
-            remedy=f"give one of {', '.join(STATISTICS)}",
+            remedy=f"give one of {', '.join(STATISTIC_NAMES)}",
         )
-    return STATISTICS.index(statistic)
+    return STATISTIC_NAMES.index(statistic)
 
 
-class Samples(NamedTuple):
+class DetectorSamples(NamedTuple):
     """Contact wrench and motion of N consecutive samples.
 
     Attributes:
@@ -59,8 +62,8 @@ class Samples(NamedTuple):
     alpha: Array
     acceleration: Array
 
-    def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
-        return Samples(*(x[rows] for x in self))
+    def select_rows(self, rows: slice | NDArray[np.bool_]) -> DetectorSamples:
+        return DetectorSamples(*(x[rows] for x in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +86,7 @@ class NoiseFloor:
     per_acceleration: Array
     correlation: Array
     rho: Array
-    widths: Array = field(default_factory=lambda: np.ones(LENGTHS))
+    widths: Array = field(default_factory=lambda: np.ones(NUM_SUM_LENGTHS))
     fade: float = 0.0
     reached: Array = field(default_factory=lambda: np.zeros(3))
 
@@ -101,7 +104,7 @@ class NoiseFloor:
                 where="rho",
                 remedy="call fit_noise_floor",
             )
-        positive_array("widths", self.widths, LENGTHS)
+        positive_array("widths", self.widths, NUM_SUM_LENGTHS)
         finite_array("reached", self.reached, 3)
         if not 0.0 <= self.fade < 1.0:
             raise DrakeTeleopError(
@@ -114,40 +117,42 @@ class NoiseFloor:
                 "is not positive definite", where="correlation", remedy="call fit_noise_floor"
             )
 
-    def threshold(self, statistic: str, margin: float = MARGIN) -> float:
+    def threshold(self, statistic: str, margin: float = THRESHOLD_MARGIN) -> float:
         """Return a contact threshold: `margin` times the largest statistic in free motion."""
         return margin * float(
             positive_array("reached", self.reached, 3)[statistic_index(statistic)]
         )
 
     @property
-    def parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
+    def compiled_parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
         """Arguments of compiled functions: n^2, P, k^2, l^2, decorrelation, rho, widths, fade."""
         root = np.linalg.inv(np.linalg.cholesky(self.correlation))
         variances, growth = self.noise**2, self.per_acceleration**2
         return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
 
-    def sigma(self, *motion: ArrayLike) -> Array:
+    def noise_std_along(self, *motion: ArrayLike) -> Array:
         """Return the noise sigma (N, 6) [N, N m] along a free motion."""
-        rows = checked_samples(*motion)
+        rows = check_samples(*motion)
         out = np.empty((len(rows[0]), 6))
-        write_sigmas(*rows, *self.parameters[:3], self.fade, out)
+        noise_std_into(*rows, *self.compiled_parameters[:3], self.fade, out)
         return out
 
 
 @njit(cache=True)
-def _square(x):
+def _squared_norm(x):
     return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
 
 
 @njit(cache=True)
-def hold_peaks(memory, acceleration, alpha, fade):
-    memory[HELD_A] = max(_square(acceleration), fade * memory[HELD_A])
-    memory[HELD_ALPHA] = max(_square(alpha), fade * memory[HELD_ALPHA])
+def hold_acceleration_peaks(memory, acceleration, alpha, fade):
+    memory[HELD_ACCELERATION_INDEX] = max(
+        _squared_norm(acceleration), fade * memory[HELD_ACCELERATION_INDEX]
+    )
+    memory[HELD_ALPHA_INDEX] = max(_squared_norm(alpha), fade * memory[HELD_ALPHA_INDEX])
 
 
 @njit(cache=True)
-def parameter_variance(s, omega, alpha, P, V, out):
+def wrench_variance_by_parameters_into(s, omega, alpha, P, V, out):
     """Write the wrench variances (6,) due to uncertain [offsets; phi] into `out`."""
     regressor_into(s, omega, alpha, V)
     for c in range(6):
@@ -163,28 +168,31 @@ def parameter_variance(s, omega, alpha, P, V, out):
 
 
 @njit(cache=True)
-def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out):
+def noise_std_into(s, omega, alpha, acceleration, variances, P, growth, fade, out):
     """Write the noise sigma (N, 6) of a record's contact wrench into `out`."""
     memory, V = np.zeros(3), np.empty((6, 10))
     for k in range(s.shape[0]):
-        hold_peaks(memory, acceleration[k], alpha[k], fade)
-        parameter_variance(s[k], omega[k], alpha[k], P, V, out[k])
+        hold_acceleration_peaks(memory, acceleration[k], alpha[k], fade)
+        wrench_variance_by_parameters_into(s[k], omega[k], alpha[k], P, V, out[k])
         for c in range(6):
-            moving = growth[c, 0] * memory[HELD_A] + growth[c, 1] * memory[HELD_ALPHA]
+            moving = (
+                growth[c, 0] * memory[HELD_ACCELERATION_INDEX]
+                + growth[c, 1] * memory[HELD_ALPHA_INDEX]
+            )
             out[k, c] = math.sqrt(variances[c] + max(out[k, c], 0.0) + moving)
 
 
-def checked_samples(*arrays: ArrayLike) -> list[Array]:
-    named = zip(Samples._fields[-len(arrays) :], arrays, strict=True)
+def check_samples(*arrays: ArrayLike) -> list[Array]:
+    named = zip(DetectorSamples._fields[-len(arrays) :], arrays, strict=True)
     return broadcast_to_rows(**{name: (x, 6 if name == "contact" else 3) for name, x in named})[1]
 
 
-def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
+def limit_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], limited to natural scales.
 
     `tared` means that offsets are from the same record: their variance is 0.
     """
-    P, natural = covariance.copy(), natural_scale(phi)
+    P, natural = covariance.copy(), natural_scales(phi)
     # Undetermined offsets must have been tared; otherwise the elimination is useless.
     undetermined = ~(np.diag(P) <= natural**2)
     P[undetermined, :] = P[:, undetermined] = 0.0

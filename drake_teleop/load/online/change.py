@@ -25,32 +25,32 @@ from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    SPECIFIC_FORCE,
-    WRENCH_AND_MOTION,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH_AND_MOTION,
     non_contact_wrench_into,
     regressor_into,
 )
 
-STATES = ("known", "disturbed", "changed", "identified")
+STATE_NAMES = ("known", "disturbed", "changed", "identified")
 """States of the monitor, by index."""
-KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
+STATE_KNOWN, STATE_DISTURBED, STATE_CHANGED, STATE_IDENTIFIED = range(4)
 
-BLOCK_S, WINDOW_S, HOLD_S, MODEL_ERROR_S = 0.016, 2.0, 0.2, 0.3
+BLOCK_DURATION_S, ESTIMATE_WINDOW_S, HOLD_S, MODEL_ERROR_S = 0.016, 2.0, 0.2, 0.3
 """Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
 error."""
-DEFAULT_BOUND = 0.0025
+MAX_RELATIVE_MASS_STD = 0.0025
 """Default of `bound`: four standard deviations are 1 % of the change of mass."""
-OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
+OFFSET_DRIFT_STD = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
 
 # Standard deviations of a grasped or released object [kg, kg m, kg m^2].
-OBJECT_STD = PRIOR_STD[6:]
+OBJECT_PRIOR_STD = PRIOR_STD[6:]
 # Cumulative sum of the blocks' chi-squared (six degrees of freedom): slack, alarm, and return to
 # the known load. With a slack of twice the mean, noise reaches the alarm once in 1e10 blocks; five
 # blocks of noise reach the return limit.
-_SLACK, _ALARM, _RETURN = 12.0, 60.0, -30.0
+_CHI_SQUARED_SLACK, _ALARM_SUM, _RETURN_TO_KNOWN_SUM = 12.0, 60.0, -30.0
 # Factor of the bound for first moments relative to that of the mass, and smallest size [m].
 _MOMENT_FACTOR, _MIN_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
@@ -58,19 +58,37 @@ _IMPOSSIBLE_DEVIATIONS = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
-_STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _RETURN_SUM, _AGE, _START, _NEW_COUNT, _POWER = range(10)
-_RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 10, 16, 22, 28, 37, 97
-_WATCH, _NEW = _KNOWN + 272, _KNOWN + 544
+(
+    _STATE_INDEX,
+    _BASE_STATE_INDEX,
+    _IN_BLOCK,
+    _SAMPLES,
+    _SUM,
+    _RETURN_SUM,
+    _ESTIMATE_AGE_INDEX,
+    _START,
+    _NEW_COUNT,
+    _POWER,
+) = range(10)
+_RESIDUAL, _SQUARES, _WRENCH, _MOTION, _REGRESSOR_START, _KNOWN_FILTER_START = (
+    10,
+    16,
+    22,
+    28,
+    37,
+    97,
+)
+_MONITOR_FILTER_START, _NEW_FILTER_START = _KNOWN_FILTER_START + 272, _KNOWN_FILTER_START + 544
 
-SIZE = _KNOWN + 816
-"""Length of the memory of `change_update`."""
+MEMORY_SIZE = _KNOWN_FILTER_START + 816
+"""Length of the memory of `update_change_detector`."""
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
 _RESOLUTION = 1e-10
 
 
 @njit(cache=True)
-def whitening(motion, phi, noise, model_var, n):
+def whitening_matrix(motion, phi, noise, model_var, n):
     """Return a matrix (6, 6) that maps the wrench noise of a block mean to unit covariance."""
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
@@ -139,35 +157,37 @@ def update_estimate(estimate, V, wrench, root):
 
 @njit(cache=True)
 def _update_filter(memory, place, block, noise):
-    """Update a filter by a block; return chi-squared of its innovation."""
     phi = memory[place + 6 : place + 16].copy()
-    wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
-    V = memory[_V:_KNOWN].reshape(6, 10)
+    wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_REGRESSOR_START]
+    V = memory[_REGRESSOR_START:_KNOWN_FILTER_START].reshape(6, 10)
     before = memory[place : place + 272].copy()
-    chi = update_estimate(before, V, wrench, whitening(motion, phi, noise, noise[15], block))
+    chi = update_estimate(before, V, wrench, whitening_matrix(motion, phi, noise, noise[15], block))
     if noise[15] == 0.0:
         copy_into(memory, place, before, 0, 272)
     else:
-        long_term_root = whitening(motion, phi, noise, noise[15] * noise[16], block)
+        long_term_root = whitening_matrix(motion, phi, noise, noise[15] * noise[16], block)
         update_estimate(memory[place : place + 272], V, wrench, long_term_root)
     return chi
 
 
 @njit(cache=True)
-def _restart(memory, place):
-    copy_into(memory, place, memory, _KNOWN, 272)
-    if place == _NEW:
+def _restart_new_estimate(memory, place):
+    copy_into(memory, place, memory, _KNOWN_FILTER_START, 272)
+    if place == _NEW_FILTER_START:
         for j in range(10):
-            memory[place + 16 + 17 * (6 + j)] += OBJECT_STD[j] ** 2
+            memory[place + 16 + 17 * (6 + j)] += OBJECT_PRIOR_STD[j] ** 2
         memory[_START] = memory[_SAMPLES]
         memory[_SQUARES:_WRENCH] = memory[_POWER] = 0.0
-    memory[_SUM] = memory[_AGE] = 0.0
+    memory[_SUM] = memory[_ESTIMATE_AGE_INDEX] = 0.0
 
 
 @njit(cache=True)
 def _is_identified(memory, bound):
-    theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
-    change = abs(theta[6] - memory[_KNOWN + 6])
+    theta, P = (
+        memory[_NEW_FILTER_START : _NEW_FILTER_START + 16],
+        memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16),
+    )
+    change = abs(theta[6] - memory[_KNOWN_FILTER_START + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
     moment = bound * change * max(size, _MIN_SIZE_M) * _MOMENT_FACTOR
     largest = max(P[7, 7], P[8, 8], P[9, 9])
@@ -176,8 +196,11 @@ def _is_identified(memory, bound):
 
 @njit(cache=True)
 def _inflate_inertia_variances(memory, noise, block):
-    theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
-    expected = memory[_AGE] * (noise[12] + noise[13] + noise[14]) / block
+    theta, P = (
+        memory[_NEW_FILTER_START : _NEW_FILTER_START + 16],
+        memory[_NEW_FILTER_START + 16 : MEMORY_SIZE].reshape(16, 16),
+    )
+    expected = memory[_ESTIMATE_AGE_INDEX] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_POWER], 1e-300))
     moment = theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2
     scale = abs(theta[10]) + abs(theta[13]) + abs(theta[15]) + 2.0 * moment / abs(theta[6])
@@ -186,94 +209,101 @@ def _inflate_inertia_variances(memory, noise, block):
 
 
 @njit(cache=True)
-def change_update(memory, sample, block, noise, window, hold, bound):
+def update_change_detector(memory, sample, block, noise, window, hold, bound):
     """Process one sample in the change detector, without checks; `memory` is updated."""
     V = np.empty((6, 10))
-    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    s, omega, alpha = (
+        sample[SAMPLE_SPECIFIC_FORCE],
+        sample[SAMPLE_ANGULAR_VELOCITY],
+        sample[SAMPLE_ANGULAR_ACCELERATION],
+    )
     regressor_into(s, omega, alpha, V)
-    known = sample[WRENCH_AND_MOTION]
+    known = sample[SAMPLE_WRENCH_AND_MOTION]
     for i in range(15):
         memory[_WRENCH + i] += known[i]
     for i in range(6):
         for j in range(10):
-            memory[_V + 10 * i + j] += V[i, j]
+            memory[_REGRESSOR_START + 10 * i + j] += V[i, j]
     memory[_SAMPLES] += 1.0
     memory[_IN_BLOCK] += 1.0
     if memory[_IN_BLOCK] >= block:
-        memory[_WRENCH:_KNOWN] /= block
+        memory[_WRENCH:_KNOWN_FILTER_START] /= block
         _test_block(memory, block, noise, window, hold, bound)
-        memory[_WRENCH:_KNOWN] = 0.0
+        memory[_WRENCH:_KNOWN_FILTER_START] = 0.0
         memory[_IN_BLOCK] = 0.0
 
 
 @njit(cache=True)
 def _test_block(memory, block, noise, window, hold, bound):
-    if memory[_STATE] == memory[_BASE]:
-        if memory[_AGE] >= window:
+    if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]:
+        if memory[_ESTIMATE_AGE_INDEX] >= window:
             excess = memory[_SUM]
-            _restart(memory, _WATCH)
+            _restart_new_estimate(memory, _MONITOR_FILTER_START)
             memory[_SUM] = excess
-        memory[_AGE] += 1.0
-        chi = _update_filter(memory, _WATCH, block, noise)
-        memory[_SUM] = max(0.0, memory[_SUM] + chi - _SLACK)
-        if memory[_SUM] > _ALARM:
-            memory[_STATE], memory[_RETURN_SUM] = DISTURBED, 0.0
-            _restart(memory, _NEW)
+        memory[_ESTIMATE_AGE_INDEX] += 1.0
+        chi = _update_filter(memory, _MONITOR_FILTER_START, block, noise)
+        memory[_SUM] = max(0.0, memory[_SUM] + chi - _CHI_SQUARED_SLACK)
+        if memory[_SUM] > _ALARM_SUM:
+            memory[_STATE_INDEX], memory[_RETURN_SUM] = STATE_DISTURBED, 0.0
+            _restart_new_estimate(memory, _NEW_FILTER_START)
         return
     # Return to the known load if it explains the blocks without an update.
-    copy_into(memory, _WATCH, memory, _KNOWN, 272)
-    chi = _update_filter(memory, _WATCH, block, noise)
-    memory[_RETURN_SUM] = min(0.0, memory[_RETURN_SUM] + chi - _SLACK)
-    if memory[_RETURN_SUM] < _RETURN:
-        memory[_STATE] = memory[_BASE]
-        _restart(memory, _WATCH)
+    copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_FILTER_START, 272)
+    chi = _update_filter(memory, _MONITOR_FILTER_START, block, noise)
+    memory[_RETURN_SUM] = min(0.0, memory[_RETURN_SUM] + chi - _CHI_SQUARED_SLACK)
+    if memory[_RETURN_SUM] < _RETURN_TO_KNOWN_SUM:
+        memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX]
+        _restart_new_estimate(memory, _MONITOR_FILTER_START)
         return
     # Test whether one new load explains all blocks since its start.
-    chi = _update_filter(memory, _NEW, block, noise)
-    memory[_AGE] += 1.0
+    chi = _update_filter(memory, _NEW_FILTER_START, block, noise)
+    memory[_ESTIMATE_AGE_INDEX] += 1.0
     for k in range(3):
         memory[_POWER] += memory[_MOTION + 6 + k] ** 2
     for c in range(6):
-        residual = memory[_WRENCH + c] - memory[_NEW + c]
+        residual = memory[_WRENCH + c] - memory[_NEW_FILTER_START + c]
         for j in range(10):
-            residual -= memory[_V + 10 * c + j] * memory[_NEW + 6 + j]
+            residual -= memory[_REGRESSOR_START + 10 * c + j] * memory[_NEW_FILTER_START + 6 + j]
         memory[_SQUARES + c] += residual * residual
-    memory[_SUM] = max(0.0, memory[_SUM] + chi - _SLACK)
+    memory[_SUM] = max(0.0, memory[_SUM] + chi - _CHI_SQUARED_SLACK)
     # A clearly negative mass is not a load.
-    mass, deviation = memory[_NEW + 6], math.sqrt(memory[_NEW + 16 + 17 * 6])
-    if memory[_SUM] > _ALARM or mass < -_IMPOSSIBLE_DEVIATIONS * deviation:
-        memory[_STATE] = DISTURBED
-        _restart(memory, _NEW)
-    elif memory[_STATE] == DISTURBED and memory[_AGE] >= hold:
-        memory[_STATE] = CHANGED
-    elif memory[_STATE] == CHANGED and _is_identified(memory, bound):
-        memory[_STATE] = memory[_BASE] = IDENTIFIED
+    mass, deviation = (
+        memory[_NEW_FILTER_START + 6],
+        math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6]),
+    )
+    if memory[_SUM] > _ALARM_SUM or mass < -_IMPOSSIBLE_DEVIATIONS * deviation:
+        memory[_STATE_INDEX] = STATE_DISTURBED
+        _restart_new_estimate(memory, _NEW_FILTER_START)
+    elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
+        memory[_STATE_INDEX] = STATE_CHANGED
+    elif memory[_STATE_INDEX] == STATE_CHANGED and _is_identified(memory, bound):
+        memory[_STATE_INDEX] = memory[_BASE_STATE_INDEX] = STATE_IDENTIFIED
         _inflate_inertia_variances(memory, noise, block)
-        copy_into(memory, _KNOWN, memory, _NEW, 272)
-        memory[_NEW_COUNT] = memory[_AGE] * block
+        copy_into(memory, _KNOWN_FILTER_START, memory, _NEW_FILTER_START, 272)
+        memory[_NEW_COUNT] = memory[_ESTIMATE_AGE_INDEX] * block
         for i in range(_SQUARES - _RESIDUAL):
-            memory[_RESIDUAL + i] = memory[_SQUARES + i] * (block / memory[_AGE])
-        _restart(memory, _WATCH)
+            memory[_RESIDUAL + i] = memory[_SQUARES + i] * (block / memory[_ESTIMATE_AGE_INDEX])
+        _restart_new_estimate(memory, _MONITOR_FILTER_START)
 
 
 @njit(cache=True)
-def _watch(memory, samples, states, block, noise, window, hold, bound):
+def _process_samples(memory, samples, states, block, noise, window, hold, bound):
     for k in range(samples.shape[0]):
-        change_update(memory, samples[k], block, noise, window, hold, bound)
-        states[k] = int(memory[_STATE])
+        update_change_detector(memory, samples[k], block, noise, window, hold, bound)
+        states[k] = int(memory[_STATE_INDEX])
 
 
-Parameters: TypeAlias = tuple[int, Array, int, int, float]
+DetectorParameters: TypeAlias = tuple[int, Array, int, int, float]
 
 
-def change_parameters(
+def change_detector_parameters(
     wrench_std: ArrayLike,
     motion_std: ArrayLike,
     period: float,
     *,
     model_error: float = 0.0,
     bound: float | None = None,
-) -> Parameters:
+) -> DetectorParameters:
     """Return the parameters of the change detector.
 
     Args:
@@ -290,20 +320,22 @@ def change_parameters(
             remedy="give the relative error of the model",
         )
     bound = (
-        max(DEFAULT_BOUND, 2.0 * model_error)
+        max(MAX_RELATIVE_MASS_STD, 2.0 * model_error)
         if bound is None
         else float(positive_array("bound", bound))
     )
-    block = max(1, round(BLOCK_S / period))
+    block = max(1, round(BLOCK_DURATION_S / period))
     window, hold, memory = (
-        max(1, round(x / (block * period))) for x in (WINDOW_S, HOLD_S, MODEL_ERROR_S)
+        max(1, round(x / (block * period))) for x in (ESTIMATE_WINDOW_S, HOLD_S, MODEL_ERROR_S)
     )
     std = positive_array("wrench_std", wrench_std, 6), finite_array("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
     return block, np.append(noise, memory), window, hold, bound
 
 
-def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT) -> Array:
+def initial_change_memory(
+    theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT_STD
+) -> Array:
     """Return the initial memory of the change detector for a known load.
 
     `offset_drift` (6,) is the standard deviation of the drift since the identification [N, N m].
@@ -318,27 +350,31 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     phi = theta[6:].copy()
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
-    memory = np.zeros(SIZE)
-    memory[_KNOWN : _KNOWN + 16] = np.concatenate([theta[:6], phi])
-    memory[_KNOWN + 16 : _WATCH] = P.ravel()
-    copy_into(memory, _WATCH, memory, _KNOWN, 272)
+    memory = np.zeros(MEMORY_SIZE)
+    memory[_KNOWN_FILTER_START : _KNOWN_FILTER_START + 16] = np.concatenate([theta[:6], phi])
+    memory[_KNOWN_FILTER_START + 16 : _MONITOR_FILTER_START] = P.ravel()
+    copy_into(memory, _MONITOR_FILTER_START, memory, _KNOWN_FILTER_START, 272)
     return memory
 
 
 @njit(cache=True)
-def known_load(memory):
-    return memory[_KNOWN : _KNOWN + 16]
+def known_load_in_memory(memory):
+    return memory[_KNOWN_FILTER_START : _KNOWN_FILTER_START + 16]
 
 
 @njit(cache=True)
 def change_state(memory):
-    """Return the index into `STATES`; `KNOWN` again after a new load was identified."""
-    return KNOWN if memory[_STATE] == memory[_BASE] else int(memory[_STATE])
+    """Return the index into `STATE_NAMES`; `STATE_KNOWN` again after a new load was identified."""
+    return (
+        STATE_KNOWN
+        if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]
+        else int(memory[_STATE_INDEX])
+    )
 
 
 @njit(cache=True)
-def new_load(memory):
-    return memory[_NEW : _NEW + 16]
+def new_load_in_memory(memory):
+    return memory[_NEW_FILTER_START : _NEW_FILTER_START + 16]
 
 
 @njit(cache=True)
@@ -347,31 +383,34 @@ def new_load_age(memory):
     return memory[_SAMPLES] - memory[_START]
 
 
-def watch_load(
+def detector_states_of_log(
     memory: Array,
-    parameters: Parameters,
+    parameters: DetectorParameters,
     wrench: ArrayLike,
     s: ArrayLike,
     omega: ArrayLike,
     alpha: ArrayLike,
 ) -> NDArray[np.int_]:
-    """Return the detector's states (N,) for N samples of a log, as indices into `STATES`."""
+    """Return the detector's states (N,) for N samples of a log, as indices into `STATE_NAMES`."""
     _, rows = broadcast_to_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
-    _watch(memory, np.concatenate(rows, axis=1), states, *parameters)
+    _process_samples(memory, np.concatenate(rows, axis=1), states, *parameters)
     return states
 
 
-def identified_load(memory: Array, known: Identification) -> Identification:
+def identified_or_known_load(memory: Array, known: Identification) -> Identification:
     """Return the last new load that the detector identified, or `known` if there is none."""
-    if memory[_BASE] == KNOWN:
+    if memory[_BASE_STATE_INDEX] == STATE_KNOWN:
         return known
-    phi, P = memory[_KNOWN + 6 : _KNOWN + 16].copy(), memory[_KNOWN + 16 : _WATCH]
+    phi, P = (
+        memory[_KNOWN_FILTER_START + 6 : _KNOWN_FILTER_START + 16].copy(),
+        memory[_KNOWN_FILTER_START + 16 : _MONITOR_FILTER_START],
+    )
     covariance = P.reshape(16, 16).copy()
     return replace(
         known,
         phi=phi,
-        offsets=memory[_KNOWN : _KNOWN + 6].copy(),
+        offsets=memory[_KNOWN_FILTER_START : _KNOWN_FILTER_START + 6].copy(),
         covariance=covariance,
         identifiable=is_precise_enough(np.sqrt(np.diag(covariance)), phi),
         residual_rms=np.sqrt(memory[_RESIDUAL:_SQUARES]),

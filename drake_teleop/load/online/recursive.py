@@ -12,13 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, broadcast_to_rows, positive_array
-from drake_teleop.load.batch.uncertainty import prior_dominated
-from drake_teleop.load.identification import WORTH_STATING, Identification, is_precise_enough
+from drake_teleop.load.batch.uncertainty import is_prior_dominated
+from drake_teleop.load.identification import (
+    MAX_IDENTIFIED_DEVIATION,
+    Identification,
+    is_precise_enough,
+)
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    SPECIFIC_FORCE,
-    WRENCH,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH,
     regressor_into,
 )
 
@@ -55,8 +59,12 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
             for c in range(6):
                 squares[c] *= forgetting
 
-        wrench, s, omega = sample[WRENCH], sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY]
-        regressor_into(s, omega, sample[ANGULAR_ACCELERATION], V)
+        wrench, s, omega = (
+            sample[SAMPLE_WRENCH],
+            sample[SAMPLE_SPECIFIC_FORCE],
+            sample[SAMPLE_ANGULAR_VELOCITY],
+        )
+        regressor_into(s, omega, sample[SAMPLE_ANGULAR_ACCELERATION], V)
         for c in range(6):
             first, last = (0, 4) if c < 3 else (1, 10)
             for i in range(16):
@@ -92,7 +100,7 @@ class RecursiveEstimator(ABC):
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of past samples, 0 < forgetting <= 1.
         prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
-        bound: standard deviation that `settled` requires, relative to `natural_scale`.
+        bound: standard deviation that `is_settled` requires, relative to `natural_scales`.
     """
 
     #: Value of `Identification.method`.
@@ -143,11 +151,11 @@ class RecursiveEstimator(ABC):
         return self.covariance_of(self._theta, self._memory)
 
     @property
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Whether data, not the prior, determine all parameters within `bound`."""
-        return self.settled_at(self._theta, self._memory)
+        return self.is_settled_at(self._theta, self._memory)
 
-    def settled_at(self, theta: Array, memory: Array) -> bool:
+    def is_settled_at(self, theta: Array, memory: Array) -> bool:
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
@@ -204,18 +212,20 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._is_certain(deviations, self._theta, WORTH_STATING),
+            identifiable=self._is_certain(deviations, self._theta, MAX_IDENTIFIED_DEVIATION),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
             method=self.method,
             samples=self._samples,
-            prior_dominated=prior_dominated(deviations, np.sqrt(self._prior)),
+            prior_dominated=is_prior_dominated(deviations, np.sqrt(self._prior)),
         )
 
     def _is_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
-        certain = ~prior_dominated(deviations, np.sqrt(self._prior))
-        return certain & is_precise_enough(deviations * (WORTH_STATING / bound), theta[6:])
+        certain = ~is_prior_dominated(deviations, np.sqrt(self._prior))
+        return certain & is_precise_enough(
+            deviations * (MAX_IDENTIFIED_DEVIATION / bound), theta[6:]
+        )
 
     def _condition_number(self) -> float:
         information = np.linalg.inv(self.covariance)

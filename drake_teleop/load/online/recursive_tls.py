@@ -19,20 +19,20 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.common.registry import Registry
-from drake_teleop.load.moments import coefficients
+from drake_teleop.load.moments import regressor_coefficients
 from drake_teleop.load.online.recursive import (
     MAX_SETTLED_STD,
     PRIOR_STD,
     RecursiveEstimator,
     RecursiveLeastSquares,
 )
-from drake_teleop.load.regressor import MOTION, WRENCH
+from drake_teleop.load.regressor import SAMPLE_MOTION, SAMPLE_WRENCH
 
 # Relative increase of diagonal elements against rounding.
-RIDGE = 1e-13
+RELATIVE_RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `moments`.
-_WRENCH, _PRODUCTS = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
-_ORDER = [0, *range(7, 19), *range(1, 7)]
+_WRENCH, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
+_ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _MIN_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
@@ -42,16 +42,16 @@ _MIN_SCALE_SAMPLES = 20
 
 
 @cache
-def terms() -> tuple[NDArray[np.uintp], Array]:
+def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
     """Return nonzero terms of T: [channel, element of z, parameter] (n, 3), factors (n,)."""
-    T = coefficients()[:, :, _ORDER].swapaxes(1, 2)
+    T = regressor_coefficients()[:, :, _ORDER_OF_BATCH_MOMENTS].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
     return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]
 
 
 @njit(cache=True)
-def scratch():
+def allocate_scratch():
     return (
         np.empty((13, 6, 16)),
         np.empty(16),
@@ -64,14 +64,14 @@ def scratch():
 
 
 @njit(cache=True)
-def write_z(wrench, motion, z):
+def write_products_vector(wrench, motion, z):
     s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
     for i in range(3):
         z[1 + i] = s[i]
         z[4 + i] = alpha[i]
         for j in range(i + 1):
-            z[_PRODUCTS[i, j]] = omega[i] * omega[j]
+            z[_OMEGA_PRODUCT_INDICES[i, j]] = omega[i] * omega[j]
     for c in range(6):
         z[_WRENCH + c] = wrench[c]
 
@@ -85,7 +85,7 @@ def add_outer_product(y, z, total):
 
 
 @njit(cache=True)
-def forget(memory, theta, information, forgetting):
+def forget_samples(memory, theta, information, forgetting):
     """Multiply the sums in the memory by `forgetting`, and centre the prior at theta (16,)."""
     last = memory.shape[0] - 1
     for i in range(last):
@@ -130,8 +130,10 @@ def noise_products(Z, noise_std, motion_std, Q):
         # The derivative of w_i w_k by w_k is w_i, or 2 w_i for i = k.
         for i in range(3):
             for j in range(3):
-                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _PRODUCTS[i, j]]
-                Q[_PRODUCTS[i, k], _PRODUCTS[j, k]] += motion_std[3 + k] ** 2 * both
+                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _OMEGA_PRODUCT_INDICES[i, j]]
+                Q[_OMEGA_PRODUCT_INDICES[i, k], _OMEGA_PRODUCT_INDICES[j, k]] += (
+                    motion_std[3 + k] ** 2 * both
+                )
 
 
 @njit(cache=True)
@@ -168,7 +170,7 @@ def weighted_right(LZ, W, index, factors, g):
 
 
 @njit(cache=True)
-def eliminate(A):
+def eliminate_rows(A):
     """Replace [A B] by [D L^T, L^-1 B] in place, for the symmetric A = L D L^T (n, n)."""
     n, m = A.shape
     for k in range(n):
@@ -181,12 +183,12 @@ def eliminate(A):
 
 
 @njit(cache=True)
-def solve(A):
+def solve_linear_system(A):
     """Replace the right part of [A B] by A^-1 B in place, A symmetric and positive definite."""
     n, m = A.shape
     for i in range(n):
-        A[i, i] *= 1.0 + RIDGE
-    eliminate(A)
+        A[i, i] *= 1.0 + RELATIVE_RIDGE
+    eliminate_rows(A)
     for i in range(n - 1, -1, -1):
         for j in range(n, m):
             x = A[i, j] / A[i, i]
@@ -196,14 +198,14 @@ def solve(A):
 
 
 @njit(cache=True)
-def invert(S, A, W):
+def invert_matrix(S, A, W):
     """Write S^-1 into W, both (6, 6); A (6, 12) is scratch."""
     for c in range(6):
         for d in range(6):
             A[c, d] = S[c, d]
             A[c, 6 + d] = 0.0
         A[c, 6 + c] = 1.0
-    solve(A)
+    solve_linear_system(A)
     for c in range(6):
         for d in range(6):
             W[c, d] = A[c, 6 + d]
@@ -219,10 +221,10 @@ class MomentEstimator(RecursiveEstimator):
 
     def _residual_rms(self) -> Array:
         L, LZ, S = np.empty((6, 19)), np.empty((6, 19)), np.empty((6, 6))
-        residual_products(self._memory[:19], self._theta, *terms(), L, LZ, S)
+        residual_products(self._memory[:19], self._theta, *nonzero_regressor_terms(), L, LZ, S)
         return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
 
-    def _within_prior(self, covariance: Array) -> Array:
+    def _limit_to_prior(self, covariance: Array) -> Array:
         shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
         return np.asarray(covariance * np.outer(shrink, shrink))
 
@@ -234,7 +236,7 @@ def select_compensated(G, N, strength, K, taper):
     for i in range(16):
         for j in range(16):
             K[i, j] = G[i, j] - strength * N[i, j]
-    eliminate(K)
+    eliminate_rows(K)
     definite = True
     for i in range(16):
         definite &= K[i, i] > _MIN_PIVOT * G[i, i]
@@ -268,7 +270,7 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
     for c in range(6):
         for d in range(6):
             S[c, d] /= Z[0, 0]
-    invert(S, inverse, W)
+    invert_matrix(S, inverse, W)
     residual_products(Z, theta, index, factors, L, LZ, S)
     scale = 0.0
     for c in range(6):
@@ -291,13 +293,13 @@ def rtls_update(
     `noise_std` (6,) and `motion_std` (9,) are standard deviations of the wrench and of [s, omega,
     alpha]; `information` (16,) are inverse variances of the prior.
     """
-    space, Q, z, taper = scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
+    space, Q, z, taper = allocate_scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
     Z, options = memory[:19], (noise_std, motion_std, index, factors)
     for n in range(len(samples)):
         if forgetting < 1.0:
-            forget(memory, theta, information, forgetting)
-        write_z(samples[n, WRENCH], samples[n, MOTION], z)
+            forget_samples(memory, theta, information, forgetting)
+        write_products_vector(samples[n, SAMPLE_WRENCH], samples[n, SAMPLE_MOTION], z)
         add_outer_product(z, z, Z)
         scale = rtls_normal_equations(Z, theta, *options, space, Q, G, N)
         for i in range(16):
@@ -309,7 +311,7 @@ def rtls_update(
             for i in range(6, 16):
                 for j in range(6, 16):
                     G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
-        solve(G)
+        solve_linear_system(G)
         for i in range(16):
             theta[i] = G[i, 16]
 
@@ -355,7 +357,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         """Return the covariance (16, 16); poorly excited directions have the prior's variance."""
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
-        root = np.linalg.inv(_cholesky(G + information))
+        root = np.linalg.inv(_cholesky_or_none(G + information))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
@@ -363,25 +365,31 @@ class RecursiveTotalLeastSquares(MomentEstimator):
             excess > _MIN_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
         )
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
-        factor = inverse @ _cholesky(scale * G + information)
+        factor = inverse @ _cholesky_or_none(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
-        return self._within_prior(factor @ factor.T + unknown @ unknown.T)
+        return self._limit_to_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
-        options = (self._noise_std, self._motion_std, *terms(), scratch(), Q)
+        options = (
+            self._noise_std,
+            self._motion_std,
+            *nonzero_regressor_terms(),
+            allocate_scratch(),
+            Q,
+        )
         scale = rtls_normal_equations(memory[:19], theta, *options, G, N)
         return G[:, :16], N, scale if memory[0, 0] > _MIN_SCALE_SAMPLES else 1.0
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._motion_std, self._forgetting, 1.0 / self._prior)
-        rtls_update(theta, memory, samples, *options, *terms())
+        rtls_update(theta, memory, samples, *options, *nonzero_regressor_terms())
 
 
-def _cholesky(A: Array) -> Array:
+def _cholesky_or_none(A: Array) -> Array:
     return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))
 
 

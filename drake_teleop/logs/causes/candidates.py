@@ -9,34 +9,34 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import signed_permutations
-from drake_teleop.load.identification import natural_scale
-from drake_teleop.logs.causes.changes import add_step, contact_spans
-from drake_teleop.logs.causes.instants import FORCES, ONE, G, R, S
+from drake_teleop.load.identification import natural_scales
+from drake_teleop.logs.causes.changes import add_step, find_contact_spans
+from drake_teleop.logs.causes.instants import CONSTANT_COLUMN, FORCES, G, R, S
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.state import State
 
-ORDER = (
+EXTENSION_NAMES = (
     *("axes", "gravity", "weight", "torque factor", "offsets", "load", "linear drift", "gain"),
     *("frame", "rotation", "contact", "cable", "drift"),
 )
 """Order of plausibility: of nearly equal candidates the first is chosen."""
-_FACTORS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
-FACTORS = tuple(
+_UNIT_RATIOS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
+TORQUE_UNIT_FACTORS = tuple(
     sign * ratio
     for sign in (1.0, -1.0)
-    for ratio in (1.0, *_FACTORS, *(1.0 / x for x in _FACTORS))
+    for ratio in (1.0, *_UNIT_RATIOS, *(1.0 / x for x in _UNIT_RATIOS))
     if sign * ratio != 1.0
 )
 """Ratios of known units and signs between torque and force."""
-_HALVED, _IMPOSSIBLE_SCORE = 0.5, 1000.0
+_SUFFICIENT_RESIDUAL_RATIO, _IMPOSSIBLE_SCORE = 0.5, 1000.0
 _SMALLEST_TILT_DEG, _GRAVITY_SHARE, _KNOWN_SHARE = 0.25, 0.05, 0.02
 _MASS_SHARE, _SMALLEST_ARM_M = 0.02, 0.004
 _SMALLEST_GAIN, _LARGEST_GAIN, _SMALLEST_SHIFT_M, _SMALLEST_ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
 _SIGNIFICANT, _LARGEST_SHIFT_M, _LARGEST_STIFFNESS = 10.0, 1.5, 1000.0  # 1, m, N/m
-_DRIFT_LEVELS = 3.0
+_MIN_DRIFT_OVER_NOISE = 3.0
 _NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
 _FACTOR_SHARE, _FACTOR_LIMIT, _FACTOR_LIMIT_FAR = 0.02, 0.06, 0.2
-_MODERATE_FACTOR, _SAME_LIKELIHOOD, _FACTOR_ITERATIONS = 0.2, 1.0, 4
+_MODERATE_FACTOR, _LIKELIHOOD_TOLERANCE, _FACTOR_ITERATIONS = 0.2, 1.0, 4
 _LOW_RESIDUAL_SHARE = 0.2
 _MAX_LIKELIHOOD_LOSS = 8.0  # of the logarithm; four standard deviations
 _DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
@@ -54,51 +54,59 @@ class Candidate:
     score: float
 
 
-def candidates(state: State, first: bool) -> Iterator[Candidate]:
+def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
     """Fit the possible extensions of a model and yield those with sufficient effect.
 
     `first` is True if the model is the rigid load alone.
     """
     model, data = state.model, state.data
     if first:
-        yield from _axes(state)
+        yield from _axis_permutation_candidates(state)
     if data.gravity_W is not None:
         if "gravity" not in model.parts:
-            yield from _fit_part(state, "gravity", [tilt_start(state), None], _is_tilt_significant)
+            yield from _fit_part(
+                state, "gravity", [start_of_tilt_fit(state), None], _is_tilt_significant
+            )
         if "weight" not in model.parts and data.accelerates_enough:
             yield from _fit_part(state, "weight", [None], _is_weight_significant)
     if "torque factor" not in model.parts and data.accelerates_enough:
-        yield from _factor(state)
+        yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
         found = add_step(state, kind)
         if found is not None:
-            yield _candidate(kind, state, found, times=1)
+            yield _scored_candidate(kind, state, found, times=1)
     if not {"linear drift", "drift"} & set(model.parts):
         yield from _fit_part(state, "linear drift", [None], _is_drift_significant)
     for c in range(6):
         if c not in model.gains:
-            larger = state.extended(replace(model, gains=(*model.gains, c)))
-            if _SMALLEST_GAIN < abs(larger.extension(f"gain {c}")[0][0]) < _LARGEST_GAIN:
-                yield _candidate("gain", state, larger)
+            larger = state.refit(replace(model, gains=(*model.gains, c)))
+            if (
+                _SMALLEST_GAIN
+                < abs(larger.parameters_of_extension(f"gain {c}")[0][0])
+                < _LARGEST_GAIN
+            ):
+                yield _scored_candidate("gain", state, larger)
     if "frame" not in model.parts and data.accelerates_enough:
         yield from _fit_part(
-            state, "frame", [None], lambda x: _size(x, "frame") > _SMALLEST_SHIFT_M
+            state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _SMALLEST_SHIFT_M
         )
     if first and not model.parts:
         angle = np.radians(_SMALLEST_ROTATION_DEG)
-        yield from _fit_part(state, "rotation", [None], lambda x: _size(x, "rotation") > angle)
-    spans = contact_spans(state)
+        yield from _fit_part(
+            state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
+        )
+    spans = find_contact_spans(state)
     if spans and spans != state.spans:
-        larger = State.of(data, model, state.x, spans)
+        larger = State.fit_record(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
-        yield _candidate("contact", state, larger, more=6 + 2 * ends)
+        yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)
     if data.positions and "cable" not in model.parts and data.accelerates_enough:
         yield from _fit_part(state, "cable", [None], lambda _: True)
     if "drift" not in model.parts and "linear drift" not in model.parts:
         yield from _fit_part(state, "drift", [None], _is_drift_significant)
 
 
-def _candidate(
+def _scored_candidate(
     name: str, state: State, larger: State, *, times: int = 0, more: int = 0
 ) -> Candidate:
     rows = float(state.data.used.sum())
@@ -112,11 +120,11 @@ def _candidate(
 def _fit_part(
     state: State, name: str, starts: list[Array | None], is_significant: Callable[[State], bool]
 ) -> Iterator[Candidate]:
-    model = state.model.extended(name)
-    fits = [state.extended(model, start) for start in starts]
+    model = state.model.with_extension(name)
+    fits = [state.refit(model, start) for start in starts]
     best = max(fits, key=lambda x: x.likelihood)
     if is_significant(best):
-        yield _candidate(name, state, best)
+        yield _scored_candidate(name, state, best)
 
 
 def has_negative_mass(state: State) -> bool:
@@ -133,7 +141,7 @@ def has_negative_inertia(state: State) -> bool:
     # The derivative of n^T I n by the six entries.
     slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
     deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
-    smallest = _NEGATIVE_SHARE * natural_scale(state.x[6:16])[10]
+    smallest = _NEGATIVE_SHARE * natural_scales(state.x[6:16])[10]
     return bool(least[0] < -max(_NEGATIVE_DEVIATIONS * deviation, smallest))
 
 
@@ -143,16 +151,19 @@ def is_plausible(state: State) -> bool:
         return False
     parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
     if "weight" in parts:
-        removed = state.extension("weight")[0][0]
+        removed = state.parameters_of_extension("weight")[0][0]
         # A robot adds no weight, and a removed weight requires an inertia to compare with.
         if removed < -0.01 * state.x[6] or state.x[6] < _SIGNIFICANT * deviation:
             return False
-    if "frame" in parts and np.linalg.norm(state.extension("frame")[0]) > _LARGEST_SHIFT_M:
+    if (
+        "frame" in parts
+        and np.linalg.norm(state.parameters_of_extension("frame")[0]) > _LARGEST_SHIFT_M
+    ):
         return False
     if "cable" in parts:
         if state.x[6] < _SIGNIFICANT * deviation:
             return False
-        K = state.extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+        K = state.parameters_of_extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
         return bool(np.abs(np.linalg.eigvalsh(K)).max() < _LARGEST_STIFFNESS)
     return True
 
@@ -160,7 +171,7 @@ def is_plausible(state: State) -> bool:
 def _is_tilt_significant(state: State) -> bool:
     assert state.data.gravity_W is not None
     given = state.data.gravity_W
-    true = given - state.extension("gravity")[0]
+    true = given - state.parameters_of_extension("gravity")[0]
     size, right = float(np.linalg.norm(true)), float(np.linalg.norm(given))
     cosine = float(true @ given) / (size * right)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -170,14 +181,14 @@ def _is_tilt_significant(state: State) -> bool:
     return bool(angle > _SMALLEST_TILT_DEG and abs(size / right - 1.0) < share)
 
 
-def tilt_start(state: State) -> Array | None:
+def start_of_tilt_fit(state: State) -> Array | None:
     """Return start parameters for a fit of a large tilt of gravity, from the force, or None."""
-    y = state.data.only(state.rows.used).y
+    y = state.data.select_rows(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
     J = np.zeros((7, 3, width))
     for i in range(3):
-        J[i, i, ONE] = 1.0
+        J[i, i, CONSTANT_COLUMN] = 1.0
         J[3, i, S.start + i] = J[3, i, G.start + i] = 1.0
         J[4:, i, R.start + 3 * i : R.start + 3 * i + 3] = np.eye(3)
     force = np.eye(width)[FORCES][:3]
@@ -190,20 +201,20 @@ def tilt_start(state: State) -> Array | None:
     size = float(np.linalg.norm(u))
     if size == 0.0:
         return None
-    model = state.model.extended("gravity")
-    x = model.start(state.x, state.model)
+    model = state.model.with_extension("gravity")
+    x = model.start_parameters(state.x, state.model)
     x[6] = size / float(np.linalg.norm(given))
     x[7:16] = 0.0
     x[model.slices["gravity"]] = given + u / size * np.linalg.norm(given)
     return x
 
 
-def _size(state: State, name: str) -> float:
-    return float(np.linalg.norm(state.extension(name)[0]))
+def _extension_magnitude(state: State, name: str) -> float:
+    return float(np.linalg.norm(state.parameters_of_extension(name)[0]))
 
 
 def _is_weight_significant(state: State) -> bool:
-    removed, _ = state.extension("weight")
+    removed, _ = state.parameters_of_extension("weight")
     mass = abs(state.x[6])
     moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)
     return bool(removed[0] > _MASS_SHARE * mass or moment > _SMALLEST_ARM_M)
@@ -211,17 +222,17 @@ def _is_weight_significant(state: State) -> bool:
 
 def _is_drift_significant(state: State) -> bool:
     name = "drift" if "drift" in state.model.parts else "linear drift"
-    rows = state.extension(name)[0].reshape(6, -1)
-    return bool((np.abs(rows).sum(axis=1) > _DRIFT_LEVELS * state.data.white).any())
+    rows = state.parameters_of_extension(name)[0].reshape(6, -1)
+    return bool((np.abs(rows).sum(axis=1) > _MIN_DRIFT_OVER_NOISE * state.data.white).any())
 
 
-def _factor(state: State) -> Iterator[Candidate]:
+def _torque_factor_candidates(state: State) -> Iterator[Candidate]:
     fits = []
-    for factor in (1.0, *FACTORS):
+    for factor in (1.0, *TORQUE_UNIT_FACTORS):
         model = replace(state.model, factor=factor)
-        fits.append(state.extended(model, state.x, steps=_FACTOR_ITERATIONS))
+        fits.append(state.refit(model, state.x, steps=_FACTOR_ITERATIONS))
     most = max(x.likelihood for x in fits)
-    best = next(x for x in fits if x.likelihood > most - _SAME_LIKELIHOOD)
+    best = next(x for x in fits if x.likelihood > most - _LIKELIHOOD_TOLERANCE)
     # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
     least = min(x.residual_ratio for x in fits)
     by_residual = least < _LOW_RESIDUAL_SHARE * min(best.residual_ratio, state.residual_ratio)
@@ -230,44 +241,42 @@ def _factor(state: State) -> Iterator[Candidate]:
         best = max(low, key=lambda x: x.likelihood)
     if best is fits[0]:
         return
-    best = state.extended(
-        best.model, best.x, **({"steps": _FACTOR_ITERATIONS} if by_residual else {})
-    )
+    best = state.refit(best.model, best.x, **({"steps": _FACTOR_ITERATIONS} if by_residual else {}))
     if 2.0 * (best.likelihood - state.likelihood) < 20.0:
         return
-    free = best.extended(best.model.extended("torque factor"))
-    value, covariance = free.extension("torque factor")
+    free = best.refit(best.model.with_extension("torque factor"))
+    value, covariance = free.parameters_of_extension("torque factor")
     # A displaced pose frame resembles any factor, but only a distant frame resembles a large one.
     far = not _MODERATE_FACTOR < best.model.factor < 1.0 / _MODERATE_FACTOR
     most = _FACTOR_LIMIT_FAR if far else _FACTOR_LIMIT
     limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), most)
-    found = _candidate("torque factor", state, best, more=1)
+    found = _scored_candidate("torque factor", state, best, more=1)
     # A factor beside the known ratios is not a cause, but widens the intervals.
     score = found.score if abs(value[0]) < limit else min(found.score, _DOUBTFUL_SCORE)
     yield replace(found, score=score)
 
 
-def similar_factors(state: State) -> list[State]:
+def fits_with_similar_torque_factors(state: State) -> list[State]:
     """Return the fits with other torque units that explain the record nearly as well."""
     factor, found = state.model.factor, []
-    for other in FACTORS if factor != 1.0 else ():
+    for other in TORQUE_UNIT_FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:
-            fitted = state.extended(replace(state.model, factor=other), state.x)
+            fitted = state.refit(replace(state.model, factor=other), state.x)
             if fitted.likelihood > state.likelihood - _MAX_LIKELIHOOD_LOSS:
                 found.append(fitted)
     return found
 
 
-def _axes(state: State) -> Iterator[Candidate]:
-    y = state.data.only(state.rows.used).y[:, state.model.columns]
+def _axis_permutation_candidates(state: State) -> Iterator[Candidate]:
+    y = state.data.select_rows(state.rows.used).y[:, state.model.columns]
     sums = y.T @ y
-    sums = sums - np.outer(sums[:, ONE], sums[ONE]) / sums[0, 0]
+    sums = sums - np.outer(sums[:, CONSTANT_COLUMN], sums[CONSTANT_COLUMN]) / sums[0, 0]
     # m s + alpha x h + omega x (omega x h) for the three axes of S, and a removed weight
     model = Model(parts=state.model.parts)
     used = [6, 7, 8, 9]
     if "weight" in model.parts:
         used.append(model.slices["weight"].start)
-    J = model.derivative(np.zeros(model.size))[used, :3]
+    J = model.wrench_derivative(np.zeros(model.size))[used, :3]
     force = np.eye(len(sums))[FORCES][:3]
     gram = np.einsum("pci,ij,qcj->pq", J, sums, J)
     cross = np.einsum("pci,ij,dj->cdp", J, sums, force)  # axis c of S, channel d
@@ -283,10 +292,10 @@ def _axes(state: State) -> Iterator[Candidate]:
             plain = left
         elif left < best[0]:
             best = (left, Q)
-    if best[0] < _HALVED * plain:
-        larger = state.extended(replace(state.model, axes=best[1]), np.zeros(state.model.size))
+    if best[0] < _SUFFICIENT_RESIDUAL_RATIO * plain:
+        larger = state.refit(replace(state.model, axes=best[1]), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
-            found = _candidate("axes", state, larger, more=3)
+            found = _scored_candidate("axes", state, larger, more=3)
             # The given axes imply a negative mass, which is impossible.
             more = _IMPOSSIBLE_SCORE if has_negative_inertia(state) else 0.0
             yield replace(found, score=found.score + more)

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import is_precise_enough
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import similar_factors
+from drake_teleop.logs.causes.candidates import fits_with_similar_torque_factors
 from drake_teleop.logs.causes.state import State
 
 _HAND_DISTANCE_S, _HAND_CONTACT_S = 0.8, 1.2
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
-CHANGES = ("zero change", "load change")
+CHANGE_CAUSES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
-EVENTS = (*CHANGES, "drift", "contact", "cable", "no load")
+TEMPORARY_CAUSES = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
 """Causes that no line of a description corrects."""
 
 
@@ -43,7 +43,7 @@ class Cause:
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
+class RecordPartWithLoad:
     """Part of a record with one load phi (10,), and covariance (16, 16) of [offsets; phi]."""
 
     start_s: float
@@ -56,31 +56,31 @@ class Stretch:
         return is_precise_enough(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
-def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
+def causes_of_fit(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
-        out.append(_axes(model.axes))
+        out.append(_wrong_axes_cause(model.axes))
     makers = {
-        "gravity": _gravity,
-        "weight": _weight,
-        "frame": _frame,
-        "rotation": _rotation,
-        "cable": _cable,
-        "linear drift": _drift,
-        "drift": _drift,
+        "gravity": _gravity_direction_cause,
+        "weight": _removed_weight_cause,
+        "frame": _pose_frame_cause,
+        "rotation": _sensor_rotation_cause,
+        "cable": _cable_cause,
+        "linear drift": _drift_cause,
+        "drift": _drift_cause,
     }
     out += [makers[name](state) for name in model.parts if name in makers and name not in given]
     if model.factor != 1.0:
-        out.append(_factor(state))
-    out += [_gain(state, c) for c in model.gains]
-    changes = [_change(state, i) for i in range(len(model.steps))]
+        out.append(_torque_factor_cause(state))
+    out += [_gain_error_cause(state, c) for c in model.gains]
+    changes = [_step_cause(state, i) for i in range(len(model.steps))]
     margin = state.data.dt  # one row more than the contact is omitted at both ends
-    contacts = [span for span in state.spans if not _is_hand_contact(span, model.times)]
-    changes += [_contact(start + margin, stop - margin) for start, stop in contacts]
+    contacts = [span for span in state.spans if not _is_hand_contact(span, model.step_times)]
+    changes += [_contact_cause(start + margin, stop - margin) for start, stop in contacts]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 
-def stretches(state: State, covariance: Array) -> list[Stretch]:
+def loads_between_changes(state: State, covariance: Array) -> list[RecordPartWithLoad]:
     """Return the parts of a record between changes of the load; none without a change."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
@@ -92,7 +92,7 @@ def stretches(state: State, covariance: Array) -> list[Stretch]:
     out, start = [], first
     for time, i in [*sorted(loads), (last, -1)]:
         spread = map_ @ state.fit.covariance @ map_.T * np.outer(ratio, ratio)
-        out.append(Stretch(start, time, (map_ @ state.x)[6:], spread))
+        out.append(RecordPartWithLoad(start, time, (map_ @ state.x)[6:], spread))
         if i >= 0:
             map_ = map_.copy()
             map_[6:, state.model.slices[f"step {i}"]] = np.eye(10)
@@ -100,11 +100,11 @@ def stretches(state: State, covariance: Array) -> list[Stretch]:
     return out
 
 
-def _vector(x: Array, unit: str, digits: str = ".3g") -> str:
+def _format_vector(x: Array, unit: str, digits: str = ".3g") -> str:
     return f"[{', '.join(format(float(v), digits) for v in x)}] {unit}"
 
 
-def _axes(Q: Array) -> Cause:
+def _wrong_axes_cause(Q: Array) -> Cause:
     rows = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in Q]
     what = f"x, y, z of the wrench are {', '.join(rows)} of the motion"
     if (-np.eye(3) == Q).all():
@@ -112,9 +112,9 @@ def _axes(Q: Array) -> Cause:
     return Cause("axes", what, values={"axes": rows, "matrix": Q.tolist()})
 
 
-def _gravity(state: State) -> Cause:
+def _gravity_direction_cause(state: State) -> Cause:
     assert state.data.gravity_W is not None
-    change, covariance = state.extension("gravity")
+    change, covariance = state.parameters_of_extension("gravity")
     given = state.data.gravity_W
     true = given - change
     cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
@@ -131,8 +131,8 @@ def _gravity(state: State) -> Cause:
     )
 
 
-def _weight(state: State) -> Cause:
-    removed, covariance = state.extension("weight")
+def _removed_weight_cause(state: State) -> Cause:
+    removed, covariance = state.parameters_of_extension("weight")
     deviation = float(np.sqrt(covariance[0, 0]))
     mass = float(state.x[6])
     own = float(np.sqrt(state.fit.covariance[6, 6]))
@@ -148,26 +148,27 @@ def _weight(state: State) -> Cause:
     return Cause(
         "payload configured",
         f"the weight of a payload of {removed[0]:.4g} kg (+- {1.96 * deviation:.2g}) at"
-        f" {_vector(1e3 * com, 'mm in S')} is already removed from the wrench, but the inertia is"
-        f" that of {mass:.4g} kg: the payload in the robot's controller is not that of the load",
+        f" {_format_vector(1e3 * com, 'mm in S')} is already removed from the wrench, but the"
+        f" inertia is that of {mass:.4g} kg: the payload in the robot's controller is not that of"
+        " the load",
         values=values,
     )
 
 
-def _factor(state: State) -> Cause:
+def _torque_factor_cause(state: State) -> Cause:
     factor = state.model.factor
     if factor == -1.0:
         what = "the torque has the opposite sign"
     else:
         what = f"the torque is {factor:.6g} times the value that fits the force"
-        if others := [other.model.factor for other in similar_factors(state)]:
+        if others := [other.model.factor for other in fits_with_similar_torque_factors(state)]:
             listed = " or ".join(f"{x:.6g}" for x in others)
             what += f" (or {listed} times, which the record does not exclude)"
     return Cause("torque factor", f"{what}: its unit or sign is wrong", values={"factor": factor})
 
 
-def _gain(state: State, c: int) -> Cause:
-    value, covariance = state.extension(f"gain {c}")
+def _gain_error_cause(state: State, c: int) -> Cause:
+    value, covariance = state.parameters_of_extension(f"gain {c}")
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
     return Cause(
         "gain",
@@ -177,32 +178,32 @@ def _gain(state: State, c: int) -> Cause:
     )
 
 
-def _frame(state: State) -> Cause:
-    r, covariance = state.extension("frame")
+def _pose_frame_cause(state: State) -> Cause:
+    r, covariance = state.parameters_of_extension("frame")
     wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
     return Cause(
         "pose frame",
-        f"the pose is that of a point at {_vector(-1e3 * r, 'mm in S')} (+- {wide.max():.2g} mm),"
-        " not of the sensor",
+        f"the pose is that of a point at {_format_vector(-1e3 * r, 'mm in S')}"
+        f" (+- {wide.max():.2g} mm), not of the sensor",
         values={"position_in_sensor": (-r).tolist()},
     )
 
 
-def _rotation(state: State) -> Cause:
-    rho, covariance = state.extension("rotation")
+def _sensor_rotation_cause(state: State) -> Cause:
+    rho, covariance = state.parameters_of_extension("rotation")
     angle = float(np.degrees(np.linalg.norm(rho)))
     wide = float(np.degrees(np.sqrt(np.diag(covariance).max())))
     return Cause(
         "sensor rotation",
         f"the sensor is rotated by {angle:.2f} deg (+- {1.96 * wide:.2g}) against the motion, about"
-        f" {_vector(rho / (np.linalg.norm(rho) + 1e-12), 'in S', '.2f')}",
+        f" {_format_vector(rho / (np.linalg.norm(rho) + 1e-12), 'in S', '.2f')}",
         values={"rotation_vector": rho.tolist()},
     )
 
 
-def _drift(state: State) -> Cause:
+def _drift_cause(state: State) -> Cause:
     name = "drift" if "drift" in state.model.parts else "linear drift"
-    rows = state.extension(name)[0].reshape(6, -1)
+    rows = state.parameters_of_extension(name)[0].reshape(6, -1)
     size = 2.0 * np.abs(rows).sum(axis=1)
     return Cause(
         "drift",
@@ -212,8 +213,8 @@ def _drift(state: State) -> Cause:
     )
 
 
-def _cable(state: State) -> Cause:
-    K = state.extension("cable")[0][3:9]
+def _cable_cause(state: State) -> Cause:
+    K = state.parameters_of_extension("cable")[0][3:9]
     stiffness = float(np.abs(np.linalg.eigvalsh(K[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]])).max())
     return Cause(
         "cable",
@@ -223,15 +224,15 @@ def _cable(state: State) -> Cause:
     )
 
 
-def _change(state: State, i: int) -> Cause:
-    step, (values, covariance) = state.model.steps[i], state.extension(f"step {i}")
+def _step_cause(state: State, i: int) -> Cause:
+    step, (values, covariance) = state.model.steps[i], state.parameters_of_extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
     if step.kind == "offsets":
         return Cause(
             "zero change",
-            f"{when} the sensor has another zero: {_vector(values[:3], 'N')},"
-            f" {_vector(values[3:], 'N m')} are added (a tare in the record); the stated offsets"
-            " are those before it",
+            f"{when} the sensor has another zero: {_format_vector(values[:3], 'N')},"
+            f" {_format_vector(values[3:], 'N m')} are added (a tare in the record); the stated"
+            " offsets are those before it",
             start_s=step.time,
             values={"change": values.tolist()},
         )
@@ -241,7 +242,7 @@ def _change(state: State, i: int) -> Cause:
     return Cause(
         "load change",
         f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
-        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each part",
+        f" {_format_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each part",
         start_s=step.time,
         values={"mass_change": mass, "com_of_change": np.asarray(com).tolist()},
     )
@@ -252,7 +253,7 @@ def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> boo
     return near and span[1] - span[0] < _HAND_CONTACT_S
 
 
-def _contact(start: float, stop: float) -> Cause:
+def _contact_cause(start: float, stop: float) -> Cause:
     return Cause(
         "contact",
         f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part is not used",

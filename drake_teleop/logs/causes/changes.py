@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import FORCES
-from drake_teleop.logs.causes.model import DELAY, Step
+from drake_teleop.logs.causes.model import DELAY_PARAMETER, Step
 from drake_teleop.logs.causes.state import (
     Spans,
     State,
-    in_spans,
+    is_in_spans,
     likelihood_gain,
     regularized_inverse,
 )
 
 _MIN_GAIN = 60.0
-_REFINEMENTS, _REFINEMENT_STEPS = (1.0, 0.25), 2  # instants
+_REFINEMENT_STEP_SHARES, _REFINEMENT_STEPS = (1.0, 0.25), 2  # instants
 _MIN_DISTANCE_S, _RAMP_COST = 0.4, 80.0
 RAMP_S = 0.5
 """Shortest omitted time around a gradual step [s]."""
-_TRIED_TIMES = 2
+_NUM_TRIED_TIMES = 2
 _SIGNIFICANT, _NOISE_LEVELS, _MASS_SHARE, _SMALLEST_ARM_M = 5.0, 2.0, 0.01, 0.002
 
 
@@ -37,7 +37,7 @@ def add_step(state: State, kind: str) -> State | None:
     best: State | None = None
     for time in _likely_times(state, kind):
         found = _refine_time(state, kind, time)
-        ramp = with_ramps(state, [[kind]], [time], state.spans)
+        ramp = fit_with_ramps(state, [[kind]], [time], state.spans)
         if 2.0 * (ramp.likelihood - found.likelihood) > _RAMP_COST:
             found = ramp
         if best is None or found.likelihood > best.likelihood:
@@ -47,20 +47,20 @@ def add_step(state: State, kind: str) -> State | None:
 
 
 def _likely_times(state: State, kind: str) -> list[float]:
-    data, rows = state.data, state.data.block
+    data, rows = state.data, state.data.rows_per_block
     scan = _StepScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
-    gains = np.array([scan.gain(int(n)) for n in starts])
-    for time in state.model.times:
+    gains = np.array([scan.gain_of_change_at(int(n)) for n in starts])
+    for time in state.model.step_times:
         gains[np.abs(data.t[starts] - time) < _MIN_DISTANCE_S] = 0.0
     out: list[float] = []
-    for _ in range(_TRIED_TIMES):
+    for _ in range(_NUM_TRIED_TIMES):
         j = int(np.argmax(gains))
         if gains[j] < _MIN_GAIN:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
-        time = float(data.t[max(near, key=scan.gain)]) - 0.5 * data.dt
-        if all(abs(time - x) > _MIN_DISTANCE_S for x in state.model.times):
+        time = float(data.t[max(near, key=scan.gain_of_change_at)]) - 0.5 * data.dt
+        if all(abs(time - x) > _MIN_DISTANCE_S for x in state.model.step_times):
             out.append(time)
         distance = max(2.0 * _MIN_DISTANCE_S, 3.0 * rows * data.dt)
         gains[np.abs(data.t[starts] - time) < distance] = 0.0
@@ -71,28 +71,28 @@ class _StepScan:
     """Gain of twice the log likelihood by a change at any instant, for white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
-        power = np.maximum(state.rows.rms(state.fit.residual), 1e-12)
-        J = state.model.derivative(state.x) / power[:, None]
+        power = np.maximum(state.rows.residual_rms(state.fit.residual), 1e-12)
+        J = state.model.wrench_derivative(state.x) / power[:, None]
         self._columns = state.rows.y @ J.transpose(1, 2, 0)  # (6, M, p)
         self._residual = (state.rows.y @ (state.fit.residual / power[:, None]).T).T
         self._which = slice(0, 6) if kind == "offsets" else slice(6, 16)
-        self._rows = rows = state.data.block
+        self._rows = rows = state.data.rows_per_block
         starts = np.arange(0, len(state.data.t), rows)
         gram, right = map(
-            np.stack, zip(*(self._sums(n, n + rows) for n in starts.tolist()), strict=True)
+            np.stack, zip(*(self._sums_of_rows(n, n + rows) for n in starts.tolist()), strict=True)
         )
         self._gram = np.cumsum(gram[::-1], axis=0)[::-1]
         self._right = np.cumsum(right[::-1], axis=0)[::-1]
         self._inverse = np.linalg.pinv(self._gram[0], rcond=1e-12, hermitian=True)
 
-    def _sums(self, start: int, stop: int) -> tuple[Array, Array]:
+    def _sums_of_rows(self, start: int, stop: int) -> tuple[Array, Array]:
         A, e = self._columns[:, start:stop], self._residual[:, start:stop]
         flat = A.reshape(-1, A.shape[2])
         return flat.T @ flat, flat.T @ e.ravel()
 
-    def gain(self, n: int) -> float:
+    def gain_of_change_at(self, n: int) -> float:
         j = -(-n // self._rows)
-        gram, right = self._sums(n, j * self._rows)
+        gram, right = self._sums_of_rows(n, j * self._rows)
         if j < len(self._gram):
             gram, right = gram + self._gram[j], right + self._right[j]
         which = self._which
@@ -102,7 +102,7 @@ class _StepScan:
         return likelihood_gain(schur, pull, 1e-6 * np.diag(gram)[which])[0]
 
 
-def with_ramps(
+def fit_with_ramps(
     state: State,
     kinds: Sequence[Sequence[str]],
     times: Sequence[float],
@@ -115,28 +115,32 @@ def with_ramps(
     steps = [Step(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
     model = replace(state.model, steps=(*state.model.steps, *steps))
-    found = State.of(state.data, model, model.start(state.x, state.model), (*spans, *around))
+    found = State.fit_record(
+        state.data, model, model.start_parameters(state.x, state.model), (*spans, *around)
+    )
     owners = [k for k, both in enumerate(kinds) for _ in both]
     middles = [_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
     steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
     model = replace(model, steps=(*state.model.steps, *steps))
-    return State.of(state.data, model, found.x, found.spans)
+    return State.fit_record(state.data, model, found.x, found.spans)
 
 
-def without_small_steps(state: State) -> State:
+def remove_small_steps(state: State) -> State:
     """Remove insignificant changes one by one, the least significant first."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
             return state
-        least = min(small, key=lambda i: _significance(state, i))
+        least = min(small, key=lambda i: _step_significance(state, i))
         steps = tuple(x for i, x in enumerate(state.model.steps) if i != least)
         model = replace(state.model, steps=steps)
-        x = np.concatenate([state.x[: DELAY + 1], np.zeros(model.size - DELAY - 1)])
-        state = State.of(state.data, model, x, state.spans)
+        x = np.concatenate(
+            [state.x[: DELAY_PARAMETER + 1], np.zeros(model.size - DELAY_PARAMETER - 1)]
+        )
+        state = State.fit_record(state.data, model, x, state.spans)
 
 
-def _significance(state: State, i: int) -> float:
+def _step_significance(state: State, i: int) -> float:
     where = state.model.slices[f"step {i}"]
     x, covariance = state.x[where], state.fit.covariance[where, where]
     return float(x @ regularized_inverse(covariance) @ x) / len(x)
@@ -147,17 +151,17 @@ def _ramp_middle(
 ) -> float:
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
-    rows = np.flatnonzero(data.used & in_spans(data, (span,)))
+    rows = np.flatnonzero(data.used & is_in_spans(data, (span,)))
     if not len(rows):
         return 0.5 * (span[0] + span[1])
 
-    def left(time: float) -> Array:
+    def residual_after_steps(time: float) -> Array:
         times = tuple(time if i in own else x.time for i, x in enumerate(state.model.steps))
-        y = data.with_steps(times)[rows][:, state.model.columns]
+        y = data.append_step_signals(times)[rows][:, state.model.columns]
         return np.asarray(y @ state.fit.residual.T)
 
-    before = left(span[1] + data.dt)
-    whole = before - left(span[0] - data.dt)
+    before = residual_after_steps(span[1] + data.dt)
+    whole = before - residual_after_steps(span[0] - data.dt)
     weight = 1.0 / np.maximum(data.white, 1e-12) ** 2
     share = (before * whole) @ weight / np.maximum((whole * whole) @ weight, 1e-12)
     done = float(np.clip(share, 0.0, 1.0).mean())
@@ -165,15 +169,17 @@ def _ramp_middle(
 
 
 def _refine_time(state: State, kind: str, time: float) -> State:
-    def at(time: float, start: Array | None = None) -> State:
+    def fit_with_step_at(time: float, start: Array | None = None) -> State:
         model = replace(state.model, steps=(*state.model.steps, Step(kind, time)))
-        return state.extended(model, start)
+        return state.refit(model, start)
 
-    best = at(time)
-    for share in _REFINEMENTS:
+    best = fit_with_step_at(time)
+    for share in _REFINEMENT_STEP_SHARES:
         for _ in range(_REFINEMENT_STEPS):
             now = best.model.steps[-1].time
-            tried = [at(now + sign * share * state.data.dt, best.x) for sign in (-1.0, 1.0)]
+            tried = [
+                fit_with_step_at(now + sign * share * state.data.dt, best.x) for sign in (-1.0, 1.0)
+            ]
             better = max(tried, key=lambda x: x.likelihood)
             if not better.likelihood > best.likelihood + 1e-3:
                 break
@@ -195,23 +201,23 @@ def _is_step_significant(state: State, i: int) -> bool:
     return bool(heavier or moved)
 
 
-_KEPT_SHARES, _ITERATIONS, _FEWEST_BLOCKS, _GROWTH = (0.12, 0.3, 0.55), 15, 8, 1.3
+_KEPT_SHARES, _ITERATIONS, _FEWEST_BLOCKS, _BLOCK_SET_GROWTH = (0.12, 0.3, 0.55), 15, 8, 1.3
 _START_LENGTHS, _END_LENGTHS = (8, 16, 32), (2, 4, 8)
-_CONTACT_LEVEL, _CALM_RATIO, _SPREAD = 8.0, 5.0, 1.3
+_CONTACT_LEVEL, _CALM_RATIO, _CALM_LEVEL_FACTOR = 8.0, 5.0, 1.3
 _MAX_LOADS, _MAX_STEPS, _SHORTEST_RUN, _MAX_UNCOVERED = 4, 4, 4, 0.12
 _LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
 
 
-def contact_spans(state: State) -> Spans:
+def find_contact_spans(state: State) -> Spans:
     """Return time spans (start, stop) [s] whose residual far exceeds that of calm parts."""
     blocks = _Blocks(state)
-    contact_blocks = blocks.contact_blocks(blocks.usable)
+    contact_blocks = blocks.find_contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
         return ()
     wide = contact_blocks.copy()
     wide[:-1] |= contact_blocks[1:]
     wide[1:] |= contact_blocks[:-1]
-    return _spans(wide, state.data.t, state.data.block)
+    return _spans_of_blocks(wide, state.data.t, state.data.rows_per_block)
 
 
 def replace_contacts_by_steps(larger: State) -> State | None:
@@ -219,10 +225,10 @@ def replace_contacts_by_steps(larger: State) -> State | None:
     blocks = _Blocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_LOADS):
-        contact_blocks = blocks.contact_blocks(left)
+        contact_blocks = blocks.find_contact_blocks(left)
         if contact_blocks is None:
             break
-        calm = _runs(left & ~contact_blocks, _SHORTEST_RUN)
+        calm = _keep_long_runs(left & ~contact_blocks, _SHORTEST_RUN)
         number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
     if not len(inner) or left.sum() > _MAX_UNCOVERED * blocks.usable.sum():
@@ -230,17 +236,17 @@ def replace_contacts_by_steps(larger: State) -> State | None:
     borders = [(a, b) for a, b in pairwise(inner) if number[a] != number[b]]
     if not 0 < len(borders) <= _MAX_STEPS:
         return None
-    dt, rows = larger.data.dt, larger.data.block
+    dt, rows = larger.data.dt, larger.data.rows_per_block
     t = larger.data.t[0] + dt * rows * np.arange(len(number))
     times = [float(0.5 * (t[a] + dt * rows + t[b])) for a, b in borders]
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
-    found = with_ramps(larger, [("offsets", "load")] * len(times), times, (), widths)
-    found = without_small_steps(found)
+    found = fit_with_ramps(larger, [("offsets", "load")] * len(times), times, (), widths)
+    found = remove_small_steps(found)
     limit = max(_LARGEST_INCREASE * larger.residual_ratio, _SMALL_RESIDUAL)
     return found if found.residual_ratio < limit else None
 
 
-def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
+def _keep_long_runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     out = np.zeros(len(flags), bool)
@@ -253,11 +259,11 @@ class _Blocks:
     def __init__(self, state: State) -> None:
         data = state.data
         self._state = state
-        y = data.with_steps(state.model.times)[:, state.model.columns]
-        sums = data.sums(y, rows=data.block, lags=1)[:, 0]
+        y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
+        sums = data.lagged_products(y, rows=data.rows_per_block, lags=1)[:, 0]
         self._counts = sums[:, 0, 0]
-        self.usable = self._counts > 0.5 * data.block
-        J = state.model.derivative(state.x)
+        self.usable = self._counts > 0.5 * data.rows_per_block
+        J = state.model.wrench_derivative(state.x)
         sizes = np.sqrt(np.diag(sums.sum(axis=0))[FORCES] / max(self._counts.sum(), 1.0))
         least = 1e-6 * sizes.reshape(2, 3).max(axis=1).repeat(3) + 1e-12
         scale = np.maximum(data.white, least)
@@ -271,13 +277,13 @@ class _Blocks:
             left = state.fit.residual[c] / scale[c]
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
-    def contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Return True for blocks with a residual far above the calmest; None for few blocks."""
         found = self._fit_calmest(np.flatnonzero(among))
         if found is None:
             return None
         level, calm, move = found
-        excess = np.sqrt(np.maximum(level**2 - (_SPREAD * calm) ** 2, 0.0))
+        excess = np.sqrt(np.maximum(level**2 - (_CALM_LEVEL_FACTOR * calm) ** 2, 0.0))
         quantile = min(0.25, 0.5 * float(np.mean(level[among] < _CALM_RATIO * calm)))
         by_motion = _motion_error_level(self._state, self._state.x + move, excess, among, quantile)
         usual = np.hypot(calm, by_motion)
@@ -301,7 +307,7 @@ class _Blocks:
                 blocks, np.r_[blocks[:length], blocks[-length:]], 0.0
             )
             calm = float(np.median(level[last]))
-            if self._is_clear(level, last, np.setdiff1d(blocks, last), calm):
+            if self._differs_from_fit(level, last, np.setdiff1d(blocks, last), calm):
                 found.append((level, move))
                 usual = min(usual, calm)
         limit = max(_CONTACT_LEVEL**2, (_CALM_RATIO**2) * usual)
@@ -309,10 +315,9 @@ class _Blocks:
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
 
-    def _is_clear(
+    def _differs_from_fit(
         self, level: Array, kept: NDArray[np.intp], others: NDArray[np.intp], calm: float
     ) -> bool:
-        """Return whether most of the `others` differ from a fit to the `kept` blocks."""
         covariance = regularized_inverse(self._gram[kept].sum(axis=0))
         share = np.einsum("bij,ji->b", self._gram[others], covariance)
         predicted = calm * (1.0 + share / (6.0 * np.maximum(self._counts[others], 1.0)))
@@ -326,7 +331,7 @@ class _Blocks:
             move = regularized_inverse(self._gram[kept].sum(axis=0)) @ self._right[kept].sum(axis=0)
             left = self._square - 2.0 * self._right @ move + (self._gram @ move) @ move
             level = left / (6.0 * np.maximum(self._counts, 1.0))
-            size = min(keep, 1 + int(_GROWTH * len(kept))) if len(kept) < keep else keep
+            size = min(keep, 1 + int(_BLOCK_SET_GROWTH * len(kept))) if len(kept) < keep else keep
             chosen = np.sort(blocks[np.argsort(level[blocks])[:size]])
             if np.array_equal(chosen, kept):
                 break
@@ -337,9 +342,9 @@ class _Blocks:
 def _motion_error_level(
     state: State, x: Array, level: Array, usable: NDArray[np.bool_], quantile: float
 ) -> Array:
-    data, rows = state.data, state.data.block
-    y = data.with_steps(state.model.times)
-    wrench = y @ state.model.wrench(x[None])[0].T
+    data, rows = state.data, state.data.rows_per_block
+    y = data.append_step_signals(state.model.step_times)
+    wrench = y @ state.model.wrench_coefficients(x[None])[0].T
     bend = np.zeros(len(y))
     both = data.used[2:] & data.used[:-2]
     second = np.diff(wrench, 2, axis=0) / np.maximum(data.white, 1e-12)
@@ -364,13 +369,15 @@ def replace_steps_by_contact(state: State) -> State:
             continue
         kept = tuple(x for k, x in enumerate(state.model.steps) if k not in ends)
         model = replace(state.model, steps=kept)
-        x = np.concatenate([state.x[: DELAY + 1], np.zeros(model.size - DELAY - 1)])
+        x = np.concatenate(
+            [state.x[: DELAY_PARAMETER + 1], np.zeros(model.size - DELAY_PARAMETER - 1)]
+        )
         dt = state.data.dt
         span = (start - dt, stop + dt)
-        if len(ends) == 2 and _cancels(state, i, j):
-            return State.of(state.data, model, x, (*state.spans, span))
+        if len(ends) == 2 and _is_offset_step_undone(state, i, j):
+            return State.fit_record(state.data, model, x, (*state.spans, span))
         if _median_residual_ratio(state, span) > _CONTACT_LEVEL:
-            calm = State.of(state.data, model, x, (*state.spans, span))
+            calm = State.fit_record(state.data, model, x, (*state.spans, span))
             if calm.residual_ratio < min(_CALM_RATIO, state.residual_ratio / _CALM_RATIO):
                 return shrink_contacts(calm)
     return state
@@ -379,15 +386,17 @@ def replace_steps_by_contact(state: State) -> State:
 def shrink_contacts(state: State) -> State:
     """Shorten the time spans of contacts to the rows with a large residual."""
     dt = state.data.dt
-    spans = [_contact_span(state, span) for span in state.spans]
-    return State.of(state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans))
+    spans = [_shrunk_contact_span(state, span) for span in state.spans]
+    return State.fit_record(
+        state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans)
+    )
 
 
-def _contact_span(state: State, span: tuple[float, float]) -> tuple[float, float]:
+def _shrunk_contact_span(state: State, span: tuple[float, float]) -> tuple[float, float]:
     data = state.data
-    inside = np.flatnonzero(data.used & in_spans(data, (span,)))
-    y = data.with_steps(state.model.times)[:, state.model.columns]
-    usual = np.maximum(np.maximum(data.white, state.rows.rms(state.fit.residual)), 1e-12)
+    inside = np.flatnonzero(data.used & is_in_spans(data, (span,)))
+    y = data.append_step_signals(state.model.step_times)[:, state.model.columns]
+    usual = np.maximum(np.maximum(data.white, state.rows.residual_rms(state.fit.residual)), 1e-12)
     large = (np.abs(y[inside] @ state.fit.residual.T) > _CALM_RATIO * usual).any(axis=1)
     first = np.flatnonzero(large[:-1] & large[1:])  # single rows are outliers of the noise
     if not len(first):
@@ -397,14 +406,14 @@ def _contact_span(state: State, span: tuple[float, float]) -> tuple[float, float
 
 
 def _median_residual_ratio(state: State, span: tuple[float, float]) -> float:
-    chosen = state.rows.used & in_spans(state.data, (span,))
+    chosen = state.rows.used & is_in_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
     e = np.abs(state.rows.y[chosen] @ state.fit.residual.T)
     return float((np.median(e, axis=0) / 0.6745 / np.maximum(state.data.white, 1e-12)).max())
 
 
-def _cancels(state: State, i: int, j: int) -> bool:
+def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
     steps = state.model.steps
     if (steps[i].kind, steps[j].kind) != ("offsets", "offsets"):
         return False
@@ -415,7 +424,7 @@ def _cancels(state: State, i: int, j: int) -> bool:
     return bool((np.abs(both) < 4.0 * np.sqrt(np.maximum(variance, 0.0))).all())
 
 
-def _spans(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> Spans:
+def _spans_of_blocks(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> Spans:
     half = 0.5 * float(t[1] - t[0])
     last = len(t) - 1
     return tuple(

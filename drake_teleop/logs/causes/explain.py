@@ -9,21 +9,26 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.logs.causes.candidates import (
-    ORDER,
+    EXTENSION_NAMES,
     Candidate,
-    candidates,
+    fit_candidates,
     has_negative_inertia,
     has_negative_mass,
     is_plausible,
-    tilt_start,
+    start_of_tilt_fit,
 )
-from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
+from drake_teleop.logs.causes.cause import (
+    Cause,
+    RecordPartWithLoad,
+    causes_of_fit,
+    loads_between_changes,
+)
 from drake_teleop.logs.causes.changes import (
     replace_contacts_by_steps,
     replace_steps_by_contact,
     shrink_contacts,
 )
-from drake_teleop.logs.causes.instants import Instants, free_delay
+from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     block_deviations,
     covariance_of,
@@ -31,16 +36,22 @@ from drake_teleop.logs.causes.intervals import (
     gain_covariance,
     misfit_deviations,
 )
-from drake_teleop.logs.causes.model import DELAY, LOAD, Model
+from drake_teleop.logs.causes.model import DELAY_PARAMETER, LOAD_PARAMETERS, Model
 from drake_teleop.logs.causes.state import State
 
-ROUNDS = 4
-WithDelay = Callable[[float], Instants]
+MAX_SEARCH_ROUNDS = 4
+InstantsAtDelay = Callable[[float], Instants]
 _SMALLEST_DELAY_S, _LARGEST_DELAY_S, _SAME_DELAY_S, _DELAY_ITERATIONS = 5e-4, 0.3, 0.004, 4  # s
 MAX_RESIDUAL_RATIO, MAX_SMOOTH_MISFIT, MAX_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the noise test: `State.residual_ratio`, `State.smooth_misfit`, `State.score`."""
 _MIN_SCORE, _SCORE_MARGIN, _SCORE_MARGIN_SHARE = 40.0, 25.0, 0.02
-_HALVED, _FIFTH, _COLOURED_NOISE_RATIO, _REDUCED, _CERTAIN_SCORE = 0.5, 0.2, 15.0, 0.9, 1000.0
+_HALVED, _CONTACT_RESIDUAL_RATIO, _COLOURED_NOISE_RATIO, _REDUCED, _CERTAIN_SCORE = (
+    0.5,
+    0.2,
+    15.0,
+    0.9,
+    1000.0,
+)
 _ATTENUATED_SHARE = 1.0 / 3.0
 _GOOD_SMOOTH_MISFIT = 1.35
 """Largest smooth misfit of good records."""
@@ -62,40 +73,47 @@ def residual_is_noise(state: State) -> bool:
     parts = ["frame", "linear drift", "rotation"]
     if state.data.gravity_W is not None:
         parts += ["gravity", "weight"]
-    larger = [model.extended(name) for name in parts if name not in model.parts]
+    larger = [model.with_extension(name) for name in parts if name not in model.parts]
     larger += [replace(model, gains=(*model.gains, c)) for c in range(6) if c not in model.gains]
     return all(state.score(x) < MAX_EXTENSION_SCORE for x in larger)
 
 
-Found = tuple[State, float, list[Candidate]]
+SearchResult = tuple[State, float, list[Candidate]]
 
 
-def search(
-    data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
-) -> Found:
+def search_causes(
+    data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
+) -> SearchResult:
     """Return the model that explains a record, additional delay [s], and rejected candidates.
 
     The model contains the extensions `given` from the start.
     """
     plain = Model(parts=given)
-    found = _search(_initial_state(data, plain), 0.0, with_delay)
+    found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
     if has_negative_mass(found[0]):
         # Without a positive mass no candidate is plausible, whatever else is in the record.
-        opposite = _search(_initial_state(data, replace(plain, axes=-np.eye(3))), 0.0, with_delay)
+        opposite = _search_causes_from(
+            _initial_state(data, replace(plain, axes=-np.eye(3))), 0.0, with_delay
+        )
         # With a negative torque factor it is a reversed specific force, seen from the wrench.
         is_wrench = opposite[0].model.factor > 0.0
-        if is_wrench and opposite[0].residual_ratio < _FIFTH * found[0].residual_ratio:
+        if (
+            is_wrench
+            and opposite[0].residual_ratio < _CONTACT_RESIDUAL_RATIO * found[0].residual_ratio
+        ):
             found = opposite
     if with_delay is None or may_be_coloured_noise(found[0]) or residual_is_noise(found[0]):
         return found
-    delay_s = free_delay(data)
+    delay_s = delay_of_free_fit(data)
     if abs(delay_s - found[1]) < _SAME_DELAY_S:
         return found
-    repeated = _search(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
+    repeated = _search_causes_from(_initial_state(with_delay(delay_s), plain), delay_s, with_delay)
     better = (
         residual_is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
     )
-    better = better or (repeated[0].residual_ratio < _FIFTH * found[0].residual_ratio)
+    better = better or (
+        repeated[0].residual_ratio < _CONTACT_RESIDUAL_RATIO * found[0].residual_ratio
+    )
     return repeated if better else found
 
 
@@ -112,25 +130,30 @@ def is_clear_misfit(state: State) -> bool:
 
 
 def _initial_state(data: Instants, model: Model) -> State:
-    state = State.of(data, model)
-    start = tilt_start(state) if "gravity" in model.parts else None
-    return state if start is None else State.of(data, state.model, start)
+    state = State.fit_record(data, model)
+    start = start_of_tilt_fit(state) if "gravity" in model.parts else None
+    return state if start is None else State.fit_record(data, state.model, start)
 
 
-def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found:
+def _search_causes_from(
+    state: State, delay_s: float, with_delay: InstantsAtDelay | None
+) -> SearchResult:
     state, delay_s = _remove_delay(state, delay_s, with_delay)
     rejected: list[Candidate] = []
-    for number in range(ROUNDS):
+    for number in range(MAX_SEARCH_ROUNDS):
         if residual_is_noise(state):
             return state, delay_s, []
-        found = _without_attenuation(list(candidates(state, first=number == 0)))
+        found = _remove_cable_if_attenuated(list(fit_candidates(state, first=number == 0)))
         rejected = [x for x in found if is_plausible(x.state)]
         effective = [x for x in rejected if _is_effective(x, state)]
-        winner, calmest = _best_candidate(effective), _smallest_residual(state, rejected)
+        winner, calmest = (
+            _best_candidate(effective),
+            _candidate_with_smallest_residual(state, rejected),
+        )
         if winner is None or _much_smaller_residual(calmest, winner):
             winner = calmest
         if winner is None:
-            explained = _without_contact(state, rejected)
+            explained = _remove_contact_candidate(state, rejected)
             if explained is None:
                 break
             state, delay_s = _remove_delay(explained, delay_s, with_delay)
@@ -147,8 +170,7 @@ def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found
     return state, delay_s, rejected
 
 
-def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Remove "cable" from the candidates if a reduced inertia explains a third of its score."""
+def _remove_cable_if_attenuated(found: list[Candidate]) -> list[Candidate]:
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
@@ -156,37 +178,39 @@ def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
 
 
 def _remove_delay(
-    state: State, delay_s: float, with_delay: WithDelay | None
+    state: State, delay_s: float, with_delay: InstantsAtDelay | None
 ) -> tuple[State, float]:
     for _ in range(_DELAY_ITERATIONS):
         if (
             with_delay is None
-            or abs(state.x[DELAY]) < _SMALLEST_DELAY_S
+            or abs(state.x[DELAY_PARAMETER]) < _SMALLEST_DELAY_S
             or abs(delay_s) > _LARGEST_DELAY_S
         ):
             break
-        delay_s += float(state.x[DELAY])
+        delay_s += float(state.x[DELAY_PARAMETER])
         x = state.x.copy()
-        x[DELAY] = 0.0
-        state = State.of(with_delay(delay_s), state.model, x, state.spans)
+        x[DELAY_PARAMETER] = 0.0
+        state = State.fit_record(with_delay(delay_s), state.model, x, state.spans)
     return state, delay_s
 
 
-def _smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
+def _candidate_with_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
     small = [x for x in found if x.name in _SMOOTH_CAUSES]
-    small = [x for x in small if x.state.residual_ratio < _FIFTH * state.residual_ratio]
+    small = [
+        x for x in small if x.state.residual_ratio < _CONTACT_RESIDUAL_RATIO * state.residual_ratio
+    ]
     least = min([x.state.residual_ratio for x in small], default=0.0)
     near = [x for x in small if x.state.residual_ratio < 2.0 * least]
-    return min(near, key=lambda x: ORDER.index(x.name), default=None)
+    return min(near, key=lambda x: EXTENSION_NAMES.index(x.name), default=None)
 
 
 def _much_smaller_residual(calmest: Candidate | None, winner: Candidate) -> bool:
     if calmest is None or calmest.name == "contact":
         return False
-    return calmest.state.residual_ratio < _FIFTH * winner.state.residual_ratio
+    return calmest.state.residual_ratio < _CONTACT_RESIDUAL_RATIO * winner.state.residual_ratio
 
 
-def _without_contact(state: State, found: list[Candidate]) -> State | None:
+def _remove_contact_candidate(state: State, found: list[Candidate]) -> State | None:
     for candidate in found:
         if (
             candidate.name == "contact"
@@ -221,7 +245,7 @@ def _best_candidate(found: list[Candidate]) -> Candidate | None:
         else max(_FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE * best)
     )
     near = [x for x in found if x.score > max(_MIN_SCORE, best - margin)]
-    first = min(near, key=lambda x: ORDER.index(x.name))
+    first = min(near, key=lambda x: EXTENSION_NAMES.index(x.name))
     return (
         first
         if first.score
@@ -253,7 +277,7 @@ class Explanation:
     covariance: Array
     deviations: Array
     delay_s: float
-    loads: tuple[Stretch, ...]
+    loads: tuple[RecordPartWithLoad, ...]
     removed_weight: Array | None
     state: State
     given: tuple[str, ...] = ()
@@ -271,7 +295,7 @@ class Explanation:
 
 
 def explain(
-    data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
+    data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
@@ -279,16 +303,16 @@ def explain(
     returns the record with an additional delay [s].
     """
     with one_blas_thread():
-        state, delay_s, rejected = search(data, with_delay, given)
+        state, delay_s, rejected = search_causes(data, with_delay, given)
         blocks = block_deviations(state)
         gains = gain_covariance(state) + factor_covariance(state)
         covariance = covariance_of(state, rejected, blocks, gains)
-        causes = causes_of(state, given)
+        causes = causes_of_fit(state, given)
         only_noise = residual_is_noise(state)
         if (
             not causes
             and (only_noise or may_be_coloured_noise(state))
-            and _no_load(state, covariance)
+            and _is_no_load(state, covariance)
         ):
             causes = [_no_load_cause(state, covariance)]
         removed = None
@@ -297,18 +321,18 @@ def explain(
         return Explanation(
             causes=tuple(causes),
             explained=only_noise,
-            theta=state.x[LOAD],
+            theta=state.x[LOAD_PARAMETERS],
             covariance=covariance,
             deviations=misfit_deviations(state, rejected, blocks, gains),
-            delay_s=delay_s + float(state.x[DELAY]),
-            loads=tuple(stretches(state, covariance)),
+            delay_s=delay_s + float(state.x[DELAY_PARAMETER]),
+            loads=tuple(loads_between_changes(state, covariance)),
             removed_weight=removed,
             state=state,
             given=given,
         )
 
 
-def _no_load(state: State, covariance: Array) -> bool:
+def _is_no_load(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SIGNIFICANT * deviation))
     return bool(mass < least and deviation < 0.1)

@@ -19,9 +19,9 @@ from scipy.interpolate import CubicSpline
 
 from drake_teleop.common.numeric import Array, parabola_minimum
 
-ORDER = 4
+MAX_NOISE_LAG = 4
 """Order of the autoregressive noise."""
-ONE, S, G, ALPHA, PRODUCTS = 0, slice(1, 4), slice(4, 7), slice(7, 10), slice(10, 16)
+CONSTANT_COLUMN, S, G, ALPHA, PRODUCTS = 0, slice(1, 4), slice(4, 7), slice(7, 10), slice(10, 16)
 FORCES, RATES, R, RP, TIME = (
     slice(16, 22),
     slice(22, 28),
@@ -29,7 +29,7 @@ FORCES, RATES, R, RP, TIME = (
     slice(37, 64),
     slice(64, 67),
 )
-WIDTH = 67
+NUM_SIGNALS = 67
 MOTION = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _RATE_HZ, _MAX_ROWS = 50.0, 20_000
@@ -39,7 +39,7 @@ _SMOOTHING_WIDTHS = (5, 9, 15, 25)  # smoothing windows of a noisy angular accel
 _SMALLEST_NOISE = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _DELAY_RANGE_S, _DELAY_STEP_S = 0.25, 0.01
 _MOTION_SIGNALS = slice(0, 16)
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_PRODUCT_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 Motion = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
@@ -83,15 +83,15 @@ class Instants:
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
-    def block(self) -> int:
+    def rows_per_block(self) -> int:
         """Number of rows in a block, the time resolution of the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
-    def only(self, used: NDArray[np.bool_]) -> Instants:
+    def select_rows(self, used: NDArray[np.bool_]) -> Instants:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
-    def with_steps(self, times: tuple[float, ...]) -> Array:
+    def append_step_signals(self, times: tuple[float, ...]) -> Array:
         """Return y and copies of its motion from each time on, (M, WIDTH + 25 len(times))."""
         parts = [self.y]
         for time in times:
@@ -99,7 +99,7 @@ class Instants:
             parts.append(self.y[:, MOTION] * share[:, None])
         return np.hstack(parts)
 
-    def sums(self, y: Array, *, rows: int, lags: int = ORDER + 1) -> Array:
+    def lagged_products(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
         """Return sums of lagged products of y (M, W) over blocks, (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
@@ -115,7 +115,7 @@ class Instants:
         return out
 
 
-def instants(
+def block_means_of_record(
     t: Array,
     wrench: Array,
     motion: Motion | tuple[Array, ...],
@@ -133,8 +133,8 @@ def instants(
     rows = len(t) // size
     t, wrench = t[: rows * size], wrench[: rows * size]
     middle = t.reshape(rows, size).mean(axis=1)
-    y = np.zeros((rows, WIDTH))
-    y[:, ONE] = 1.0
+    y = np.zeros((rows, NUM_SIGNALS))
+    y[:, CONSTANT_COLUMN] = 1.0
     y[:, FORCES] = wrench.reshape(rows, size, 6).mean(axis=1)
     y[1:-1, RATES] = (y[2:, FORCES] - y[:-2, FORCES]) / (2.0 * size * dt)
     positions = _write_motion(y, t, size, motion, gravity_W)
@@ -152,7 +152,7 @@ def instants(
     out = Instants(
         middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
     )
-    return out.only(used)
+    return out.select_rows(used)
 
 
 def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
@@ -185,13 +185,13 @@ def _write_motion(
 ) -> bool:
     rows = len(y)
     if not callable(motion):
-        columns = _columns([x[: rows * size] for x in motion], gravity_W)
-        _write_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
+        columns = _signal_columns([x[: rows * size] for x in motion], gravity_W)
+        _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(motion) == 5
     if size <= _MAX_EXACT_SIZE:
         found = motion(t)
-        columns = _columns(found, gravity_W)
-        _write_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
+        columns = _signal_columns(found, gravity_W)
+        _write_signal_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(found) == 5
     # Simpson's rule over an interval with the variance of `size` samples.
     dt = float(t[-1] - t[0]) / (len(t) - 1)
@@ -200,19 +200,19 @@ def _write_motion(
     total = np.zeros(())
     for shift, weight in ((-half, 1.0), (0.0, 4.0), (half, 1.0)):
         found = motion(middle + shift)
-        total = total + weight / 6.0 * _columns(found, gravity_W)
-    _write_columns(y, total)
+        total = total + weight / 6.0 * _signal_columns(found, gravity_W)
+    _write_signal_columns(y, total)
     return len(found) == 5
 
 
-def _write_columns(y: Array, columns: Array) -> None:
+def _write_signal_columns(y: Array, columns: Array) -> None:
     y[:, 1:16] = columns[:, :15]
     y[:, R.start : R.start + columns.shape[1] - 15] = columns[:, 15:]
 
 
-def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
+def _signal_columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     s, omega, alpha = motion[:3]
-    products = np.stack([omega[:, i] * omega[:, k] for i, k in _PAIRS], axis=1)
+    products = np.stack([omega[:, i] * omega[:, k] for i, k in _PRODUCT_AXES], axis=1)
     if len(motion) == 3 or gravity_W is None:
         return np.hstack([s, np.zeros_like(s), alpha, products])
     R_SW = np.swapaxes(motion[3], 1, 2)
@@ -222,7 +222,7 @@ def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
     return np.hstack(parts)
 
 
-def free_delay(data: Instants) -> float:
+def delay_of_free_fit(data: Instants) -> float:
     """Return the delay of the motion [s], within +-0.25 s, with the smallest residual.
 
     The wrench is fitted by free coefficients of 16 motion signals, without a rigid load.

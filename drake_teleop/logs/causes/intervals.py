@@ -9,16 +9,16 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M
-from drake_teleop.load.identification import natural_scale
-from drake_teleop.logs.causes.candidates import Candidate, similar_factors
+from drake_teleop.load.identification import natural_scales
+from drake_teleop.logs.causes.candidates import Candidate, fits_with_similar_torque_factors
 from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
-from drake_teleop.logs.causes.model import LOAD
+from drake_teleop.logs.causes.model import LOAD_PARAMETERS
 from drake_teleop.logs.causes.state import Rows, State, regularized_inverse
 
-_GROUPS = 12
-_TOLERATED, _USUAL = 1.5, 1.15
+_NUM_JACKKNIFE_PARTS = 12
+_TOLERATED_RESIDUAL_RATIO, _USUAL_RESIDUAL_RATIO = 1.5, 1.15
 _GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
-_SMALLEST_SCORE, _CERTAIN_SCORE, _HALVED = 6.0, 15.0, 0.5
+_SMALLEST_SCORE, _CERTAIN_SCORE, _SUFFICIENT_RESIDUAL_RATIO = 6.0, 15.0, 0.5
 _CABLE_FACTOR, _LARGE_RESIDUAL_RATIO, _CLEAR_SMOOTH_MISFIT, _LARGE_SMOOTH_MISFIT = (
     1.5,
     20.0,
@@ -35,7 +35,7 @@ def covariance_of(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
-    out = state.fit.covariance[LOAD, LOAD].copy()
+    out = state.fit.covariance[LOAD_PARAMETERS, LOAD_PARAMETERS].copy()
     deviations = np.sqrt(np.diag(out))
     factor = misfit_factor(state, blocks)
     squares = np.maximum(factor * deviations, blocks) ** 2
@@ -66,21 +66,21 @@ def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
         share = (
             min(1.0, candidate.score / _CERTAIN_SCORE) if candidate.score > _SMALLEST_SCORE else 0.0
         )
-        if other.residual_ratio < _HALVED * state.residual_ratio:
+        if other.residual_ratio < _SUFFICIENT_RESIDUAL_RATIO * state.residual_ratio:
             share = 1.0  # the likelihood hides a smooth misfit, which coloured noise predicts
-        own = np.diag(other.fit.covariance)[LOAD]
-        squares += share * ((other.x[LOAD] - state.x[LOAD]) ** 2 + own)
+        own = np.diag(other.fit.covariance)[LOAD_PARAMETERS]
+        squares += share * ((other.x[LOAD_PARAMETERS] - state.x[LOAD_PARAMETERS]) ** 2 + own)
     return squares
 
 
 def gain_covariance(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to errors of all 36 sensor gains."""
     fit, rows = state.fit, state.rows
-    weights = rows.whitened(fit.filters) / fit.power[:, None, None]
+    weights = rows.whitened_products(fit.filters) / fit.power[:, None, None]
     unit = np.repeat([1.0, TORQUE_ARM_M], 3)
     # Gains multiply the wrench of the model, because noise of the reading is in the residual.
     wrench = (rows.columns == np.arange(FORCES.start, FORCES.stop)[:, None]) - fit.residual
-    J, inverse = state.model.derivative(state.x), fit.covariance
+    J, inverse = state.model.wrench_derivative(state.x), fit.covariance
     mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
     for c in range(6):
         own = slice(6 * c, 6 * c + 6)
@@ -94,25 +94,25 @@ def gain_covariance(state: State) -> Array:
     shown = values > 1e-9 * values[-1]
     seen, squares = values[shown], (vectors[:, shown].T @ right) ** 2 / values[shown]
 
-    def gained(std: float) -> float:
+    def likelihood_with_gain_std(std: float) -> float:
         more = std * std * seen
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
-    likely = np.array([gained(std) for std in _GAIN_ERRORS])
+    likely = np.array([likelihood_with_gain_std(std) for std in _GAIN_ERRORS])
     explaining = squares.sum() > _MIN_GAIN_SHARE * state.smooth_gain[0]
     plausible = _GAIN_ERRORS[int(likely.argmax())] < _LARGEST_GAIN_ERROR
     if likely.max() < _MIN_GAIN_LIKELIHOOD or not explaining or not plausible:
         return np.zeros((16, 16))
     largest = _GAIN_ERRORS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
-    effects = largest * (inverse @ mixed)[LOAD]
+    effects = largest * (inverse @ mixed)[LOAD_PARAMETERS]
     return np.asarray(effects @ effects.T)
 
 
 def factor_covariance(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
-    for other in similar_factors(state):
-        distance = other.x[LOAD] - state.x[LOAD]
+    for other in fits_with_similar_torque_factors(state):
+        distance = other.x[LOAD_PARAMETERS] - state.x[LOAD_PARAMETERS]
         out += np.outer(distance, distance)
     return out
 
@@ -123,19 +123,19 @@ def attenuation_bias(state: State) -> Array:
     at = np.searchsorted(state.rows.columns, np.arange(ALPHA.start, ALPHA.stop))
     variance = white_noise(data.y[data.used][:, ALPHA]) ** 2
     weights = state.rows.used.sum() * (fit.filters**2).sum(axis=1) / fit.power
-    J = state.model.derivative(state.x)[:, :, at]
+    J = state.model.wrench_derivative(state.x)[:, :, at]
     right = np.einsum("pck,ck,c,k->p", J, fit.residual[:, at], weights, variance)
-    return np.asarray((fit.covariance @ right)[LOAD])
+    return np.asarray((fit.covariance @ right)[LOAD_PARAMETERS])
 
 
 def misfit_factor(state: State, blocks: Array) -> float:
     """Return the factor that widens all standard deviations; 1 for stationary noise."""
-    deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD])
-    shown = deviations < natural_scale(state.x[6:16])
+    deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD_PARAMETERS])
+    shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0
     if shown.any():
         spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))
-        factor = spread / _USUAL if spread > _TOLERATED else 1.0
+        factor = spread / _USUAL_RESIDUAL_RATIO if spread > _TOLERATED_RESIDUAL_RATIO else 1.0
     if "cable" in state.model.parts:
         factor *= _CABLE_FACTOR  # a spring models a cable only to first order
     return factor * (
@@ -146,14 +146,16 @@ def misfit_factor(state: State, blocks: Array) -> float:
 def block_deviations(state: State) -> Array:
     """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
-    at = np.array_split(np.flatnonzero(rows.used), _GROUPS)
-    whole, right = state.fit.normal(state.model, state.x)
+    at = np.array_split(np.flatnonzero(rows.used), _NUM_JACKKNIFE_PARTS)
+    whole, right = state.fit.normal_equations(state.model, state.x)
     moves = []
     for part in at:
         used = np.zeros(len(rows.used), bool)
         used[part] = True
         few = Rows(rows.data, used, rows.times, rows.columns)
-        gram, pull = replace(state.fit, rows=few).normal(state.model, state.x)
-        moves.append((regularized_inverse(whole - gram) @ (right - pull))[LOAD])
+        gram, pull = replace(state.fit, rows=few).normal_equations(state.model, state.x)
+        moves.append((regularized_inverse(whole - gram) @ (right - pull))[LOAD_PARAMETERS])
     spread = np.array(moves) - np.mean(moves, axis=0)
-    return np.asarray(np.sqrt((_GROUPS - 1.0) / _GROUPS * np.sum(spread**2, axis=0)))
+    return np.asarray(
+        np.sqrt((_NUM_JACKKNIFE_PARTS - 1.0) / _NUM_JACKKNIFE_PARTS * np.sum(spread**2, axis=0))
+    )

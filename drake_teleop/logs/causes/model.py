@@ -11,25 +11,25 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.moments import centripetal_matrix, coefficients
+from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA,
+    CONSTANT_COLUMN,
     FORCES,
     MOTION,
-    ONE,
+    NUM_SIGNALS,
     PRODUCTS,
     RATES,
     RP,
     TIME,
-    WIDTH,
     G,
     R,
     S,
 )
 
-LOAD, DELAY = slice(0, 16), 16
+LOAD_PARAMETERS, DELAY_PARAMETER = slice(0, 16), 16
 """Positions of the 16 parameters [offsets; phi] and of the delay."""
-_SIZES = {
+_EXTENSION_SIZES = {
     "gravity": 3,
     "weight": 4,
     "torque factor": 1,
@@ -39,14 +39,14 @@ _SIZES = {
     "drift": 18,
     "cable": 12,
 }
-_LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
+_EXTENSION_LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _R_OF_STEP = slice(16, 25)
 _LARGEST_DELAY = 0.03  # s, in an iteration
 _ROTATION_STEP = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
-_V = coefficients()[:, 6:, 7:19]
-_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
+_SYMMETRIC_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,14 @@ class Model:
     axes: Array = field(default_factory=lambda: np.eye(3))
     factor: float = 1.0
 
-    def extended(self, part: str) -> Model:
+    def with_extension(self, part: str) -> Model:
         return self if part in self.parts else replace(self, parts=(*self.parts, part))
 
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Position of each extension's parameters in the parameter vector."""
-        out, at = {}, DELAY + 1
-        sizes = [(name, _SIZES[name]) for name in self.parts]
+        out, at = {}, DELAY_PARAMETER + 1
+        sizes = [(name, _EXTENSION_SIZES[name]) for name in self.parts]
         sizes += [(f"gain {c}", 1) for c in self.gains]
         sizes += [(f"step {i}", step.size) for i, step in enumerate(self.steps)]
         for name, size in sizes:
@@ -96,56 +96,60 @@ class Model:
 
     @property
     def size(self) -> int:
-        return max([DELAY + 1, *(x.stop for x in self.slices.values())])
+        return max([DELAY_PARAMETER + 1, *(x.stop for x in self.slices.values())])
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
         """Indices (k,) of the signals in y that the model uses."""
         wide = bool({"gravity", "cable"} & set(self.parts))
-        kept = np.ones(WIDTH + len(MOTION) * len(self.steps), bool)
+        kept = np.ones(NUM_SIGNALS + len(MOTION) * len(self.steps), bool)
         if not wide:
             kept[R], kept[RP] = False, False
             for i in range(len(self.steps)):
-                kept[_step_columns(i)][_R_OF_STEP] = False
+                kept[_columns_of_step(i)][_R_OF_STEP] = False
         return np.flatnonzero(kept)
 
     @cached_property
     def limits(self) -> Array:
         """Largest change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
-        out[DELAY] = _LARGEST_DELAY
+        out[DELAY_PARAMETER] = _LARGEST_DELAY
         for name, where in self.slices.items():
-            out[where] = _LIMITS.get(name.split(" ")[0] if "gain" in name else name, np.inf)
+            out[where] = _EXTENSION_LIMITS.get(
+                name.split(" ")[0] if "gain" in name else name, np.inf
+            )
         return out
 
     @property
-    def times(self) -> tuple[float, ...]:
+    def step_times(self) -> tuple[float, ...]:
         return tuple(step.time for step in self.steps)
 
-    def start(self, x: Array, of: Model) -> Array:
+    def start_parameters(self, x: Array, of: Model) -> Array:
         """Return parameters (size,) from parameters x of the model `of`; new ones are 0."""
         out = np.zeros(self.size)
-        out[: DELAY + 1] = x[: DELAY + 1]
+        out[: DELAY_PARAMETER + 1] = x[: DELAY_PARAMETER + 1]
         for name, where in self.slices.items():
             if name in of.slices:
                 out[where] = x[of.slices[name]]
         return out
 
-    def wrench(self, x: Array) -> Array:
+    def wrench_coefficients(self, x: Array) -> Array:
         """Return the wrench's coefficients (B, 6, W) in the signals, for parameters x (B, size)."""
-        width, parts = WIDTH + len(MOTION) * len(self.steps), self.slices
-        motion = self._motion(x)
+        width, parts = NUM_SIGNALS + len(MOTION) * len(self.steps), self.slices
+        motion = self._motion_coefficients(x)
         out = np.zeros((len(x), 6, width))
-        out[..., :WIDTH] = _load(x[:, 6:16]) @ motion
+        out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
-                out[..., _step_columns(i)] = _load(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
+                out[..., _columns_of_step(i)] = (
+                    _load_coefficients(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
+                )
         if "weight" in parts:
-            static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _V[:, :4, :3])
+            static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
             out[..., G] += static  # - V(-g) w
         if "cable" in parts:
-            out[..., :WIDTH] += _cable(x[:, parts["cable"]])
-        turned = self._rotations(x)
+            out[..., :NUM_SIGNALS] += _cable_coefficients(x[:, parts["cable"]])
+        turned = self._sensor_rotations(x)
         out[:, :3], out[:, 3:] = turned @ out[:, :3], turned @ out[:, 3:]
         factor = np.full(len(x), self.factor)
         if "torque factor" in parts:
@@ -153,25 +157,25 @@ class Model:
         out[:, 3:] *= factor[:, None, None]
         for c in self.gains:
             out[:, c] *= 1.0 + x[:, parts[f"gain {c}"]]
-        self._add_constants(out, x)
+        self._add_constant_extensions(out, x)
         return out
 
-    def _add_constants(self, out: Array, x: Array) -> None:
+    def _add_constant_extensions(self, out: Array, x: Array) -> None:
         channels = np.arange(6)
-        out[:, :, ONE] += x[:, :6]
-        out[:, channels, RATES.start + channels] += x[:, DELAY, None]
+        out[:, :, CONSTANT_COLUMN] += x[:, :6]
+        out[:, channels, RATES.start + channels] += x[:, DELAY_PARAMETER, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _step_columns(i).start] += x[:, self.slices[f"step {i}"]]
+                out[:, :, _columns_of_step(i).start] += x[:, self.slices[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
             if name in self.slices:
                 rows = x[:, self.slices[name]].reshape(-1, 6, degree)
                 out[:, :, TIME.start : TIME.start + degree] += rows
 
-    def _motion(self, x: Array) -> Array:
+    def _motion_coefficients(self, x: Array) -> Array:
         parts = self.slices
         varied = "gravity" in parts or "frame" in parts
-        M = np.zeros((len(x) if varied else 1, 12, WIDTH))
+        M = np.zeros((len(x) if varied else 1, 12, NUM_SIGNALS))
         for rows, where in ((slice(0, 3), S), (slice(3, 6), ALPHA), (slice(6, 12), PRODUCTS)):
             M[:, rows, where] = np.eye(rows.stop - rows.start)
         if "gravity" in parts:
@@ -184,39 +188,39 @@ class Model:
             M[:, :3, PRODUCTS] += centripetal_matrix(r)
         return M
 
-    def _rotations(self, x: Array) -> Array:
+    def _sensor_rotations(self, x: Array) -> Array:
         if "rotation" not in self.slices:
             return self.axes[None]
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
 
-    def derivative(self, x: Array) -> Array:
+    def wrench_derivative(self, x: Array) -> Array:
         """Return the derivative (size, 6, k) of the wrench's coefficients by parameters x."""
         steps = np.ones(self.size)
         if "rotation" in self.slices:
             steps[self.slices["rotation"]] = _ROTATION_STEP
         moves = np.diag(steps)
-        both = self.wrench(np.vstack([x + moves, x - moves]))
+        both = self.wrench_coefficients(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
-    def residual(self, x: Array) -> Array:
+    def residual_coefficients(self, x: Array) -> Array:
         """Return coefficients (6, k) of the residual in the signals, for parameters x (size,)."""
-        out = -self.wrench(x[None])[0]
+        out = -self.wrench_coefficients(x[None])[0]
         out[np.arange(6), FORCES.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])
 
 
-def _step_columns(i: int) -> slice:
-    return slice(WIDTH + len(MOTION) * i, WIDTH + len(MOTION) * (i + 1))
+def _columns_of_step(i: int) -> slice:
+    return slice(NUM_SIGNALS + len(MOTION) * i, NUM_SIGNALS + len(MOTION) * (i + 1))
 
 
-def _load(phi: Array) -> Array:
-    return np.einsum("bj,cjk->bck", phi, _V)
+def _load_coefficients(phi: Array) -> Array:
+    return np.einsum("bj,cjk->bck", phi, _REGRESSOR_TENSOR)
 
 
-def _cable(x: Array) -> Array:
-    out = np.zeros((len(x), 6, WIDTH))
-    K = x[:, 3:9][:, _SYMMETRIC]
+def _cable_coefficients(x: Array) -> Array:
+    out = np.zeros((len(x), 6, NUM_SIGNALS))
+    K = x[:, 3:9][:, _SYMMETRIC_INDICES]
     for i in range(3):
         out[:, i, R.start + 3 * i : R.start + 3 * i + 3] = x[:, :3]
         out[:, i, RP.start + 9 * i : RP.start + 9 * i + 9] = K.reshape(-1, 9)

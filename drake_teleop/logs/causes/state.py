@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.instants import FORCES, ORDER, PRODUCTS, RP, Instants, R
+from drake_teleop.logs.causes.instants import FORCES, MAX_NOISE_LAG, PRODUCTS, RP, Instants, R
 from drake_teleop.logs.causes.model import Model
 
 _MIN_NOISE_ROWS = 50
@@ -27,69 +27,75 @@ class Rows:
     times: tuple[float, ...]
     columns: NDArray[np.intp]
 
-    def fits(self, model: Model) -> bool:
-        return self.times == model.times and np.array_equal(self.columns, model.columns)
+    def has_columns_of(self, model: Model) -> bool:
+        return self.times == model.step_times and np.array_equal(self.columns, model.columns)
 
     @cached_property
     def y(self) -> Array:
-        return self.data.only(self.used).with_steps(self.times)[:, self.columns]
+        return self.data.select_rows(self.used).append_step_signals(self.times)[:, self.columns]
 
     @cached_property
-    def sums(self) -> Array:
+    def lagged_product_sums(self) -> Array:
         """Sums (5, W, W) of products of the signals at lags 0 to 4."""
-        return np.asarray(self.data.sums(self.y, rows=len(self.y))[0])
+        return np.asarray(self.data.lagged_products(self.y, rows=len(self.y))[0])
 
     @cached_property
-    def whole(self) -> NDArray[np.intp]:
+    def rows_with_predecessors(self) -> NDArray[np.intp]:
         """Indices of rows whose four predecessors are used, too."""
         whole = self.used.copy()
-        whole[:ORDER] = False
-        for d in range(1, ORDER + 1):
+        whole[:MAX_NOISE_LAG] = False
+        for d in range(1, MAX_NOISE_LAG + 1):
             whole[d:] &= self.used[:-d]
         return np.flatnonzero(whole)
 
     @cached_property
-    def _partial(self) -> Array:
-        padded = np.concatenate([self.used, np.zeros(ORDER, bool)])
+    def _rows_without_predecessors(self) -> Array:
+        padded = np.concatenate([self.used, np.zeros(MAX_NOISE_LAG, bool)])
         near = padded.copy()
-        for d in range(1, ORDER + 1):
+        for d in range(1, MAX_NOISE_LAG + 1):
             near[d:] |= padded[:-d]
-        near[self.whole] = False
-        at = np.flatnonzero(near)[:, None] - np.arange(ORDER + 1)
-        y = np.vstack([self.y, np.zeros((2 * ORDER, self.y.shape[1]))])
+        near[self.rows_with_predecessors] = False
+        at = np.flatnonzero(near)[:, None] - np.arange(MAX_NOISE_LAG + 1)
+        y = np.vstack([self.y, np.zeros((2 * MAX_NOISE_LAG, self.y.shape[1]))])
         return np.asarray(y[at])
 
-    def whitened(self, filters: Array) -> Array:
+    def whitened_products(self, filters: Array) -> Array:
         """Return sums of products (6, n, n) of n signals, after each channel's 5-tap filter."""
         width = self.y.shape[1]
-        taps = [(filters[:, : ORDER + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
-        full = np.stack(taps, axis=1) @ self.sums.reshape(ORDER + 1, -1)
+        taps = [
+            (filters[:, : MAX_NOISE_LAG + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)
+        ]
+        full = np.stack(taps, axis=1) @ self.lagged_product_sums.reshape(MAX_NOISE_LAG + 1, -1)
         out = full.reshape(6, width, width)
-        edge = np.tensordot(filters, self._partial, axes=(1, 1))
+        edge = np.tensordot(filters, self._rows_without_predecessors, axes=(1, 1))
         return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
 
-    def noise(self, residual: Array, floor: Array, order: int = ORDER) -> tuple[Array, Array]:
+    def noise_filters_and_power(
+        self, residual: Array, floor: Array, order: int = MAX_NOISE_LAG
+    ) -> tuple[Array, Array]:
         """Return whitening filters (6, 5) and noise power (6,) for the residual (6, W)."""
         e = self.y @ residual.T
-        filters = np.zeros((6, ORDER + 1))
+        filters = np.zeros((6, MAX_NOISE_LAG + 1))
         filters[:, 0] = 1.0
-        history = np.stack([e[self.whole - d] for d in range(ORDER + 1)], axis=2)
+        history = np.stack(
+            [e[self.rows_with_predecessors - d] for d in range(MAX_NOISE_LAG + 1)], axis=2
+        )
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
-        products /= max(len(self.whole), 1)
-        if order == 0 or len(self.whole) < _MIN_NOISE_ROWS:
+        products /= max(len(self.rows_with_predecessors), 1)
+        if order == 0 or len(self.rows_with_predecessors) < _MIN_NOISE_ROWS:
             return filters, np.maximum(products[:, 0, 0], floor)
-        inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(ORDER)
-        inner += 1e-300 * np.eye(ORDER)
+        inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(MAX_NOISE_LAG)
+        inner += 1e-300 * np.eye(MAX_NOISE_LAG)
         filters[:, 1:] = -np.linalg.solve(inner, products[:, 1:, :1])[..., 0]
         power = products[:, 0, 0] + (filters[:, 1:] * products[:, 0, 1:]).sum(axis=1)
         return filters, np.maximum(power, floor)
 
-    def rms(self, residual: Array) -> Array:
+    def residual_rms(self, residual: Array) -> Array:
         e = self.y @ residual.T
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
-def in_spans(data: Instants, spans: Spans) -> NDArray[np.bool_]:
+def is_in_spans(data: Instants, spans: Spans) -> NDArray[np.bool_]:
     inside = np.zeros(len(data.t), bool)
     for start, stop in spans:
         inside |= (data.t >= start) & (data.t <= stop)
@@ -97,7 +103,7 @@ def in_spans(data: Instants, spans: Spans) -> NDArray[np.bool_]:
 
 
 _MAX_ITERATIONS, _CONVERGENCE, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
-_RIDGE, _FLOOR = 1e-11, 1e-14
+_RIDGE, _NOISE_POWER_FLOOR = 1e-11, 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,38 +128,46 @@ class Fit:
     @property
     def likelihood(self) -> float:
         """Logarithm of the likelihood up to a constant."""
-        return -0.5 * len(self.rows.whole) * float(np.log(self.power).sum())
+        return -0.5 * len(self.rows.rows_with_predecessors) * float(np.log(self.power).sum())
 
-    def normal(self, model: Model, x: Array) -> tuple[Array, Array]:
+    def normal_equations(self, model: Model, x: Array) -> tuple[Array, Array]:
         """Return matrix and right-hand side of the normal equations at parameters x (size,)."""
-        whitened = self.rows.whitened(self.filters) / self.power[:, None, None]
-        J = model.derivative(x).transpose(1, 0, 2)
+        whitened = self.rows.whitened_products(self.filters) / self.power[:, None, None]
+        J = model.wrench_derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
         gram = (weighted @ J.transpose(0, 2, 1)).sum(axis=0)
         right = (weighted @ self.residual[:, :, None]).sum(axis=0)[:, 0]
         return 0.5 * (gram + gram.T), right
 
 
-def fit(
+def fit_model(
     model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
 ) -> Fit:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
     both = total.reshape(2, 3).sum(axis=1).repeat(3)
-    floor = np.maximum(_FLOOR * both, 1e-30)
-    filters = np.zeros((6, ORDER + 1))
+    floor = np.maximum(_NOISE_POWER_FLOOR * both, 1e-30)
+    filters = np.zeros((6, MAX_NOISE_LAG + 1))
     filters[:, 0] = 1.0
-    found = Fit(model, rows, x, np.zeros(0), model.residual(x), filters, np.maximum(both, floor))
+    found = Fit(
+        model,
+        rows,
+        x,
+        np.zeros(0),
+        model.residual_coefficients(x),
+        filters,
+        np.maximum(both, floor),
+    )
     for step in range(steps):
-        gram, right = found.normal(model, x)
+        gram, right = found.normal_equations(model, x)
         inverse = regularized_inverse(gram)
         move = inverse @ right
         move /= max(1.0, float(np.max(np.abs(move) / model.limits)))
         x = x + move
-        residual = model.residual(x)
-        order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else ORDER
-        filters, power = rows.noise(residual, floor, order)
+        residual = model.residual_coefficients(x)
+        order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else MAX_NOISE_LAG
+        filters, power = rows.noise_filters_and_power(residual, floor, order)
         found = Fit(model, rows, x, inverse, residual, filters, power)
         still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGENCE
         if still and step > _UNWEIGHTED_ITERATIONS:
@@ -171,7 +185,7 @@ def regularized_inverse(gram: Array) -> Array:
     return np.asarray(scale[:, None] * ((vectors / values) @ vectors.T) * scale)
 
 
-_SEGMENTS = 6
+_NUM_SMOOTH_SEGMENTS = 6
 _STIFFNESS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -184,21 +198,25 @@ class State:
     fit: Fit
 
     @classmethod
-    def of(
+    def fit_record(
         cls, data: Instants, model: Model, start: Array | None = None, spans: Spans = ()
     ) -> State:
-        used = data.used & ~in_spans(data, spans)
-        return cls(data, spans, fit(model, Rows(data, used, model.times, model.columns), start))
+        used = data.used & ~is_in_spans(data, spans)
+        return cls(
+            data, spans, fit_model(model, Rows(data, used, model.step_times, model.columns), start)
+        )
 
-    def extended(self, model: Model, start: Array | None = None, **options: int) -> State:
+    def refit(self, model: Model, start: Array | None = None, **options: int) -> State:
         if start is None:
-            start = model.start(self.x, self.model)
-        return State(self.data, self.spans, fit(model, self._rows_of(model), start, **options))
+            start = model.start_parameters(self.x, self.model)
+        return State(
+            self.data, self.spans, fit_model(model, self._rows_for_model(model), start, **options)
+        )
 
-    def _rows_of(self, model: Model) -> Rows:
-        if self.rows.fits(model):
+    def _rows_for_model(self, model: Model) -> Rows:
+        if self.rows.has_columns_of(model):
             return self.rows
-        return Rows(self.data, self.rows.used, model.times, model.columns)
+        return Rows(self.data, self.rows.used, model.step_times, model.columns)
 
     @property
     def model(self) -> Model:
@@ -208,7 +226,7 @@ class State:
     def x(self) -> Array:
         return self.fit.x
 
-    def extension(self, name: str) -> tuple[Array, Array]:
+    def parameters_of_extension(self, name: str) -> tuple[Array, Array]:
         """Return the parameters of a named extension of the model, and their covariance."""
         where = self.model.slices[name]
         return self.x[where], self.fit.covariance[where, where]
@@ -223,21 +241,23 @@ class State:
         if not self.spans:
             return self.fit.likelihood
         used = self.data.used & ~self.rows.used
-        inside = Rows(self.data, used, self.model.times, self.model.columns)
-        power = inside.noise(self.fit.residual, 1e-6 * self.fit.power)[1]
+        inside = Rows(self.data, used, self.model.step_times, self.model.columns)
+        power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
-        count = len(self.whole) - len(self.rows.whole)
+        count = len(self.state_without_contacts) - len(self.rows.rows_with_predecessors)
         return self.fit.likelihood - 0.5 * count * float(np.log(power).sum())
 
     @cached_property
-    def whole(self) -> Array:
-        return np.asarray(Rows(self.data, self.data.used, (), self.model.columns).whole)
+    def state_without_contacts(self) -> Array:
+        return np.asarray(
+            Rows(self.data, self.data.used, (), self.model.columns).rows_with_predecessors
+        )
 
     @cached_property
     def residual_ratio(self) -> float:
         """RMS residual over white noise, in the channel where this ratio is largest."""
         white = np.maximum(self.data.white, 1e-12)
-        return float(np.max(self.rows.rms(self.fit.residual) / white))
+        return float(np.max(self.rows.residual_rms(self.fit.residual) / white))
 
     @cached_property
     def smooth_misfit(self) -> float:
@@ -249,19 +269,19 @@ class State:
     def smooth_gain(self) -> tuple[float, int]:
         """Gain of twice the log likelihood by generic smooth signals, and their number."""
         y = self.data.y
-        part = np.linspace(0.0, _SEGMENTS, len(y), endpoint=False).astype(int)
+        part = np.linspace(0.0, _NUM_SMOOTH_SEGMENTS, len(y), endpoint=False).astype(int)
         columns = np.hstack(
             [
                 y[:, : PRODUCTS.stop],
                 y[:, R] if self.data.gravity_W is not None else y[:, :0],
-                y[:, RP] @ _springs().T if self.data.positions else y[:, :0],
-                part[:, None] == np.arange(1.0, _SEGMENTS),
+                y[:, RP] @ _spring_signals().T if self.data.positions else y[:, :0],
+                part[:, None] == np.arange(1.0, _NUM_SMOOTH_SEGMENTS),
             ]
         )
         e = self.rows.y @ self.fit.residual.T
-        whole, filters = self.rows.whole, self.fit.filters
+        whole, filters = self.rows.rows_with_predecessors, self.fit.filters
         gain, freedom = 0.0, 0
-        late = [columns[whole - d] for d in range(ORDER + 1)]
+        late = [columns[whole - d] for d in range(MAX_NOISE_LAG + 1)]
         for c in range(6):
             x = sum(a * part for a, part in zip(filters[c], late, strict=True))
             white = sum(a * e[whole - d, c] for d, a in enumerate(filters[c]))
@@ -271,10 +291,12 @@ class State:
 
     def score(self, model: Model) -> float:
         """Return the first-order gain of twice the log likelihood by fitting a larger model."""
-        x = model.start(self.x, self.model)
-        rows = self._rows_of(model)
-        residual = self.fit.residual if rows is self.rows else model.residual(x)
-        return likelihood_gain(*replace(self.fit, rows=rows, residual=residual).normal(model, x))[0]
+        x = model.start_parameters(self.x, self.model)
+        rows = self._rows_for_model(model)
+        residual = self.fit.residual if rows is self.rows else model.residual_coefficients(x)
+        return likelihood_gain(
+            *replace(self.fit, rows=rows, residual=residual).normal_equations(model, x)
+        )[0]
 
 
 def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
@@ -291,7 +313,7 @@ def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tu
     return float(np.sum(part**2 / values[kept])), int(kept.sum())
 
 
-def _springs() -> Array:
+def _spring_signals() -> Array:
     out = np.zeros((6, 3, 27))
     for row, (j, k) in enumerate(_STIFFNESS_PAIRS):
         for i in range(3):

@@ -20,18 +20,18 @@ from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Finding,
     edit_field,
-    load_edits,
     try_edit,
     with_opposite_sign,
+    wrench_and_motion_edits,
 )
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import (
-    SEARCH_RANGE,
+    DELAY_SEARCH_RANGE_S,
     estimate_delay,
     far_from_gaps,
-    low_passed,
+    low_pass_log,
+    remove_delay,
     resample,
-    undelayed,
     white_noise,
 )
 from drake_teleop.logs.read.canonical import Log
@@ -43,7 +43,7 @@ VALID_SHARE = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_IMPROVEMENT = 4.0
 """Smallest factor by which an edit must reduce the unexplained share."""
-_FALSE_ALARMS, _TESTED_EDITS = 1e-6, 50
+_FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _CUTOFF_HZ = 15.0
 _ALREADY_SIGNED = ("sign", "swapped axes")  # mirrored axes are a cause that `identify` names
 _FREE_SHARE = 0.75
@@ -75,10 +75,10 @@ class LoadFit:
 def load_fit(log: Log, kept_share: float = 1.0) -> LoadFit:
     """Fit a load and offsets to the share of a log that fits best, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
-    smooth = low_passed(log, cutoff).only(far_from_gaps(log, cutoff))
+    smooth = low_pass_log(log, cutoff).select_rows(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
-    scale = _scale(wrench)
+    scale = _channel_scales(wrench)
     V = regressor(*(x[rows] for x in smooth.motion))
     if "weight" in log.free and smooth.gravity is not None:
         rest = np.zeros_like(smooth.gravity[rows])
@@ -112,65 +112,65 @@ def _least_squares(V: Array, w: Array) -> Array:
 
 def unexplained_share(wrench: Array, residual: Array) -> float:
     """Return the variance of a residual (N, 6) over that of the wrench (N, 6)."""
-    scale = _scale(wrench)
+    scale = _channel_scales(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
 
 
-def _scale(wrench: Array) -> Array:
+def _channel_scales(wrench: Array) -> Array:
     force, torque = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1))
     least = 1e-9 * float(np.abs(wrench).max()) + 1e-15
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
-def decisive_factor(fit: LoadFit) -> float:
+def min_reduction_factor(fit: LoadFit) -> float:
     """Return the factor by which a correction must reduce the unexplained share of a fit."""
     n = max(1.0, fit.independent)
-    return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARMS / _TESTED_EDITS)))
+    return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
 
 
 UNDETERMINED_SHARE = 0.9
 """Unexplained share of the wrench's variance above which a load is undetermined."""
 SMALLEST_LAG_S = 0.002
 """Smallest reported delay [s]."""
-_PARTS, _FEWEST_PARTS = 8, 4
+_NUM_DELAY_PARTS, _MIN_DELAY_PARTS = 8, 4
 _SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
-_HALVED = 0.5
+_SUFFICIENT_REDUCTION = 0.5
 
 
 def check_wrench(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
     """Return findings about wrench, orientation and clocks, and the motion's delay [s]."""
-    log = data.read(description)
+    log = data.read_whole_log(description)
     delay = None if log.static else estimate_delay(log, 30.0)
-    thin = data.thin(description)
+    thin = data.read_thinned_log(description)
 
-    def fitted(edited: Description, kept_share: float = 1.0) -> LoadFit:
+    def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFit:
         # A wrong description may cause a wrong delay.
-        log = _edit_wrench(thin, description, edited) or data.thin(edited)
-        fits = [load_fit(undelayed(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
+        log = _log_with_edited_wrench(thin, description, edited) or data.read_thinned_log(edited)
+        fits = [load_fit(remove_delay(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
-    given = fitted(description)
+    given = fit_edited_description(description)
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
-    inside = delay is not None and abs(delay) < 0.9 * SEARCH_RANGE
+    inside = delay is not None and abs(delay) < 0.9 * DELAY_SEARCH_RANGE_S
     edits: list[tuple[Finding | None, Description]] = []
     if not (given.good and inside):
-        edits += _clock_edits(description, thin)
+        edits += _clock_offset_edits(description, thin)
     if not given.good:
-        edits = [*load_edits(description), *edits]
-    found = _better_edits(fitted, given, edits)
+        edits = [*wrench_and_motion_edits(description), *edits]
+    found = _better_edits(fit_edited_description, given, edits)
     if not found and not given.good and not log.static:  # contact may hide what fits
-        without_contact = partial(fitted, kept_share=_FREE_SHARE)
+        without_contact = partial(fit_edited_description, kept_share=_FREE_SHARE)
         found = _better_edits(without_contact, without_contact(description), edits)
     if not found and given.good:
         return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
-        return _without_remedy(description, log, given, delay)
+        return _findings_without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
     equals = [(finding, edited) for fit, finding, edited in found if fit.unexplained <= least]
     finding, edited = equals[0]
-    delay = None if log.static else estimate_delay(data.read(edited), 30.0)
+    delay = None if log.static else estimate_delay(data.read_whole_log(edited), 30.0)
     if finding is None:  # The edit shifted the clock of the wrench to the nearest 20 ms.
         assert description.wrench is not None and edited.wrench is not None
         shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
@@ -199,7 +199,7 @@ def _better_edits(
             both = with_opposite_sign(finding, edited)
             negative.append((replace(fit, mass=-fit.mass), *both))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid, decisive = VALID_SHARE + given.noise, given.unexplained / decisive_factor(given)
+    valid, decisive = VALID_SHARE + given.noise, given.unexplained / min_reduction_factor(given)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -208,12 +208,12 @@ def _better_edits(
 def _is_delay_significant(log: Log, delay: float | None) -> bool:
     if delay is None:
         return False
-    none, aligned = load_fit(log), load_fit(undelayed(log, delay))
+    none, aligned = load_fit(log), load_fit(remove_delay(log, delay))
     gain = none.independent * np.log(none.unexplained / (aligned.unexplained + 1e-30))
     return bool(gain > 25.0)
 
 
-def _edit_wrench(log: Log, old: Description, new: Description) -> Log | None:
+def _log_with_edited_wrench(log: Log, old: Description, new: Description) -> Log | None:
     a, b = old.wrench, new.wrench
     if a is None or b is None or "base" in (a.frame, b.frame):
         return None
@@ -233,10 +233,10 @@ def _edit_wrench(log: Log, old: Description, new: Description) -> Log | None:
     return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
 
-def _without_remedy(
+def _findings_without_remedy(
     description: Description, log: Log, given: LoadFit, delay: float | None
 ) -> tuple[list[Finding], float | None]:
-    smooth = low_passed(log, 30.0)
+    smooth = low_pass_log(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
     finding = payload_finding(load, given.unexplained - given.noise)
@@ -270,20 +270,20 @@ def payload_finding(load: Identification, unexplained: float) -> Finding | None:
     )
 
 
-def _clock_edits(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
+def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
     if description.wrench is None:
         return
     reach = min(2.0, 0.25 * float(log.t[-1] - log.t[0]))
-    smooth = low_passed(log, min(5.0, 0.2 / log.dt))
+    smooth = low_pass_log(log, min(5.0, 0.2 / log.dt))
     t = np.linspace(log.t[0] + reach, log.t[-1] - reach, 300)
     wrench = resample(t, smooth.t, smooth.wrench)
 
-    def cost(shift: float) -> float:
+    def unexplained_at_shift(shift: float) -> float:
         s, omega, alpha = (resample(t + shift, smooth.t, x) for x in smooth.motion)
         return load_fit(Log(t, wrench, s, omega, alpha)).unexplained
 
     shifts = np.arange(-reach, reach + 1e-9, 0.02)
-    best = float(shifts[int(np.argmin([cost(x) for x in shifts]))])
+    best = float(shifts[int(np.argmin([unexplained_at_shift(x) for x in shifts]))])
     if abs(best) < reach - 0.03:
         offset = description.wrench.time.offset + best
         yield None, edit_field(description, "wrench.time.offset", offset)
@@ -314,18 +314,22 @@ def drift_finding(description: Description, data: LogData) -> tuple[list[Finding
     stream = getattr(description, name)
     if stream is None or description.wrench is None or (description.imu and description.pose):
         return [], description
-    log = data.thin(description)
-    line = _delay_line(log)
+    log = data.read_thinned_log(description)
+    line = _fit_delay_over_time(log)
     if line is None:
         return [], description
     late, slope = line
-    start = data.start(stream, description) - data.start(description.wrench, description)
+    start = data.start_time_of_stream(stream, description) - data.start_time_of_stream(
+        description.wrench, description
+    )
     scale = 1.0 / (1.0 + slope)
     lag = scale * (late + slope * start)
     offset, factor = stream.time.offset - lag, scale * stream.time.scale
     edited = edit_field(description, f"{name}.time.offset", offset)
     edited = edit_field(edited, f"{name}.time.scale", factor)
-    if _unexplained_without_delay(data.thin(edited)) > _HALVED * _unexplained_without_delay(log):
+    if _unexplained_without_delay(
+        data.read_thinned_log(edited)
+    ) > _SUFFICIENT_REDUCTION * _unexplained_without_delay(log):
         return [], description
     finding = Finding(
         "clock",
@@ -336,16 +340,16 @@ def drift_finding(description: Description, data: LogData) -> tuple[list[Finding
     return [finding], edited
 
 
-def _delay_line(log: Log) -> tuple[float, float] | None:
+def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
     span = float(log.t[-1] - log.t[0])
-    edges = np.linspace(0, len(log), _PARTS + 1).astype(int)
+    edges = np.linspace(0, len(log), _NUM_DELAY_PARTS + 1).astype(int)
     found = []
     for a, b in pairwise(edges):
-        part = log.only(slice(int(a), int(b)))
+        part = log.select_rows(slice(int(a), int(b)))
         delay = estimate_delay(part, 15.0)
         if delay is not None:
             found.append((0.5 * float(part.t[0] + part.t[-1]), delay))
-    if len(found) < _FEWEST_PARTS:
+    if len(found) < _MIN_DELAY_PARTS:
         return None
     t, delays = np.array(found).T
     slope, late = np.polyfit(t, delays, 1)
@@ -358,6 +362,6 @@ def _delay_line(log: Log) -> tuple[float, float] | None:
 
 def _unexplained_without_delay(log: Log) -> float:
     try:
-        return load_fit(undelayed(log, estimate_delay(log, 15.0) or 0.0)).unexplained
+        return load_fit(remove_delay(log, estimate_delay(log, 15.0) or 0.0)).unexplained
     except DrakeTeleopError:
         return np.inf

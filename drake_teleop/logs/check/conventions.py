@@ -23,7 +23,7 @@ from drake_teleop.logs.check.against_load import (
 )
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
-    MOTION_ERRORS,
+    MOTION_FINDINGS,
     Finding,
     correct_gravity_unit,
 )
@@ -31,16 +31,16 @@ from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu
 from drake_teleop.logs.check.log_data import LogData, channel_findings
 from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.description import NO_YAML, Description, load_description
+from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
-from drake_teleop.logs.read.table_files import FORMATS, read_table
+from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table
 
-_REST_RMS = 0.3, 0.1
+_MIN_MOTION_RMS = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _FEWEST_POSES = 6
 """Fewest poses that allow a check of the fit."""
-_SMALLEST_SPREAD = 0.15
+_MIN_DIRECTION_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
 _CONSTANT_SHARE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
@@ -62,13 +62,13 @@ class Conventions:
 
 
 def check_file(path: Path) -> Conventions:
-    if path.suffix.lower() in FORMATS:
+    if path.suffix.lower() in TABLE_READERS:
         table = read_table(path)
         return check_conventions(describe_canonical(path, table), str(path), {path: table})
     return check_conventions(load_description(path), str(path))
 
 
-def question_fit(
+def check_suspicious_load(
     log: Log,
     load: Identification,
     predicted: Array,
@@ -80,7 +80,7 @@ def question_fit(
     The load predicts the wrench `predicted` (N, 6). `check` checks the log's description against
     its data. Raise DrakeTeleopError if the load is useless and a finding has a remedy.
     """
-    if _never_changes(log):
+    if _is_wrench_constant(log):
         raise DrakeTeleopError(
             "the wrench is the same in all samples: no load can be identified",
             where=log.source,
@@ -91,8 +91,8 @@ def question_fit(
     clocks = log.static or (delay is not None and abs(delay) < MIN_CLOCK_ERROR_S)
     if load.mass > 0 and unexplained < GOOD_SHARE and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
-        return tuple(_findings(check)) if _is_suspicious(log) else ()
-    found = _findings(check)
+        return tuple(_findings_without_lag(check)) if _is_suspicious(log) else ()
+    found = _findings_without_lag(check)
     if any(finding.name == "payload" for finding in found):
         own = payload_finding(load, unexplained)
         found = [own if own and f.name == "payload" else f for f in found]
@@ -102,7 +102,7 @@ def question_fit(
     negative = load.mass < 0 and bool(load.identifiable[6])
     worthless = negative or unexplained > 0.5 or any(f.name == "units" for f in found)
     if worthless and not log.static:
-        _check_moves(log)
+        _require_motion(log)
     if found and worthless:
         what = f"the fitted mass is {load.mass:.4g} kg"
         if not negative:
@@ -118,20 +118,20 @@ def question_fit(
     return tuple(found)
 
 
-def errors_of_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
+def findings_about_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
     """Return the findings of `check` that concern the described motion, not the wrench."""
-    return tuple(x for x in _findings(check) if x.name in MOTION_ERRORS)
+    return tuple(x for x in _findings_without_lag(check) if x.name in MOTION_FINDINGS)
 
 
-def _findings(check: Callable[[], Conventions]) -> list[Finding]:
+def _findings_without_lag(check: Callable[[], Conventions]) -> list[Finding]:
     with suppress(ValueError, ArithmeticError):  # the log itself was readable
         return [finding for finding in check().findings if finding.name != "lag"]
     return []
 
 
-def _check_moves(log: Log) -> None:
+def _require_motion(log: Log) -> None:
     s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
-    if s < _REST_RMS[0] and omega < _REST_RMS[1]:
+    if s < _MIN_MOTION_RMS[0] and omega < _MIN_MOTION_RMS[1]:
         seconds = log.t[-1] - log.t[0]
         raise DrakeTeleopError(
             f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
@@ -142,9 +142,9 @@ def _check_moves(log: Log) -> None:
 
 
 def _is_suspicious(log: Log) -> bool:
-    if log.static or log.described is None or Path(log.source).suffix.lower() in FORMATS:
+    if log.static or log.described is None or Path(log.source).suffix.lower() in TABLE_READERS:
         return False
-    few = log.only(slice(None, None, max(1, int(0.01 / log.dt))))
+    few = log.select_rows(slice(None, None, max(1, int(0.01 / log.dt))))
     if (np.ptp(few.wrench, axis=0) < 1e-9 * np.abs(few.wrench).max()).any():
         return True
     with suppress(ValueError, ArithmeticError):
@@ -156,36 +156,38 @@ def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
     with one_blas_thread():
-        found = _check(LogData(description, source, dict(tables or {})), description)
-    if Path(source).suffix.lower() not in FORMATS:
+        found = _check_description(LogData(description, source, dict(tables or {})), description)
+    if Path(source).suffix.lower() not in TABLE_READERS:
         return found
     # A canonical table has no description to edit.
-    findings = (replace(f, message=f"{f.message} ({NO_YAML})") for f in found.findings)
+    findings = (replace(f, message=f"{f.message} ({ONLY_IN_DESCRIPTION})") for f in found.findings)
     return replace(found, findings=tuple(findings))
 
 
-def _never_changes(log: Log) -> bool:
+def _is_wrench_constant(log: Log) -> bool:
     return bool((np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * np.abs(log.wrench).max()).all())
 
 
-def _check(data: LogData, description: Description) -> Conventions:
-    log = data.read(description)
-    if _never_changes(log):
+def _check_description(data: LogData, description: Description) -> Conventions:
+    log = data.read_whole_log(description)
+    if _is_wrench_constant(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
         return Conventions((Finding("dead channel", message),), LoadFit(1.0, 0.0), None, None)
     if "gravity" in log.free and log.described is not None:  # determine it once, not for each edit
         description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
     if dead:  # A dead channel would cause wrong findings about motion and load.
-        return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
+        return Conventions(
+            (*dead, *broken), load_fit(data.read_thinned_log(description)), None, None
+        )
     findings, description = correct_gravity_unit(description, log)
-    more, description = check_imu_signals(description, data.thin(description))
+    more, description = check_imu_signals(description, data.read_thinned_log(description))
     findings += more
     mounting = None
     if description.imu and description.pose:
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
-    fit = load_fit(data.thin(description))
+    fit = load_fit(data.read_thinned_log(description))
     if broken or (mounting is not None and mounting.mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
     if "weight" in log.free:  # the checks below require the weight of the load in the wrench
@@ -196,14 +198,14 @@ def _check(data: LogData, description: Description) -> Conventions:
         lag = 0.0 if mounting is None else mounting.lag_s
         findings += position_finding(description, data, lag)
     more, delay = check_wrench(description, data)
-    findings = _one_clock(description, [*findings, *more], mounting, delay)
-    rest = _rest_finding(log)
+    findings = _merge_clock_findings(description, [*findings, *more], mounting, delay)
+    rest = _static_poses_finding(log)
     if rest is not None:
         findings.append(rest)
     return Conventions(tuple(findings), fit, mounting, delay)
 
 
-def _one_clock(
+def _merge_clock_findings(
     description: Description,
     findings: list[Finding],
     mounting: Mounting | None,
@@ -223,7 +225,7 @@ def _one_clock(
     return [finding, *(other for other in findings if other.name != "clock")]
 
 
-def _rest_finding(log: Log) -> Finding | None:
+def _static_poses_finding(log: Log) -> Finding | None:
     if not log.static:
         return None
     if len(log) < _FEWEST_POSES:
@@ -234,7 +236,7 @@ def _rest_finding(log: Log) -> Finding | None:
         )
     up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
     least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
-    if least >= _SMALLEST_SPREAD:
+    if least >= _MIN_DIRECTION_SPREAD:
         return None
     angle = float(np.degrees(np.arcsin(least)))
     return Finding(

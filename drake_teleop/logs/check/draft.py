@@ -12,19 +12,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drake_teleop.common.texts import yaml_text
+from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.read.description_fields import (
     FORCE_UNITS,
     POSITION_UNITS,
+    SI_VALUE_OF_UNIT,
     TORQUE_UNITS,
-    UNITS,
 )
 from drake_teleop.logs.read.tables import Table
 
-_TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
+_TIME_NAME_PATTERN = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
 # Ends of the names of vectors, before the axis.
-_VECTORS = {
+_VECTOR_NAME_PATTERNS = {
     "force": "f|forces?",
     "torque": "t|m|tau|torques?|moment",
     "specific_force": "a|s|acc|accel|(?<!angular_)acceleration",
@@ -33,14 +33,14 @@ _VECTORS = {
     "position": "p|pos|position|translation|tcp|ee|eef",
 }
 # Names of three angles, without their unit, and the axes about which they turn.
-_EULER = {
+_EULER_ANGLE_NAMES = {
     ("roll", "pitch", "yaw"): "xyz",
     ("yaw", "pitch", "roll"): "ZYX",
     ("a", "b", "c"): "ZYX",  # of KUKA
     ("w", "p", "r"): "xyz",  # of Fanuc
 }
 # Names of numbered columns, and positions of the components of a vector.
-_NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
+_NUMBERED_COLUMN_PATTERNS: dict[str, dict[str, tuple[int, ...]]] = {
     r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)f$|(^|_)ft(_[a-z]+)?$": {
         "force": (0, 1, 2),
         "torque": (3, 4, 5),
@@ -51,15 +51,15 @@ _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
         "position": (12, 13, 14),
     },
 }
-_HOMOGENEOUS = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
-_MATRIX = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
-_IN_BASE = r"tcp_force$|^o_f_ext"
+_HOMOGENEOUS_MATRIX_PLACES = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
+_MATRIX_ELEMENT_NAMES = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+_BASE_FRAME_PATTERN = r"tcp_force$|^o_f_ext"
 _ROBOT_NOTES = {
     r"tcp_force$": "The TCP's force excludes the payload set in the controller: set it to 0.",
     r"f_ext": "An external wrench is an estimate that excludes the load that is set in the robot.",
 }
 _UNIT_NAMES = {
-    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*UNITS, "g")},
+    **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*SI_VALUE_OF_UNIT, "g")},
     "µs": "us",
     "°": "deg",
     "dps": "deg/s",
@@ -68,7 +68,7 @@ _UNIT_NAMES = {
     "n*m": "N m",
     "n.m": "N m",
 }
-_UNITS = {
+_ALLOWED_UNITS = {
     "force": FORCE_UNITS,
     "torque": TORQUE_UNITS,
     "specific_force": ("m/s^2", "mm/s^2", "g"),
@@ -78,23 +78,23 @@ _UNITS = {
     "euler": ("rad", "deg"),
     "time": ("s", "ms", "us", "ns"),
 }
-_POSE_VECTOR = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
-_POSE_WIDTHS = (7, 8)
+_POSE_VECTOR_PATTERN = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
+_POSE_VECTOR_WIDTHS = (7, 8)
 _QUATERNION_TOLERANCE = 0.01  # of the length
-_NUMBERED_QUATERNION = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
+_NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
-_MIN_COUNTS = 2000.0  # median of integers that are raw counts
+_MIN_RAW_COUNT = 2000.0  # median of integers that are raw counts
 _FILL_IN = "FILL IN"
 _TIME_FIELDS = ("column", "nanoseconds")
-_COUNTER = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
+_COUNTER_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
-_NANOSECONDS = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
-_COUNTS = (
+_NANOSECOND_NAMES = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
+_RAW_COUNTS_NOTE = (
     "Force and torque are raw counts. scale is the value of one count in N and N m, from the"
     " manual of the sensor: 1e-6 for 1000000 counts per N. The data contain only the ratio of both."
 )
-_WITHOUT_TORQUE = "A force alone is not enough: the commands need force and torque."
-_WITHOUT_TIME = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
+_NO_TORQUE_NOTE = "A force alone is not enough: the commands need force and torque."
+_NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
 
 
 class Draft(NamedTuple):
@@ -104,7 +104,7 @@ class Draft(NamedTuple):
     head: list[str]
 
     def text(self) -> str:
-        return yaml_text(self.streams, head=self.head)
+        return to_yaml_text(self.streams, head=self.head)
 
     def corrected(self, finding: Finding) -> Draft:
         streams = copy.deepcopy(self.streams)
@@ -141,41 +141,52 @@ class _Columns(NamedTuple):
     unit: str
 
 
-_NOTHING = _Columns([], "")
+_NO_COLUMNS = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
     """Guess a log description from the names and magnitudes of a table's columns."""
-    plain = {name: _normalized(name) for name in table.columns}
-    found = _pose_vectors(table, plain) | _vectors(plain) | _euler_angles(plain)
-    found |= _numbered(plain) | _numbered_quaternion(table, plain) | _arrays(table, plain)
+    plain = {name: _split_name_and_unit(name) for name in table.columns}
+    found = _find_pose_vectors(table, plain) | _find_vectors(plain) | _find_euler_angles(plain)
+    found |= (
+        _find_numbered_columns(plain)
+        | _find_quaternion(table, plain)
+        | _find_array_columns(table, plain)
+    )
     _resolve_translation(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
-    def stream(**groups: Any) -> dict[str, Any]:
+    def stream_of_groups(**groups: Any) -> dict[str, Any]:
         beside = next(iter(groups.values()))["columns"][0]
-        return {**file, "time": _time(table, plain, beside), **groups}
+        return {**file, "time": _draft_time(table, plain, beside), **groups}
 
     none = _Columns([_FILL_IN] * 3, "")
-    wrench = stream(
-        **{kind: _group(table, kind, found.get(kind, none)) for kind in ("force", "torque")}, sign=1
+    wrench = stream_of_groups(
+        **{
+            kind: _draft_quantity(table, kind, found.get(kind, none))
+            for kind in ("force", "torque")
+        },
+        sign=1,
     )
-    forces = [_without_number(plain[name][0]) for name in found.get("force", _NOTHING).columns[:1]]
-    if any(re.search(_IN_BASE, name) for name in forces):
+    forces = [
+        _remove_trailing_number(plain[name][0])
+        for name in found.get("force", _NO_COLUMNS).columns[:1]
+    ]
+    if any(re.search(_BASE_FRAME_PATTERN, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
     if "force" in found or "torque" in found:
         draft["wrench"] = wrench
     imu = {
-        kind: _group(table, kind, found[kind])
+        kind: _draft_quantity(table, kind, found[kind])
         for kind in ("specific_force", "angular_velocity")
-        if _width(table, found.get(kind, _NOTHING)) == 3
+        if _width_of_columns(table, found.get(kind, _NO_COLUMNS)) == 3
     }
     if imu:
-        draft["imu"] = stream(**imu)
-    pose = _pose(table, found)
+        draft["imu"] = stream_of_groups(**imu)
+    pose = _draft_pose(table, found)
     if pose:
-        draft["pose"] = stream(**pose)
+        draft["pose"] = stream_of_groups(**pose)
     if not draft:
         draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
@@ -183,7 +194,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
     if _FILL_IN in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
-        draft = _static(draft)
+        draft = _streams_of_static_poses(draft)
     times = {stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_FIELDS}
     used |= times - {None}
     arrays = _array_names(table)
@@ -196,16 +207,15 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
         "above all wrench.sign, units and frames.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
-        *([_WITHOUT_TORQUE] if "force" in found and "torque" not in found else []),
-        *([_WITHOUT_TIME] if _FILL_IN in times else []),
-        *([_COUNTS] if f"'scale': '{_FILL_IN}'" in str(draft) else []),
+        *([_NO_TORQUE_NOTE] if "force" in found and "torque" not in found else []),
+        *([_NO_TIME_NOTE] if _FILL_IN in times else []),
+        *([_RAW_COUNTS_NOTE] if f"'scale': '{_FILL_IN}'" in str(draft) else []),
         *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return Draft(draft, head)
 
 
-def _static(draft: dict[str, Any]) -> dict[str, Any]:
-    """Return the streams as poses at rest (`static`), if wrench and orientation are known."""
+def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
     pose, wrench = draft.get("pose"), draft.get("wrench")
     if pose is None or wrench is None or _is_template(wrench):
         return draft
@@ -213,7 +223,7 @@ def _static(draft: dict[str, Any]) -> dict[str, Any]:
     return {"static": {**kept, "orientation": pose["orientation"]}}
 
 
-def _normalized(name: str) -> tuple[str, str]:
+def _split_name_and_unit(name: str) -> tuple[str, str]:
     """Return the words of a column's name, and its unit: `Fx [N]`, `Fx (N)` or `Fx_N`."""
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
@@ -223,13 +233,13 @@ def _normalized(name: str) -> tuple[str, str]:
     return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
 
-def _without_number(plain: str) -> str:
+def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     found: dict[str, _Columns] = {}
-    for kind, names in _VECTORS.items():
+    for kind, names in _VECTOR_NAME_PATTERNS.items():
         axes = "wxyz" if kind == "orientation" else "xyz"
         ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
         groups: dict[str, dict[str, str]] = {}
@@ -245,13 +255,12 @@ def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     return found
 
 
-def _euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    """Return three columns of angles, named as in `_EULER` after a common prefix."""
+def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
         prefix, _, end = words.rpartition("_")
         ends.setdefault(prefix, {}).setdefault(end, name)
-    for names, axes in _EULER.items():
+    for names, axes in _EULER_ANGLE_NAMES.items():
         for group in ends.values():
             if all(name in group for name in names):
                 columns = [group[name] for name in names]
@@ -260,20 +269,18 @@ def _euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
 
 
 def _resolve_translation(found: dict[str, _Columns], plain: dict[str, tuple[str, str]]) -> None:
-    """Take tx, ty, tz without a force as a position, as in TUM files, not as a torque."""
-    torque = found.get("torque", _NOTHING).columns
+    torque = found.get("torque", _NO_COLUMNS).columns
     bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
     if bare and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
 
 
-def _pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    """Return position and quaternion of numbered columns, which may end with a gripper's width."""
+def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
-        if re.search(_POSE_VECTOR, words):
-            groups.setdefault(_without_number(words), []).append(name)
-    for columns in (group for group in groups.values() if len(group) in _POSE_WIDTHS):
+        if re.search(_POSE_VECTOR_PATTERN, words):
+            groups.setdefault(_remove_trailing_number(words), []).append(name)
+    for columns in (group for group in groups.values() if len(group) in _POSE_VECTOR_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
             if _have_unit_length(table, quaternion):
@@ -283,28 +290,27 @@ def _pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, 
 
 
 def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
-    length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
+    length = np.linalg.norm(table.raw_side_by_side(quaternion, ""), axis=1)
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
 
 
-def _numbered_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    """Return four columns such as q1, q2, q3, q4 of ABB, if they have unit length."""
+def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
-        if re.search(_NUMBERED_QUATERNION, words):
-            groups.setdefault(_without_number(words), []).append(name)
+        if re.search(_NUMBERED_QUATERNION_PATTERN, words):
+            groups.setdefault(_remove_trailing_number(words), []).append(name)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _have_unit_length(table, group)), None)
     return {"orientation": _Columns(found, "")} if found else {}
 
 
-def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(r"\d$", words):
-            groups.setdefault(_without_number(words), []).append(name)
+            groups.setdefault(_remove_trailing_number(words), []).append(name)
     found: dict[str, _Columns] = {}
-    for start, kinds in _NUMBERED.items():
+    for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
         for base in sorted(fit, key=lambda name: "target" in name)[:1]:
@@ -312,20 +318,20 @@ def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
                 columns = [groups[base][k] for k in places]
                 found[kind] = _Columns(columns, plain[columns[0]][1])
     by_words = {words: name for name, (words, _) in plain.items()}
-    if all(word in by_words for word in _MATRIX):
-        found["matrix"] = _Columns([by_words[word] for word in _MATRIX], "")
+    if all(word in by_words for word in _MATRIX_ELEMENT_NAMES):
+        found["matrix"] = _Columns([by_words[word] for word in _MATRIX_ELEMENT_NAMES], "")
     return found
 
 
-def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     found: dict[str, _Columns] = {}
     arrays = _array_names(table)
-    for kind, names in {**_VECTORS, "matrix": "r|rot|rotation(_matrix)?"}.items():
+    for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
             words, unit = plain[name]
             whole = _Columns([name], unit)
-            fits = _width(table, whole) == width
+            fits = _width_of_columns(table, whole) == width
             form = kind
             if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
                 words = words[:-5]
@@ -333,7 +339,7 @@ def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Colum
             if form not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
                 found[form] = whole
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
-        for kind, places in _HOMOGENEOUS.items():
+        for kind, places in _HOMOGENEOUS_MATRIX_PLACES.items():
             found[kind] = _Columns([f"{name}[{k}]" for k in places], "")
     return found
 
@@ -342,17 +348,17 @@ def _array_names(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _width(table: Table, found: _Columns) -> int:
+def _width_of_columns(table: Table, found: _Columns) -> int:
     return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
 
 
-def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
+def _draft_quantity(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(found.columns)}
     if kind in ("force", "torque") and _are_counts(table, found.columns):
         group["scale"] = _FILL_IN
     if found.unit:
         unit = _UNIT_NAMES.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
-        group["unit"] = unit if unit in _UNITS[kind] else _FILL_IN
+        group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN
         return group
     if _FILL_IN in found.columns or kind in ("force", "torque"):
         return group
@@ -367,35 +373,37 @@ def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
 
 
 def _are_counts(table: Table, columns: list[str]) -> bool:
-    """Return whether columns contain integers too large for a force in N: raw sensor counts."""
     if _FILL_IN in columns:
         return False
     first = table.raw(columns[0], columns[0])
-    if not np.nanmedian(np.abs(first)) > _MIN_COUNTS:
+    if not np.nanmedian(np.abs(first)) > _MIN_RAW_COUNT:
         return False
     return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
 
 
-def _pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
-    if _width(table, found.get("orientation", _NOTHING)) == 4:
+def _draft_pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
+    if _width_of_columns(table, found.get("orientation", _NO_COLUMNS)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
         orientation = {"columns": found[form].columns, "form": form}
-    elif euler := next((name for name in found if name in _EULER.values()), None):
-        orientation = _group(table, "euler", found[euler]) | {"form": "euler", "axes": euler}
+    elif euler := next((name for name in found if name in _EULER_ANGLE_NAMES.values()), None):
+        orientation = _draft_quantity(table, "euler", found[euler]) | {
+            "form": "euler",
+            "axes": euler,
+        }
     elif (name := "rotation_vector") in found:
-        orientation = _group(table, name, found[name]) | {"form": name}
+        orientation = _draft_quantity(table, name, found[name]) | {"form": name}
     else:
         return {}
     pose: dict[str, Any] = {"orientation": orientation}
-    if _width(table, found.get("position", _NOTHING)) == 3:
-        pose["position"] = _group(table, "position", found["position"])
+    if _width_of_columns(table, found.get("position", _NO_COLUMNS)) == 3:
+        pose["position"] = _draft_quantity(table, "position", found["position"])
     return pose
 
 
-def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[str, Any]:
-    named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
-    named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
+def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[str, Any]:
+    named = [name for name, (words, _) in plain.items() if re.search(_TIME_NAME_PATTERN, words)]
+    named += [name for name, (_, unit) in plain.items() if unit.lower() in _ALLOWED_UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
     named = named or _clock_columns(table, plain)
     if not named:
@@ -411,31 +419,30 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
     unit = _UNIT_NAMES.get(plain[named[0]][1].lower(), "")
     start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
     parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
-    for end in _NANOSECONDS if start != plain[named[0]][0] else ():
+    for end in _NANOSECOND_NAMES if start != plain[named[0]][0] else ():
         if start + end in parts:
             return {"column": named[0], "nanoseconds": parts[start + end]}
     return {
         "column": named[0],
-        "unit": unit if unit in _UNITS["time"] else _time_unit(table, named[0]),
+        "unit": unit if unit in _ALLOWED_UNITS["time"] else _guess_time_unit(table, named[0]),
     }
 
 
 def _clock_columns(table: Table, plain: dict[str, tuple[str, str]]) -> list[str]:
-    """Return the columns that increase in nearly equal steps, but are no counters of rows."""
-
     def is_clock(name: str) -> bool:
         values = np.asarray(table.columns[name])
         if values.ndim != 1 or values.dtype.kind not in "fiu" or len(values) < _MIN_CLOCK_ROWS:
             return False
         steps = np.diff(values.astype(float))
         even = np.ptp(np.quantile(steps, [0.1, 0.9])) < steps.mean()
-        return bool((steps > 0.0).all() and even and not re.search(_COUNTER, plain[name][0]))
+        is_counter = re.search(_COUNTER_PATTERN, plain[name][0])
+        return bool((steps > 0.0).all() and even and not is_counter)
 
     return [name for name in plain if is_clock(name)]
 
 
-def _time_unit(table: Table, column: str) -> str:
-    step = float(np.median(np.abs(np.diff(table.single(column, column)))))
+def _guess_time_unit(table: Table, column: str) -> str:
+    step = float(np.median(np.abs(np.diff(table.single_column(column, column)))))
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if step * scale <= 0.3:
             return unit

@@ -21,22 +21,22 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description, Imu
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
 
-DEGREE_RATIOS = (40.0, 80.0)
+RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
 MIN_GRAVITY_ERROR = 0.02
 """Smallest reported error of gravity; calibrated sensors are within 1 %."""
 _SIGNIFICANT = 5.0
 _MIN_CORRELATION = 0.8
-_BAND_HZ = 5.0
-_MAX_OWN_SHARE = 0.5
+_COMPARISON_CUTOFF_HZ = 5.0
+_MAX_UNSWAPPED_SHARE = 0.5
 _WINDOW_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
-_ROTATION_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
+_GYRO_AXES_RATE_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
 
 
 def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding], Description]:
     """Return contradictions among the signals of an IMU, and the corrected description."""
     imu = description.imu
-    if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
+    if imu is None or imu.angular_velocity is None or log.static or imu.is_mounting_auto:
         return [], description
     unit = _angle_unit_finding(imu, log)
     if unit is not None:
@@ -44,13 +44,13 @@ def check_imu_signals(description: Description, log: Log) -> tuple[list[Finding]
     if imu.specific_force is None or imu.frame == "base":
         return [], description
     gravity = float(np.linalg.norm(description.gravity_W))
-    axes = _gyro_axes(imu, log, gravity)
+    axes = _gyro_axes_finding(imu, log, gravity)
     if axes is not None:
         finding, columns = axes
         if columns is not None:
             description = edit_field(description, "imu.angular_velocity.columns", columns)
         return [finding], description
-    alpha = _alpha_axes(imu, log)
+    alpha = _angular_acceleration_axes_finding(imu, log)
     if alpha is not None:
         return [alpha], description
     scale = _gravity_finding(imu, log, gravity)
@@ -66,7 +66,7 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     correlation = float(np.sum(given_alpha * derived_alpha))
     if min(sizes) == 0.0 or correlation < _MIN_CORRELATION * sizes[0] * sizes[1]:
         return None
-    ratio, (least, most) = sizes[0] / sizes[1], DEGREE_RATIOS
+    ratio, (least, most) = sizes[0] / sizes[1], RANGE_OF_DEGREES_PER_RADIAN
     for wrong, quantity, unit, other in (
         (ratio, "angular_acceleration", "rad/s^2", "deg/s^2"),
         (1.0 / ratio, "angular_acceleration", "deg/s^2", "rad/s^2"),
@@ -81,13 +81,13 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
 
 def _angular_accelerations(log: Log) -> tuple[Array, Array]:
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    given = low_pass(log.angular_acceleration, log.dt, _BAND_HZ)
-    return given, low_pass(rate, log.dt, _BAND_HZ)
+    given = low_pass(log.angular_acceleration, log.dt, _COMPARISON_CUTOFF_HZ)
+    return given, low_pass(rate, log.dt, _COMPARISON_CUTOFF_HZ)
 
 
-def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
+def _gyro_axes_finding(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
     assert imu.angular_velocity is not None
-    few = log.only(slice(None, None, max(1, round(1.0 / (_ROTATION_HZ * log.dt)))))
+    few = log.select_rows(slice(None, None, max(1, round(1.0 / (_GYRO_AXES_RATE_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
     if not given > _MIN_MISFIT:
         return None
@@ -113,7 +113,7 @@ def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | Non
     ), ordered
 
 
-def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
+def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
     if imu.angular_acceleration is None:
         return None
     given_alpha, derived_alpha = _angular_accelerations(log)
@@ -121,7 +121,7 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     alike = given_alpha.T @ derived_alpha / size
     best = max(signed_permutations(), key=lambda P: float(np.sum(alike * P)))
     largest = np.sum(alike * best)
-    if largest < _MIN_CORRELATION or np.trace(alike) > _MAX_OWN_SHARE * largest:
+    if largest < _MIN_CORRELATION or np.trace(alike) > _MAX_UNSWAPPED_SHARE * largest:
         return None
     axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
     return Finding(
@@ -132,7 +132,7 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     )
 
 
-def _mean_forces(log: Log, P: Array) -> Array:
+def _windowed_specific_forces(log: Log, P: Array) -> Array:
     """Return specific forces (2, n, 3) in Hann windows, and half a window later [m/s^2]."""
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
     half = max(1, int(0.5 * length / log.dt))
@@ -153,7 +153,7 @@ def _mean_forces(log: Log, P: Array) -> Array:
 
 
 def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
-    means = _mean_forces(log, P) / gravity
+    means = _windowed_specific_forces(log, P) / gravity
     if means.shape[1] == 0:
         return np.nan
     off = np.linalg.norm(means, axis=2) - 1.0
@@ -161,7 +161,7 @@ def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
 
 
 def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
-    forces = _mean_forces(log, np.eye(3))[0]
+    forces = _windowed_specific_forces(log, np.eye(3))[0]
     if len(forces) < _MIN_WINDOWS:
         return None
     ratios = np.linalg.norm(forces, axis=1) / gravity
@@ -190,27 +190,27 @@ def check_imu_against_pose(
 ) -> tuple[list[Finding], Mounting | None, Description]:
     """Return contradictions of IMU and pose, the IMU's mounting, and the corrected description."""
 
-    def mounting(edited: Description) -> Mounting | None:
+    def fit_mounting(edited: Description) -> Mounting | None:
         pose_alone = edited.model_copy(update={"imu": None})
-        return find_mounting(data.thin(edited), data.thin(pose_alone))
+        return find_mounting(data.read_thinned_log(edited), data.read_thinned_log(pose_alone))
 
-    given = mounting(description)
+    given = fit_mounting(description)
     if given is None:
         return [], None, description
     findings: list[Finding] = []
-    if given.unexplained > GOOD_SHARE or given.mirrored or given.angle_deg > 10:
+    if given.unexplained > GOOD_SHARE or given.mirrored or given.rotation_angle_deg > 10:
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
-            if (found := try_edit(mounting, edited)) and not found.mirrored
+            if (found := try_edit(fit_mounting, edited)) and not found.mirrored
         ]
         limit = min(VALID_SHARE, given.unexplained / MIN_IMPROVEMENT)
         if given.mirrored:
-            better = [entry for entry in better if entry[3].angle_deg < 10]
-        elif given.angle_deg > 10 and given.unexplained < VALID_SHARE:
+            better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
+        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_SHARE:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
-            better = [entry for entry in better if entry[3].angle_deg < 10]
+            better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
             limit = min(VALID_SHARE, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0], default=None)
         if best and best[0] < limit:
@@ -219,7 +219,7 @@ def check_imu_against_pose(
     if given.unexplained > VALID_SHARE and not given.mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
-        finding, description = _imu_clock(description, given, data)
+        finding, description = _correct_imu_clock(description, given, data)
         findings.append(finding)
     if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
         text = f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
@@ -231,22 +231,28 @@ def check_imu_against_pose(
             " has the wrong sign; correct imu.specific_force.columns"
         )
         findings.append(Finding("swapped axes", text))
-    elif given.angle_deg > 10:
+    elif given.rotation_angle_deg > 10:
         assert description.imu is not None
         old = np.eye(3)
         if isinstance(description.imu.frame, tuple):
             old = np.array(description.imu.frame)
-        frame = np.array(given.right_angled if given.is_right_angled else given.R_SI) @ old
+        frame = (
+            np.array(given.nearest_right_angled_rotation if given.is_right_angled else given.R_SI)
+            @ old
+        )
         shown = np.round(frame, 4).tolist()
         kind = "swapped axes" if given.is_right_angled else "mounting"
-        text = f"the IMU is turned by {given.angle_deg:.0f} deg against S; set imu.frame: {shown}"
+        text = (
+            f"the IMU is turned by {given.rotation_angle_deg:.0f} deg against S; set imu.frame:"
+            f" {shown}"
+        )
         oblique = "" if given.is_right_angled else " (not a right-angled mounting)"
         findings.append(Finding(kind, text + oblique))
         description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))
     return findings, given, description
 
 
-def _imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
+def _correct_imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
     assert description.imu is not None and description.wrench is not None
     time = description.imu.time
     if not found.drift:
@@ -257,7 +263,9 @@ def _imu_clock(description: Description, found: Mounting, data: LogData) -> Edit
             f" set imu.time.offset: {offset:.3f}",
         )
         return finding, edit_field(description, "imu.time.offset", offset)
-    start = data.start(description.imu, description) - data.start(description.wrench, description)
+    start = data.start_time_of_stream(description.imu, description) - data.start_time_of_stream(
+        description.wrench, description
+    )
     scale = 1 / (1 + found.drift)
     lag = scale * (found.lag_middle_s + found.drift * (start - found.middle_s))
     offset, factor = time.offset - lag, scale * time.scale

@@ -20,7 +20,7 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread_shared_stamps, time_stamps_s
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import read_description
-from drake_teleop.logs.read.streams import MINIMUM_SAMPLES
+from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
 _RATE_HZ = 100.0
@@ -35,25 +35,25 @@ class LogData:
         self.tables = tables
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
-        streams = _streams(description)
+        streams = _described_streams(description)
         for stream in streams.values():
             if stream.source not in tables:
                 tables[stream.source] = read_stream(stream)
-            steps.setdefault(stream.source, []).append(self._stride(stream))
+            steps.setdefault(stream.source, []).append(self._thinning_stride(stream))
         for name, stream in streams.items():
             thin = self._thinned.setdefault(
                 stream.source,
                 replace(tables[stream.source], columns=dict(tables[stream.source].columns)),
             )
-            self._thin(name, stream, thin, min(steps[stream.source]))
+            self._add_thinned_columns(name, stream, thin, min(steps[stream.source]))
 
-    def read(self, description: Description) -> Log:
+    def read_whole_log(self, description: Description) -> Log:
         return read_description(description, self._source, tables=self.tables)
 
-    def thin(self, description: Description) -> Log:
+    def read_thinned_log(self, description: Description) -> Log:
         """Return the log at about 100 Hz, as a description defines it."""
         stamped = {}
-        for name, stream in _streams(description).items():
+        for name, stream in _described_streams(description).items():
             if (time := getattr(stream, "time", None)) is not None:
                 column = {"column": f"{_TIME_COLUMN} {name}", "unit": "s"}
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
@@ -61,63 +61,65 @@ class LogData:
         description = description.model_copy(update=stamped)
         return read_description(description, self._source, tables=self._thinned)
 
-    def start(self, stream: Any, description: Description) -> float:
+    def start_time_of_stream(self, stream: Any, description: Description) -> float:
         """Return the time of a stream's first row on the common clock [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
-        return float(self._stamps(stream)[0][0]) + float(stream.time.offset)
+        return float(self._times_and_rows(stream)[0][0]) + float(stream.time.offset)
 
-    def _stride(self, stream: Any) -> int:
+    def _thinning_stride(self, stream: Any) -> int:
         time: Time | None = getattr(stream, "time", None)
         if time is None:
             return 1
-        t, _ = self._stamps(stream)
+        t, _ = self._times_and_rows(stream)
         if len(t) < 2:  # read_log raises the error
             return 1
         rate = 1 / max(1e-12, float(np.median(np.diff(t))))
         # A short record keeps enough samples.
-        most = min(rate / _RATE_HZ, len(t) / MINIMUM_SAMPLES)
+        most = min(rate / _RATE_HZ, len(t) / MIN_STREAM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
-    def _table(self, stream: Any) -> Table:
-        return self.tables[stream.source].filled(stream.columns)
+    def _table_of_stream(self, stream: Any) -> Table:
+        return self.tables[stream.source].rows_with_numbers(stream.columns)
 
-    def _stamps(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
+    def _times_and_rows(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
         if stream.time.column is None:
-            rows = np.arange(self._table(stream).rows)
+            rows = np.arange(self._table_of_stream(stream).rows)
             return rows / stream.time.rate, rows
-        t, _ = time_stamps_s(stream.time, self._table(stream), "time")
+        t, _ = time_stamps_s(stream.time, self._table_of_stream(stream), "time")
         rows = np.flatnonzero(np.isfinite(t))
         t = t[rows]
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
         return (spread_shared_stamps(t) if shared else t), rows
 
-    def _thin(self, name: str, stream: Any, thin: Table, k: int) -> None:
-        table, rows = self._table(stream), None
+    def _add_thinned_columns(self, name: str, stream: Any, thin: Table, k: int) -> None:
+        table, rows = self._table_of_stream(stream), None
         if getattr(stream, "time", None) is not None:
-            t, rows = self._stamps(stream)
-            thin.columns[f"{_TIME_COLUMN} {name}"] = _means(t[:, None], k)
+            t, rows = self._times_and_rows(stream)
+            thin.columns[f"{_TIME_COLUMN} {name}"] = _means_of_consecutive_rows(t[:, None], k)
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
                 x = table.raw(column, field)
                 x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
                 taken = x[k // 2 :: k][: len(x) // k]
-                thin.columns[column] = taken if field == "orientation" else _means(x, k)
+                thin.columns[column] = (
+                    taken if field == "orientation" else _means_of_consecutive_rows(x, k)
+                )
 
 
-def _streams(description: Description) -> dict[str, Any]:
+def _described_streams(description: Description) -> dict[str, Any]:
     streams = {name: getattr(description, name) for name in ("wrench", "imu", "pose", "static")}
     return {name: stream for name, stream in streams.items() if stream is not None}
 
 
-def _means(x: Array, k: int) -> Array:
+def _means_of_consecutive_rows(x: Array, k: int) -> Array:
     rows = len(x) // k
     return x[: rows * k].reshape(rows, k, -1).mean(axis=1) if k > 1 else x
 
 
-_FIELDS = {
+_CHECKED_FIELDS = {
     "wrench": ("force", "torque"),
     "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
 }
@@ -131,18 +133,21 @@ def channel_findings(
     described = getattr(description, stream)
     found: list[Finding] = []
     named: dict[str, str] = {}
-    for field in _FIELDS[stream]:
+    for field in _CHECKED_FIELDS[stream]:
         quantity = getattr(described, field, None)
         if quantity is None:
             continue
         where = f"{stream}.{field}"
-        numbers = _numbers(tables[described.source], quantity.columns, where)
-        twice = _repeated_names(where, quantity.columns, named)
-        found += twice or [*_dead_channels(where, numbers), *_equal_channels(where, numbers)]
+        numbers = _channel_values(tables[described.source], quantity.columns, where)
+        twice = _repeated_column_findings(where, quantity.columns, named)
+        found += twice or [
+            *_dead_channel_findings(where, numbers),
+            *_equal_channel_findings(where, numbers),
+        ]
     return found
 
 
-def _numbers(table: Table, columns: Any, where: str) -> dict[str, Array]:
+def _channel_values(table: Table, columns: Any, where: str) -> dict[str, Array]:
     numbers: dict[str, Array] = {}
     for column in columns:
         x = table.raw(column, where)
@@ -151,7 +156,7 @@ def _numbers(table: Table, columns: Any, where: str) -> dict[str, Array]:
     return numbers
 
 
-def _repeated_names(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
+def _repeated_column_findings(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
     found = []
     for column, times in Counter(map(str, columns)).items():
         before = where if times > 1 else named.get(column)
@@ -168,7 +173,7 @@ def _repeated_names(where: str, columns: Any, named: dict[str, str]) -> list[Fin
     return found
 
 
-def _dead_channels(where: str, numbers: dict[str, Array]) -> list[Finding]:
+def _dead_channel_findings(where: str, numbers: dict[str, Array]) -> list[Finding]:
     spread = {name: float(np.ptp(x)) for name, x in numbers.items()}
     noise = white_noise(np.stack(list(numbers.values()), axis=1))
     alive = noise > _MIN_NOISE_SHARE * (np.array(list(spread.values())) + 1e-300)
@@ -186,7 +191,7 @@ def _dead_channels(where: str, numbers: dict[str, Array]) -> list[Finding]:
     ]
 
 
-def _equal_channels(where: str, numbers: dict[str, Array]) -> list[Finding]:
+def _equal_channel_findings(where: str, numbers: dict[str, Array]) -> list[Finding]:
     return [
         Finding(
             "repeated channel",

@@ -11,11 +11,11 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
-from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.alignment import low_pass, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.description_fields import POSITION_UNITS, UNITS
+from drake_teleop.logs.read.description_fields import POSITION_UNITS, SI_VALUE_OF_UNIT
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -24,18 +24,21 @@ _CUTOFF_HZ = 3.0
 _WORST_CONDITION = 1e8
 _SMALLEST_SHIFT, _LARGEST_DEVIATION = 0.02, 0.01  # m
 _SIGNIFICANT = 5.0  # standard deviations
-_UNIT_RANGE, _UNIT_ERROR = (0.7, 1.43), 0.15
+_UNIT_RANGE, _MAX_UNIT_DEVIATION = (0.7, 1.43), 0.15
 _UNKNOWN_UNIT = 50.0
-SHORTEST_S = 4.0
+MIN_POSES_DURATION_S = 4.0
 """Shorter records have too few frequencies for an estimate by poses alone [s]."""
 _UNIT_TOLERANCE, _NEAREST_COM, _FARTHEST_COM = 0.1, 2e-4, 1.5  # 1, m, m
 _TORQUE_UNITS = ("N m", "N mm", "lbf in")
 _UNIT_RATIOS = (
-    *(UNITS[unit] / UNITS[other] for unit, other in permutations(_TORQUE_UNITS, 2)),
-    *(UNITS["lbf"], 1.0 / UNITS["lbf"]),
+    *(
+        SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[other]
+        for unit, other in permutations(_TORQUE_UNITS, 2)
+    ),
+    *(SI_VALUE_OF_UNIT["lbf"], 1.0 / SI_VALUE_OF_UNIT["lbf"]),
 )
 """Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
-_SAME_COM = 0.03
+_COM_TOLERANCE = 0.03
 
 
 def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
@@ -46,10 +49,10 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     imu, pose = description.imu, description.pose
     if imu is None or pose is None or imu.specific_force is None or pose.position is None:
         return []
-    if imu.automatic or pose.automatic:
+    if imu.is_mounting_auto or pose.is_frame_auto:
         return []
-    sensed = data.thin(description)
-    posed = data.thin(description.model_copy(update={"imu": None}))
+    sensed = data.read_thinned_log(description)
+    posed = data.read_thinned_log(description.model_copy(update={"imu": None}))
     if sensed.gravity is None or posed.gravity is None:
         return []
     # Both logs begin with the wrench, so that their times are on one clock.
@@ -68,12 +71,12 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
         return []
     x, deviations = fit
     k = float(x[0])
-    unit = _position_unit(pose.position.unit, 1.0 / k, float(deviations[0]) / k**2)
+    unit = _position_unit_finding(pose.position.unit, 1.0 / k, float(deviations[0]) / k**2)
     if unit is not None:
         return [unit]
     shift, deviation = x[1:] / k, float(np.linalg.norm(deviations[1:]))
     size = float(np.linalg.norm(shift))
-    if abs(k - 1.0) > _UNIT_ERROR or deviation > _LARGEST_DEVIATION:
+    if abs(k - 1.0) > _MAX_UNIT_DEVIATION or deviation > _LARGEST_DEVIATION:
         return []
     if size < max(_SMALLEST_SHIFT, _SIGNIFICANT * deviation):
         return []
@@ -86,12 +89,12 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     return [Finding("pose frame", text)]
 
 
-def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
+def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding | None:
     if not abs(kappa) > _SIGNIFICANT * deviation:
         return None
     text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
     for unit in POSITION_UNITS:
-        ratio = UNITS[unit] / UNITS[now]
+        ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[now]
         if unit != now and _UNIT_RANGE[0] < kappa / ratio < _UNIT_RANGE[1]:
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
     if 1.0 / _UNKNOWN_UNIT < abs(kappa) < _UNKNOWN_UNIT:  # noise or another error
@@ -124,7 +127,11 @@ def _fit_with_offset(
 
 def has_usable_poses(log: Log) -> bool:
     """Return whether a log has poses over at least 4 s, as splines require."""
-    return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST_S
+    return (
+        log.posed is not None
+        and not log.static
+        and float(log.t[-1] - log.t[0]) >= MIN_POSES_DURATION_S
+    )
 
 
 def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
@@ -132,20 +139,24 @@ def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
     seen = found.seen
-    if pose is not None and pose.position is not None and seen.usable and not seen.mirrored:
-        unit = _position_unit(pose.position.unit, seen.kappa, seen.kappa_deviation)
+    if pose is not None and pose.position is not None and seen.is_usable and not seen.is_mirrored:
+        unit = _position_unit_finding(pose.position.unit, seen.kappa, seen.kappa_deviation)
         if unit is not None:
             return unit
     return frame_finding(found, log.posed)
 
 
-def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
+def frame_finding(found: PoseEstimate, posed: PosesOfLog) -> Finding | None:
     """Return a finding for a displaced or rotated pose frame, unless another error is likely."""
     frame, seen, phi = found.frame, found.seen, found.free.state.theta[6:]
     if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
         return None
     unit = abs(seen.kappa - 1.0) > max(_UNIT_TOLERANCE, 5.0 * seen.kappa_deviation)
-    if unit or (seen.usable and seen.mirrored) or _is_wrong_unit(phi[1:4] / phi[0], frame.p_SoPo_S):
+    if (
+        unit
+        or (seen.is_usable and seen.is_mirrored)
+        or _is_torque_unit_wrong(phi[1:4] / phi[0], frame.p_SoPo_S)
+    ):
         return None
     place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
     texts, lines = [], []
@@ -155,23 +166,23 @@ def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
         texts.append(
             f"its origin is [{shift}] mm from that of S in the axes of S (+- {deviation:.2g})"
         )
-        lines.append(f"pose.position_in_sensor: {_rounded(place)}")
+        lines.append(f"pose.position_in_sensor: {_rounded_for_yaml(place)}")
     if frame.turned:
         angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
         deviation = float(frame.turn_deviations_deg.max())
         texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
-        lines.append(f"pose.rotation_in_sensor: {_rounded(frame.R_SP @ posed.R_SP)}")
+        lines.append(f"pose.rotation_in_sensor: {_rounded_for_yaml(frame.R_SP @ posed.R_SP)}")
     return Finding(
         "pose frame",
         f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}",
     )
 
 
-def _is_wrong_unit(com: Array, shift: Array) -> bool:
+def _is_torque_unit_wrong(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
     off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _UNIT_RATIOS]
-    return not _NEAREST_COM < size < _FARTHEST_COM or bool(min(off) < _SAME_COM * size)
+    return not _NEAREST_COM < size < _FARTHEST_COM or bool(min(off) < _COM_TOLERANCE * size)
 
 
-def _rounded(x: Array) -> list[Any]:
+def _rounded_for_yaml(x: Array) -> list[Any]:
     return list((np.round(x, 4) + 0.0).tolist())

@@ -27,50 +27,53 @@ from drake_teleop.common.files import (
 from drake_teleop.common.html import render_page
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import show_progress
-from drake_teleop.common.texts import read_yaml, yaml_text
+from drake_teleop.common.texts import read_yaml, to_yaml_text
 from drake_teleop.load.contact.detection import ContactDetector
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.draft import Draft, draft_description
 from drake_teleop.logs.dataset.dataset_files import (
-    Columns,
     Dataset,
     Episode,
+    NewColumns,
     open_dataset,
     write_copy,
 )
 from drake_teleop.logs.dataset.episode_faults import Finding, name_faults, saturated_channels
 from drake_teleop.logs.dataset.episode_verdict import (
-    CALM_WIDTH,
+    HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
     Hypothesis,
-    calm_half,
     find_hypothesis,
-    offset_step,
-    unexplained,
+    find_offset_step,
+    spread_and_centre_of_calm_half,
+    unexplained_reading,
 )
 from drake_teleop.logs.dataset.shared_load import (
     SharedLoad,
-    contact_samples,
-    own_load,
-    shared_load,
+    find_shared_load,
+    load_of_episode,
+    samples_for_detector,
 )
-from drake_teleop.logs.figures import load_figures, plain
-from drake_teleop.logs.read.alignment import widened
+from drake_teleop.logs.figures import load_figures, to_plain_values
+from drake_teleop.logs.read.alignment import widen_flags
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import read_clock
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_description
 
-_MAX_CALIBRATION = 24  # episodes that determine load, lag and noise
-_DRAFTS, _CORRECTIONS, _DRAFT_SPACING = 3, 5, 3.0
+_MAX_CALIBRATION_EPISODES = 24  # episodes that determine load, lag and noise
+_MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS, _DRAFT_SPACING = 3, 5, 3.0
 _STREAMS = ("wrench", "imu", "pose")
-_UNDETERMINED = 1.5  # log spread beyond the usual one that no hypothesis explains
-_FREE_MARGIN, _FEWEST_FREE = 2, 20  # frames around contact; free frames for the offsets
-_WORK = "unfinished"
+_MAX_EXCESS_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
+_CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES = (
+    2,
+    20,
+)  # frames around contact; free frames for the offsets
+_WORK_FOLDER_NAME = "unfinished"
 
 
-class Task(NamedTuple):
+class EpisodeTask(NamedTuple):
     """Input for the verdict of an episode."""
 
     dataset: Dataset
@@ -110,16 +113,16 @@ def dataset_command(
         )
     make_folder(out)
     with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
-        streams = _streams(dataset, description)
+        streams = _described_or_drafted_streams(dataset, description)
         work = _work_folder(out, dataset, [str(load), known, streams])
-        shared = _shared(dataset, streams, known, stage("load"))
-        task = Task(dataset, streams, shared)
-        rows = _judge_all(task, work, jobs, stage("episodes"))
+        shared = _estimate_shared_load(dataset, streams, known, stage("load"))
+        task = EpisodeTask(dataset, streams, shared)
+        rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
         columns = [_read_columns(work / f"{k}.npy") for k in range(len(rows))]
         write_copy(dataset, copied, columns)
-        write_text(out / "description.yaml", yaml_text(streams))
+        write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
-        summary = plain(_summary(dataset, copied, shared, rows))
+        summary = to_plain_values(_dataset_summary(dataset, copied, shared, rows))
         report = render_page(
             "drake_teleop.logs", "dataset.html.j2", name=path.name, summary=summary
         )
@@ -127,14 +130,13 @@ def dataset_command(
         shutil.rmtree(work)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(summary, out)
+        _print_summary(summary, out)
     return summary
 
 
-def _streams(dataset: Dataset, description: Path | None) -> dict[str, Any]:
-    """Return the streams of the description, without file names."""
+def _described_or_drafted_streams(dataset: Dataset, description: Path | None) -> dict[str, Any]:
     if description is None:
-        return _drafted(dataset)
+        return _draft_streams_by_majority(dataset)
     data = read_yaml(description)
     if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
         raise DrakeTeleopError(
@@ -143,11 +145,11 @@ def _streams(dataset: Dataset, description: Path | None) -> dict[str, Any]:
     for name in _STREAMS:
         if isinstance(data.get(name), dict):
             data[name].pop("file", None)
-    _described(data, dataset.episodes[0], dataset.fps)  # report errors before the work
+    _description_of_episode(data, dataset.episodes[0], dataset.fps)  # report errors before the work
     return data
 
 
-def _described(streams: dict[str, Any], episode: Episode, fps: float) -> Description:
+def _description_of_episode(streams: dict[str, Any], episode: Episode, fps: float) -> Description:
     data = copy.deepcopy(streams)
     for name in _STREAMS:
         if name in data:
@@ -164,21 +166,21 @@ def _described(streams: dict[str, Any], episode: Episode, fps: float) -> Descrip
         ) from error
 
 
-def _drafted(dataset: Dataset) -> dict[str, Any]:
-    """Return the draft description that most of the first, middle and last episode give."""
+def _draft_streams_by_majority(dataset: Dataset) -> dict[str, Any]:
     count = len(dataset.episodes)
-    chosen = sorted({0, count // 2, count - 1})[:_DRAFTS]
-    drafts = [_draft(dataset, dataset.episodes[k]) for k in chosen]
+    chosen = sorted({0, count // 2, count - 1})[:_MAX_DRAFTED_EPISODES]
+    drafts = [_draft_streams(dataset, dataset.episodes[k]) for k in chosen]
     texts = Counter(json.dumps(draft, sort_keys=True) for draft in drafts)
     text, votes = texts.most_common(1)[0]
     streams = dict(json.loads(text)) if votes > 1 or count == 1 else drafts[0]
-    return _with_fitting_signs(dataset, streams, [dataset.episodes[k] for k in chosen])
+    return _choose_quaternion_order_and_sign(
+        dataset, streams, [dataset.episodes[k] for k in chosen]
+    )
 
 
-def _with_fitting_signs(
+def _choose_quaternion_order_and_sign(
     dataset: Dataset, streams: dict[str, Any], episodes: Sequence[Episode]
 ) -> dict[str, Any]:
-    """Return the streams with the quaternion order and the sign with which a load fits best."""
     form = streams.get("pose", {}).get("orientation", {}).get("form", "")
     found = []
     for order in ("quaternion_xyzw", "quaternion_wxyz") if "quaternion" in form else (form,):
@@ -189,7 +191,7 @@ def _with_fitting_signs(
         for episode in episodes:
             with suppress(DrakeTeleopError):
                 log, _ = _episode_log(dataset, tried, episode)
-                loads.append(own_load(EpisodeSignals(log, _DRAFT_SPACING)))
+                loads.append(load_of_episode(EpisodeSignals(log, _DRAFT_SPACING)))
         if loads:
             spread = float(np.median([x.spread.sum() for x in loads]))
             mass = float(np.median([x.phi[0] for x in loads if x.phi is not None]))
@@ -202,10 +204,10 @@ def _with_fitting_signs(
     return streams
 
 
-def _draft(dataset: Dataset, episode: Episode) -> dict[str, Any]:
-    table = dataset.table(episode)
+def _draft_streams(dataset: Dataset, episode: Episode) -> dict[str, Any]:
+    table = dataset.read_episode(episode)
     draft = draft_description(table, episode.file.parent)
-    streams = _without_files(draft, dataset.fps)
+    streams = _remove_file_names(draft, dataset.fps)
     if "FILL IN" in str(streams) or "wrench" not in streams or not {"pose", "imu"} & set(streams):
         raise DrakeTeleopError(
             "wrench, time and motion are not all recognized by the names of its columns"
@@ -213,8 +215,8 @@ def _draft(dataset: Dataset, episode: Episode) -> dict[str, Any]:
             where=f"{episode.file.name}: {episode.name}",
             remedy="give a --description, see docs/robot-learning.md",
         )
-    for _ in range(_CORRECTIONS):
-        described = _described(streams, episode, dataset.fps)
+    for _ in range(_MAX_CORRECTIONS):
+        described = _description_of_episode(streams, episode, dataset.fps)
         try:
             found = check_conventions(described, str(episode.file), {episode.file: table}).findings
         except DrakeTeleopError:
@@ -223,11 +225,11 @@ def _draft(dataset: Dataset, episode: Episode) -> dict[str, Any]:
         if fields is None:
             break
         draft = draft.corrected(fields)
-        streams = _without_files(draft, dataset.fps)
+        streams = _remove_file_names(draft, dataset.fps)
     return streams
 
 
-def _without_files(draft: Draft, fps: float) -> dict[str, Any]:
+def _remove_file_names(draft: Draft, fps: float) -> dict[str, Any]:
     streams = {name: dict(x) for name, x in draft.streams.items()}
     for stream in streams.values():
         stream.pop("file", None)
@@ -238,7 +240,10 @@ def _without_files(draft: Draft, fps: float) -> dict[str, Any]:
 
 def _episode_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tuple[Log, Array]:
     """Return the log of an episode, and the times (N,) of its rows on the log's clock [s]."""
-    table, described = dataset.table(episode), _described(streams, episode, dataset.fps)
+    table, described = (
+        dataset.read_episode(episode),
+        _description_of_episode(streams, episode, dataset.fps),
+    )
     source = f"{episode.file.name}: {episode.name}"
     tables = {episode.file: table}
     log = read_description(described, source, tables=tables, differentiate=False)
@@ -253,11 +258,10 @@ def _episode_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) ->
 
 
 def _work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
-    """Return the folder of results of this command, with those of an interrupted one."""
     files = sorted({episode.file for episode in dataset.episodes})
     states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     key = hashlib.sha256(repr((settings, states)).encode()).hexdigest()
-    work = out / _WORK
+    work = out / _WORK_FOLDER_NAME
     if work.is_dir() and (work / "key").is_file() and (work / "key").read_text() != key:
         shutil.rmtree(work)
     make_folder(work)
@@ -265,10 +269,10 @@ def _work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
     return work
 
 
-def _shared(
+def _estimate_shared_load(
     dataset: Dataset, streams: dict[str, Any], known: Identification | None, progress: Any
 ) -> SharedLoad:
-    step = -(-len(dataset.episodes) // _MAX_CALIBRATION)
+    step = -(-len(dataset.episodes) // _MAX_CALIBRATION_EPISODES)
     logs, errors = [], []
     for k, episode in enumerate(dataset.episodes[::step]):
         try:
@@ -278,69 +282,71 @@ def _shared(
         progress(0.5 * (k + 1) * step / len(dataset.episodes))
     if not logs:
         raise errors[0]
-    shared = shared_load(logs, known)
+    shared = find_shared_load(logs, known)
     progress(1.0)
     return shared
 
 
-def _judge_all(task: Task, work: Path, jobs: int, progress: Any) -> list[dict[str, Any]]:
+def _judge_all_episodes(
+    task: EpisodeTask, work: Path, jobs: int, progress: Any
+) -> list[dict[str, Any]]:
     from joblib import Parallel, delayed
 
     count = len(task.dataset.episodes)
     left = [k for k in range(count) if not (work / f"{k}.json").is_file()]
     progress(1.0 - len(left) / count)
     done = Parallel(n_jobs=jobs, return_as="generator_unordered")(
-        delayed(partial(_judge, task, work))(k) for k in left
+        delayed(partial(_judge_episode, task, work))(k) for k in left
     )
     for number, _ in enumerate(done, start=count - len(left) + 1):
         progress(number / count, f"{number} of {count}")
     return [json.loads((work / f"{k}.json").read_text(encoding="utf-8")) for k in range(count)]
 
 
-def _judge(task: Task, work: Path, number: int) -> None:
-    """Write columns and row of one episode; the row last, which marks it as complete."""
+def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
     episode = task.dataset.episodes[number]
     try:
         with one_blas_thread():
-            row, columns = _verdict(task, episode)
+            row, columns = _verdict_on_episode(task, episode)
     except DrakeTeleopError as error:
-        rows = task.dataset.table(episode).rows
-        columns = Columns(np.full((rows, 6), np.nan), np.zeros(rows, bool))
+        rows = task.dataset.read_episode(episode).rows
+        columns = NewColumns(np.full((rows, 6), np.nan), np.zeros(rows, bool))
         row = {"verdict": ["unusable"], "messages": [str(error)], "frames": rows}
     with whole_file(work / f"{number}.npy") as temporary, temporary.open("wb") as file:
         np.save(file, np.column_stack(columns))
-    write_json(work / f"{number}.json", plain({"episode": episode.name} | row))
+    write_json(work / f"{number}.json", to_plain_values({"episode": episode.name} | row))
 
 
-def _read_columns(path: Path) -> Columns:
+def _read_columns(path: Path) -> NewColumns:
     values = np.load(path, allow_pickle=False)
-    return Columns(values[:, :6], values[:, 6] > 0.5)
+    return NewColumns(values[:, :6], values[:, 6] > 0.5)
 
 
-def _verdict(task: Task, episode: Episode) -> tuple[dict[str, Any], Columns]:
-    """Return figures and new columns of an episode; named faults are corrected in the columns."""
+def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, Any], NewColumns]:
     shared = task.shared
     log, at = _episode_log(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log, shared.spacing)
-    predict = signals.predictor(shared.phi)
-    found = find_hypothesis(predict, signals.regress, shared.lag, shared.typical)
-    residual = unexplained(found, predict, signals.regress)
+    predict = signals.reading_predictor(shared.phi)
+    found = find_hypothesis(predict, signals.regressor_at_lag, shared.lag, shared.typical)
+    residual = unexplained_reading(found, predict, signals.regressor_at_lag)
     faults: list[Finding] = saturated_channels(log.wrench)
     faults += name_faults(found, shared.lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
-    step = offset_step(residual, found.spread)
+    step = find_offset_step(residual, found.spread)
     if step is not None:
         k, before, after = step
         offsets[:k], offsets[k:] = before, after
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
         faults.append(Finding("tared", text, float(log.t[k])))
-    spread = calm_half(residual - offsets, 0.1 * shared.typical)[0] - np.log(shared.typical)
+    spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * shared.typical)[0] - np.log(
+        shared.typical
+    )
     spread -= np.log(found.gain).repeat(3)
-    if not faults and spread.mean() > _UNDETERMINED:
+    if not faults and spread.mean() > _MAX_EXCESS_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
         faults.append(Finding("unexplained", f"{text} changes", None))
-    contact, touched = _without_load(shared, signals, found, residual - offsets)
+    contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
     rows = np.array([np.interp(at, log.t, x) for x in contact.T]).T
     nearest = np.clip(np.round((at - log.t[0]) / log.dt).astype(int), 0, len(log) - 1)
     free = contact[~touched]
@@ -356,25 +362,24 @@ def _verdict(task: Task, episode: Episode) -> tuple[dict[str, Any], Columns]:
         "free_rms": np.sqrt(np.mean(free**2, axis=0)) if len(free) else None,
         "notes": list(log.notes),
     }
-    return row, Columns(rows.astype(np.float32), touched[nearest])
+    return row, NewColumns(rows.astype(np.float32), touched[nearest])
 
 
-def _without_load(
+def _contact_wrench_and_flags(
     shared: SharedLoad, signals: EpisodeSignals, found: Hypothesis, residual: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return contact wrench and flags of contact; the offsets are the mean of the free frames."""
     for _ in range(3):
-        contact = found.correct(residual)
+        contact = found.wrench_of_reading(residual)
         detector = ContactDetector(shared.floor, shared.threshold, statistic="level", hold=1)
-        touched = detector.detect(*contact_samples(signals, found.lag, contact))
-        free = ~widened(touched, _FREE_MARGIN)
-        if free.sum() < _FEWEST_FREE:
+        touched = detector.detect(*samples_for_detector(signals, found.lag, contact))
+        free = ~widen_flags(touched, _CONTACT_MARGIN_FRAMES)
+        if free.sum() < _MIN_FREE_FRAMES:
             break
         residual = residual - residual[free].mean(axis=0)
     return contact, touched
 
 
-def _summary(
+def _dataset_summary(
     dataset: Dataset, copied: Path, shared: SharedLoad, rows: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
     names = Counter(name for row in rows for name in row["verdict"])
@@ -387,14 +392,14 @@ def _summary(
         "ok": names["ok"],
         "faults": dict(sorted((k, n) for k, n in names.items() if k != "ok")),
         "lag_frames": shared.lag,
-        "noise": shared.typical / CALM_WIDTH,
+        "noise": shared.typical / HALF_WIDTH_OF_NORMAL,
         "spline_frames": shared.spacing,
         "contact_threshold": shared.threshold,
         **load_figures(shared.identification),
     }
 
 
-def _print(summary: dict[str, Any], out: Path) -> None:
+def _print_summary(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
 
     show = partial(Console(soft_wrap=True).print, highlight=False, markup=False)

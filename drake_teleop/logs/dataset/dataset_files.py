@@ -20,14 +20,14 @@ from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, whole_file, write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.array_files import import_optional, read_hdf5, read_zarr
-from drake_teleop.logs.read.canonical import WRENCH
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.table_files import expanded_columns, read_table
+from drake_teleop.logs.read.table_files import columns_with_nested, read_table
 from drake_teleop.logs.read.tables import Table
 
 CONTACT_WRENCH, IN_CONTACT = "observation.contact_wrench", "observation.in_contact"
-_TABLES = (".csv", ".tsv", ".parquet")
-_JSON_OF_ZARR = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
+_TABLE_SUFFIXES = (".csv", ".tsv", ".parquet")
+_ZARR_METADATA_NAMES = (".zgroup", ".zattrs", ".zmetadata", "zarr.json")
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
@@ -41,7 +41,7 @@ class Episode(NamedTuple):
     group: str = ""
 
 
-class Columns(NamedTuple):
+class NewColumns(NamedTuple):
     """New columns of an episode: contact wrench (N, 6) and flags (N,) of contact."""
 
     contact_wrench: Array
@@ -56,24 +56,27 @@ class Dataset(NamedTuple):
     episodes: list[Episode]
     fps: float
 
-    def table(self, episode: Episode) -> Table:
+    def read_episode(self, episode: Episode) -> Table:
         """Return the columns of an episode."""
         if self.kind == "tables":
             return read_table(episode.file)
         rows = slice(episode.first, episode.first + episode.rows)
         with wrap_read_errors(episode.file, "check that it is complete"):
             if self.kind == "hdf5":
-                return Table(episode.file, _expanded(read_hdf5(episode.file, group=episode.group)))
+                return Table(
+                    episode.file,
+                    _with_element_columns(read_hdf5(episode.file, group=episode.group)),
+                )
             if self.kind == "zarr":
                 arrays = read_zarr(episode.file / "data", rows=rows)
-                return Table(episode.file, _expanded(arrays))
+                return Table(episode.file, _with_element_columns(arrays))
             import polars as pl
 
             frame = pl.scan_parquet(episode.file).slice(episode.first, episode.rows)
-            return Table(episode.file, expanded_columns(frame))
+            return Table(episode.file, columns_with_nested(frame))
 
 
-def _expanded(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
+def _with_element_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
     parts = {
         f"{name}[{k}]": x.reshape(len(x), -1)[:, k]
         for name, x in arrays.items()
@@ -94,7 +97,7 @@ def open_dataset(path: Path) -> Dataset:
         elif path.suffix.lower() == ".zarr":
             found = _open_zarr(path)
         else:
-            files = sorted(p for p in path.glob("**/*") if p.suffix.lower() in _TABLES)
+            files = sorted(p for p in path.glob("**/*") if p.suffix.lower() in _TABLE_SUFFIXES)
             episodes = [Episode(str(p.relative_to(path)), p, 0, 0) for p in files]
             found = Dataset(path, "tables", episodes, float("nan"))
     if not found.episodes:
@@ -144,7 +147,7 @@ def _open_zarr(path: Path) -> Dataset:
     return Dataset(path, "zarr", episodes, float("nan"))
 
 
-def write_copy(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
+def write_copy(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> None:
     """Write the dataset with the columns of each episode to `out`; the dataset stays unchanged."""
     if dataset.kind == "hdf5":
         _write_hdf5(dataset, out, columns)
@@ -154,12 +157,12 @@ def write_copy(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
         written |= {dataset.path / "meta" / name for name in ("info.json", "stats.json")}
     for file in sorted(p for p in dataset.path.glob("**/*") if p.is_file()):
         if file not in written:
-            copied = dataset.kind == "zarr" and file.name in _JSON_OF_ZARR
-            _link(file, out / file.relative_to(dataset.path), copied=copied)
+            copied = dataset.kind == "zarr" and file.name in _ZARR_METADATA_NAMES
+            _link_or_copy_file(file, out / file.relative_to(dataset.path), copied=copied)
     if dataset.kind == "zarr":
         _write_zarr(out, columns)
         return
-    for path, part in _by_file(dataset.episodes, columns):
+    for path, part in _columns_by_file(dataset.episodes, columns):
         target = out / path.relative_to(dataset.path)
         make_folder(target.parent)
         if path.suffix.lower() == ".parquet":
@@ -167,22 +170,25 @@ def write_copy(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
         else:
             _write_csv(path, target, part)
     if dataset.kind == "lerobot":
-        _write_meta(dataset.path / "meta", out / "meta", columns)
+        _write_lerobot_metadata(dataset.path / "meta", out / "meta", columns)
 
 
-def _by_file(
-    episodes: Sequence[Episode], columns: Sequence[Columns]
-) -> Iterator[tuple[Path, Columns]]:
+def _columns_by_file(
+    episodes: Sequence[Episode], columns: Sequence[NewColumns]
+) -> Iterator[tuple[Path, NewColumns]]:
     files = list(dict.fromkeys(episode.file for episode in episodes))
     for file in files:
-        yield file, _joined([c for e, c in zip(episodes, columns, strict=True) if e.file == file])
+        yield (
+            file,
+            _join_columns([c for e, c in zip(episodes, columns, strict=True) if e.file == file]),
+        )
 
 
-def _joined(columns: Sequence[Columns]) -> Columns:
-    return Columns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+def _join_columns(columns: Sequence[NewColumns]) -> NewColumns:
+    return NewColumns(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
-def _link(file: Path, target: Path, *, copied: bool) -> None:
+def _link_or_copy_file(file: Path, target: Path, *, copied: bool) -> None:
     make_folder(target.parent)
     with whole_file(target) as temporary:
         temporary.unlink(missing_ok=True)
@@ -194,7 +200,7 @@ def _link(file: Path, target: Path, *, copied: bool) -> None:
             shutil.copyfile(file, temporary)
 
 
-def _write_parquet(path: Path, target: Path, new: Columns) -> None:
+def _write_parquet(path: Path, target: Path, new: NewColumns) -> None:
     import polars as pl
 
     frame = pl.read_parquet(path)
@@ -204,11 +210,11 @@ def _write_parquet(path: Path, target: Path, new: Columns) -> None:
     )
     kept = {k: v for k, v in pl.read_parquet_metadata(path).items() if k != "ARROW:schema"}
     if "huggingface" in kept:
-        kept["huggingface"] = _with_features(kept["huggingface"])
+        kept["huggingface"] = _add_features_to_metadata(kept["huggingface"])
     write_table(target, frame, metadata=kept)
 
 
-def _with_features(text: str) -> str:
+def _add_features_to_metadata(text: str) -> str:
     data = json.loads(text)
     features = data.get("info", {}).get("features", {})
     lists = [x for x in features.values() if isinstance(x, dict) and "feature" in x]
@@ -221,8 +227,7 @@ def _with_features(text: str) -> str:
     return json.dumps(data)
 
 
-def _write_csv(path: Path, target: Path, new: Columns) -> None:
-    """Append cells to each line, so that all other text remains."""
+def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
     frame, first = read_csv(path, True)
     lines = path.read_bytes().splitlines(keepends=True)
     rows = [k for k in range(first - 1, len(lines)) if lines[k].strip()]
@@ -234,7 +239,7 @@ def _write_csv(path: Path, target: Path, new: Columns) -> None:
             remedy="convert it to Parquet",
         )
     separator = max((b",", b";", b"\t", b" "), key=lines[head].count)
-    names = [f"{CONTACT_WRENCH}.{name}" for name in WRENCH] + [IN_CONTACT]
+    names = [f"{CONTACT_WRENCH}.{name}" for name in WRENCH_COLUMNS] + [IN_CONTACT]
     cells = np.column_stack([new.contact_wrench, new.in_contact])
     texts = {head: names} | {
         k: [f"{x:.6g}" for x in row] for k, row in zip(rows, cells, strict=True)
@@ -247,7 +252,7 @@ def _write_csv(path: Path, target: Path, new: Columns) -> None:
         temporary.write_bytes(b"".join(lines))
 
 
-def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None:
+def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> None:
     h5py = import_optional("h5py", dataset.path)
     make_folder(out.parent)
     with whole_file(out) as temporary:
@@ -262,9 +267,9 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[Columns]) -> None
                     group[name] = values.astype(np.float32 if values.ndim == 2 else bool)
 
 
-def _write_zarr(out: Path, columns: Sequence[Columns]) -> None:
+def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
     zarr = import_optional("zarr", out)
-    group, new = zarr.open_group(out / "data", mode="r+"), _joined(columns)
+    group, new = zarr.open_group(out / "data", mode="r+"), _join_columns(columns)
     for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
         array = values.astype(np.float32 if values.ndim == 2 else bool)
         group.create_array(name, data=array, overwrite=True)
@@ -272,15 +277,22 @@ def _write_zarr(out: Path, columns: Sequence[Columns]) -> None:
         zarr.consolidate_metadata(out, zarr_format=2)
 
 
-def _write_meta(source: Path, target: Path, columns: Sequence[Columns]) -> None:
+def _write_lerobot_metadata(source: Path, target: Path, columns: Sequence[NewColumns]) -> None:
     info = json.loads((source / "info.json").read_text(encoding="utf-8"))
-    info["features"][CONTACT_WRENCH] = {"dtype": "float32", "shape": [6], "names": list(WRENCH)}
+    info["features"][CONTACT_WRENCH] = {
+        "dtype": "float32",
+        "shape": [6],
+        "names": list(WRENCH_COLUMNS),
+    }
     info["features"][IN_CONTACT] = {"dtype": "bool", "shape": [1], "names": None}
     make_folder(target)
     _write_json(target / "info.json", info)
     if not (source / "stats.json").is_file():
         return
-    stats, new = json.loads((source / "stats.json").read_text(encoding="utf-8")), _joined(columns)
+    stats, new = (
+        json.loads((source / "stats.json").read_text(encoding="utf-8")),
+        _join_columns(columns),
+    )
     with_quantiles = any("q50" in x for x in stats.values())
     for name, values in (
         (CONTACT_WRENCH, new.contact_wrench),

@@ -8,15 +8,15 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.dataset.episode_verdict import Hypothesis
-from drake_teleop.logs.read.canonical import WRENCH
-from drake_teleop.logs.read.description_fields import FORCE_UNITS, TORQUE_UNITS, UNITS
+from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
+from drake_teleop.logs.read.description_fields import FORCE_UNITS, SI_VALUE_OF_UNIT, TORQUE_UNITS
 
 _UNITS = (
     ("force", "N", set(FORCE_UNITS) - {"N"}),
     ("torque", "N m", set(TORQUE_UNITS) - {"N m", "N mm"}),  # N mm equals mN m
 )
 _UNIT_TOLERANCE, _SMALLEST_GAIN = 0.04, 0.06
-_SMALLEST_TURN_DEG = 4.0
+_MIN_ROTATION_DEG = 4.0
 _SMALLEST_LAG = 0.6  # frames
 _FEWEST_SATURATED = 4
 
@@ -44,11 +44,11 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
         found.append(Finding("weight removed", text, None))
-    found += _turn_findings(
+    found += _rotation_findings(
         x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force"
     )
     if not np.allclose(x.force, x.torque):
-        found += _turn_findings(x.torque, "the torque")
+        found += _rotation_findings(x.torque, "the torque")
     found += _unit_findings(x.gain)
     late = x.lag - usual_lag
     if abs(late) >= _SMALLEST_LAG:
@@ -58,7 +58,7 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
     return found
 
 
-def _turn_findings(M: Array, what: str) -> list[Finding]:
+def _rotation_findings(M: Array, what: str) -> list[Finding]:
     from scipy.spatial.transform import Rotation
 
     single = np.flatnonzero(np.diag(M) < 0)
@@ -71,7 +71,7 @@ def _turn_findings(M: Array, what: str) -> list[Finding]:
         M = -M
     turn = Rotation.from_matrix(M).as_rotvec(degrees=True)
     angle = float(np.linalg.norm(turn))
-    if angle > _SMALLEST_TURN_DEG:
+    if angle > _MIN_ROTATION_DEG:
         axis = ", ".join(f"{a:.2g}" for a in turn / angle)
         text = f"{what} is turned by {angle:.3g} deg about [{axis}] of S"
         found.append(Finding("frame", text, M.tolist()))
@@ -83,8 +83,8 @@ def _unit_findings(gain: Array) -> list[Finding]:
     for factor, (what, si, names) in zip(gain, _UNITS, strict=True):
         if abs(factor - 1.0) < _SMALLEST_GAIN:
             continue
-        unit = min(names, key=lambda name: abs(np.log(factor * UNITS[name])))
-        near = abs(factor * UNITS[unit] - 1.0) < _UNIT_TOLERANCE
+        unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))
+        near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_TOLERANCE
         text = f"the {what} is {factor:.4g} times that in {si}"
         found.append(Finding("unit", text + (f": its unit is {unit}" if near else ""), factor))
     return found
@@ -93,7 +93,7 @@ def _unit_findings(gain: Array) -> list[Finding]:
 def saturated_channels(wrench: Array) -> list[Finding]:
     """Return a finding for channels of a wrench (N, 6) that stay at an end of their range."""
     names = []
-    for name, x in zip(WRENCH, wrench.T, strict=True):
+    for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():
             return [Finding("dead channel", f"{name} is {x[0]:.4g} in all frames", name)]
         starts = np.flatnonzero(np.diff(x, prepend=np.nan))

@@ -22,26 +22,29 @@ from drake_teleop.load.regressor import non_contact_wrench, regressor
 from drake_teleop.logs.pose_motion.splines import PoseSplines
 from drake_teleop.logs.read.canonical import Log
 
-STEPS = 8
+LAG_STEPS_PER_FRAME = 8
 """Steps of the lag per frame."""
 MAX_LAG_FRAMES = 8
-KINDS = ("sensor", "weight removed", "base")
+HYPOTHESIS_KINDS = ("sensor", "weight removed", "base")
 """Wrenches of the load: in S; without its weight; in the axes of the base."""
-CALM_WIDTH = 0.674
+HALF_WIDTH_OF_NORMAL = 0.674
 """Half width of the calmer half of normal numbers, in standard deviations."""
 _SIGNED_PERMUTATIONS = np.array(signed_permutations())
 _FORCE, _TORQUE = slice(0, 3), slice(3, 6)
-_KEPT_SHARE, _ITERATIONS = 0.6, 4
-_COST, _COST_FRAMES = 0.25, 40.0  # required reduction of the log spread, for each deviation
-_PARTS = 4
+_BEST_ROWS_SHARE, _ITERATIONS = 0.6, 4
+_COST_PER_DEVIATION, _COST_FRAMES = (
+    0.25,
+    40.0,
+)  # required reduction of the log spread, for each deviation
+_NUM_START_PARTS = 4
 _FLOOR_SHARE = 0.3
-_INLIER, _STEP_DEVIATIONS = 5.0, 5.0
-_FEWEST_STEP_FRAMES, _STEP_SHARE, _TRIED_STEPS = 12, 0.12, 20
+_INLIER_DEVIATIONS, _STEP_DEVIATIONS = 5.0, 5.0
+_FEWEST_STEP_FRAMES, _STEP_SHARE, _NUM_TRIED_STEPS = 12, 0.12, 20
 _NOISE_MARGIN = 1.5
 
-Predict = Callable[[str, float], tuple[Array, Array]]
+PredictReading = Callable[[str, float], tuple[Array, Array]]
 """Function of a kind and a lag [frames]: reading in the axes of S, and the load's wrench (N, 6)."""
-Regress = Callable[[float], Array]
+RegressorAtLag = Callable[[float], Array]
 """Function of a lag [frames] that returns the regressor V (N, 6, 10)."""
 
 
@@ -70,30 +73,30 @@ class Hypothesis:
     offsets: Array = field(default_factory=lambda: np.zeros(6))
     cost: float = np.inf
 
-    def apply(self, load_wrench: Array) -> Array:
+    def reading_of_load(self, load_wrench: Array) -> Array:
         """Map the load's wrench (N, 6) by gain and axes to a reading (N, 6) without offsets."""
         f, tau = load_wrench[:, :3], load_wrench[:, 3:]
         return np.hstack([self.gain[0] * f @ self.force.T, self.gain[1] * tau @ self.torque.T])
 
-    def correct(self, wrench: Array) -> Array:
+    def wrench_of_reading(self, wrench: Array) -> Array:
         """Invert `apply`: map readings (N, 6) without offsets to wrenches in S [N, N m]."""
         f, tau = wrench[:, :3] @ self.force, wrench[:, 3:] @ self.torque
         return np.hstack([f / self.gain[0], tau / self.gain[1]])
 
 
-def as_described(lag: float) -> Hypothesis:
+def hypothesis_without_fault(lag: float) -> Hypothesis:
     """Return the hypothesis without a fault."""
     return Hypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
 
 
-def calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
+def spread_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
     """Return log half widths (6,) of the narrowest half of residuals (N, 6), and its centres."""
     widths, centres = narrowest_half(residual)
     return np.log(np.maximum(0.5 * widths, floor)), centres
 
 
 def find_hypothesis(
-    predict: Predict, regress: Regress, usual_lag: float, typical: Array
+    predict: PredictReading, regress: RegressorAtLag, usual_lag: float, typical: Array
 ) -> Hypothesis:
     """Return the simplest hypothesis that explains the wrench of an episode.
 
@@ -101,94 +104,106 @@ def find_hypothesis(
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = Search(predict, regress, usual_lag, _FLOOR_SHARE * typical)
-    usual = search.judged(as_described(usual_lag))
+    search = HypothesisSearch(predict, regress, usual_lag, _FLOOR_SHARE * typical)
+    usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual
     found = [usual]
-    for kind in KINDS:
-        lags = {usual_lag, search.best_lag(replace(usual, kind=kind)), search.free_lag(kind)}
+    for kind in HYPOTHESIS_KINDS:
+        lags = {
+            usual_lag,
+            search.best_lag(replace(usual, kind=kind)),
+            search.lag_of_linear_fit(kind),
+        }
         for lag in lags:
-            found += search._hypotheses(kind, lag)
-            found += [search.other_load(lag)] if kind == "sensor" else []
+            found += search._hypotheses_at_lag(kind, lag)
+            found += [search.hypothesis_of_other_load(lag)] if kind == "sensor" else []
     best = min(found, key=lambda x: x.cost)
     if best.phi is None:
-        found.append(search.judged(replace(best, lag=search.best_lag(best))))
+        found.append(search.with_spread_and_cost(replace(best, lag=search.best_lag(best))))
     return min(found, key=lambda x: x.cost)
 
 
-def unexplained(x: Hypothesis, predict: Predict, regress: Regress) -> Array:
+def unexplained_reading(x: Hypothesis, predict: PredictReading, regress: RegressorAtLag) -> Array:
     """Return the part (N, 6) of the reading that is not from the load, with offsets."""
     wrench, load_wrench = predict(x.kind, x.lag)
     if x.phi is not None:
         return np.asarray(wrench - regress(x.lag) @ x.phi)
-    return wrench - x.apply(load_wrench)
+    return wrench - x.reading_of_load(load_wrench)
 
 
-class Search:
+class HypothesisSearch:
     """Hypotheses for one episode; arguments as for `find_hypothesis`, `floor` (6,) of spreads."""
 
-    def __init__(self, predict: Predict, regress: Regress, usual_lag: float, floor: Array) -> None:
+    def __init__(
+        self, predict: PredictReading, regress: RegressorAtLag, usual_lag: float, floor: Array
+    ) -> None:
         self.predict, self.regress = predict, regress
         self.usual_lag, self.floor = usual_lag, floor
         self.frames = len(predict("sensor", usual_lag)[0])
-        self.price = _COST + _COST_FRAMES / self.frames
+        self.price = _COST_PER_DEVIATION + _COST_FRAMES / self.frames
 
-    def _residual(self, x: Hypothesis) -> Array:
-        return unexplained(x, self.predict, self.regress)
+    def _reading_residual(self, x: Hypothesis) -> Array:
+        return unexplained_reading(x, self.predict, self.regress)
 
-    def judged(self, x: Hypothesis) -> Hypothesis:
+    def with_spread_and_cost(self, x: Hypothesis) -> Hypothesis:
         """Return the hypothesis with its spread, offsets and cost."""
-        spread, offsets = calm_half(self._residual(x), self.floor)
-        cost = float(spread.sum()) + self.price * _deviations(x, self.usual_lag)
+        spread, offsets = spread_and_centre_of_calm_half(self._reading_residual(x), self.floor)
+        cost = float(spread.sum()) + self.price * _weighted_number_of_deviations(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
 
-    def _kept(self, x: Hypothesis) -> NDArray[np.bool_]:
-        return _best_rows((self._residual(x) - x.offsets) / np.exp(x.spread))
+    def _best_rows_of(self, x: Hypothesis) -> NDArray[np.bool_]:
+        return _rows_of_smallest_residual(
+            (self._reading_residual(x) - x.offsets) / np.exp(x.spread)
+        )
 
-    def _hypotheses(self, kind: str, lag: float) -> Iterator[Hypothesis]:
+    def _hypotheses_at_lag(self, kind: str, lag: float) -> Iterator[Hypothesis]:
         both, one = self.predict(kind, lag), np.ones(2)
         force, torque = (self.best_permutation(*both, channels) for channels in (_FORCE, _TORQUE))
         plain = Hypothesis(kind, lag, np.eye(3), np.eye(3), one)
-        yield self.judged(plain)
-        yield self.judged(replace(plain, force=-np.eye(3), torque=-np.eye(3)))
+        yield self.with_spread_and_cost(plain)
+        yield self.with_spread_and_cost(replace(plain, force=-np.eye(3), torque=-np.eye(3)))
         for M, T in ((force, force), (torque, torque), (force, torque)):
-            yield self.judged(replace(plain, force=M, torque=T))
+            yield self.with_spread_and_cost(replace(plain, force=M, torque=T))
         for det in (1.0, -1.0):
-            start = self.concentrate(plain, det=det, scale=True)
+            start = self.refit_to_best_rows(plain, det=det, scale=True)
             yield start
-            yield self.concentrate(replace(start, gain=one), det=det, scale=False)
+            yield self.refit_to_best_rows(replace(start, gain=one), det=det, scale=False)
             nearest = max(_SIGNED_PERMUTATIONS, key=lambda M: float((M * start.force).sum()))
             for M in (np.eye(3), -np.eye(3), nearest):
-                yield self.concentrate(replace(start, force=M, torque=M), det=0.0, scale=True)
+                yield self.refit_to_best_rows(
+                    replace(start, force=M, torque=M), det=0.0, scale=True
+                )
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
         """Return the signed permutation with the least spread of three channels."""
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
-        spread = calm_half(pairs.reshape(len(w), -1), np.repeat(floor, 6))[0].reshape(3, 3, 2)
+        spread = spread_and_centre_of_calm_half(pairs.reshape(len(w), -1), np.repeat(floor, 6))[
+            0
+        ].reshape(3, 3, 2)
         costs = [
             sum(spread[i, j, int(M[i, j] < 0)] for i, j in zip(*np.nonzero(M), strict=True))
             for M in _SIGNED_PERMUTATIONS
         ]
         return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmin(costs))])
 
-    def starts(self) -> Iterator[NDArray[np.bool_]]:
+    def start_rows(self) -> Iterator[NDArray[np.bool_]]:
         """Yield flags (N,) of all frames and of parts, of which one may be without contact."""
-        at = np.arange(self.frames) * _PARTS // self.frames
+        at = np.arange(self.frames) * _NUM_START_PARTS // self.frames
         yield at >= 0
-        for part in range(_PARTS):
+        for part in range(_NUM_START_PARTS):
             yield at == part
 
-    def concentrate(self, x: Hypothesis, *, det: float, scale: bool) -> Hypothesis:
+    def refit_to_best_rows(self, x: Hypothesis, *, det: float, scale: bool) -> Hypothesis:
         """Return the hypothesis with rotation and factors fitted to the best rows.
 
         The determinant of the fitted rotation is `det`; 0 keeps the rotation.
         """
-        found = [self._concentrated(x, rows, det, scale) for rows in self.starts()]
+        found = [self._fit_to_rows(x, rows, det, scale) for rows in self.start_rows()]
         return min(found, key=lambda x: x.cost)
 
-    def _concentrated(
+    def _fit_to_rows(
         self, x: Hypothesis, rows: NDArray[np.bool_], det: float, scale: bool
     ) -> Hypothesis:
         both = self.predict(x.kind, x.lag)
@@ -201,54 +216,54 @@ class Search:
                 ]
                 x = replace(x, gain=np.maximum(ratio, 1e-9))
             if det:
-                M = _rotation(w, q, x.gain, det)
+                M = _fit_rotation(w, q, x.gain, det)
                 x = replace(x, force=M, torque=M)
             if scale:
-                x = replace(x, gain=_gains(w, q, x))
-            x = self.judged(x)
-            rows = self._kept(x)
+                x = replace(x, gain=_fit_gains(w, q, x))
+            x = self.with_spread_and_cost(x)
+            rows = self._best_rows_of(x)
         return x
 
-    def other_load(self, lag: float) -> Hypothesis:
+    def hypothesis_of_other_load(self, lag: float) -> Hypothesis:
         """Return the hypothesis of another load, fitted to the best rows."""
         wrench, V = self.predict("sensor", lag)[0], self.regress(lag)
-        found = [self._fitted_load(wrench, V, lag, rows) for rows in self.starts()]
+        found = [self._fit_other_load(wrench, V, lag, rows) for rows in self.start_rows()]
         return min(found, key=lambda x: x.cost)
 
-    def _fitted_load(
+    def _fit_other_load(
         self, wrench: Array, V: Array, lag: float, rows: NDArray[np.bool_]
     ) -> Hypothesis:
-        x = as_described(lag)
-        weights = np.exp(-calm_half(wrench, self.floor)[0])
+        x = hypothesis_without_fault(lag)
+        weights = np.exp(-spread_and_centre_of_calm_half(wrench, self.floor)[0])
         for _ in range(_ITERATIONS):
             w, A = (y[rows] - y[rows].mean(axis=0) for y in (wrench, V))
             A, w = (A * weights[:, None]).reshape(-1, 10), (w * weights).ravel()
             size = np.linalg.norm(A, axis=0) + 1e-12
             phi = np.linalg.lstsq(A / size, w, rcond=1e-3)[0] / size
-            x = self.judged(replace(x, phi=phi))
-            rows, weights = self._kept(x), np.exp(-x.spread)
+            x = self.with_spread_and_cost(replace(x, phi=phi))
+            rows, weights = self._best_rows_of(x), np.exp(-x.spread)
         return x
 
     def best_lag(self, x: Hypothesis) -> float:
         """Return the lag with the least spread of a hypothesis."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
-        for step in (0.5, 1.0 / STEPS):
+        for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)
-            costs = [self.judged(replace(x, lag=float(y))).spread.sum() for y in lags]
+            costs = [self.with_spread_and_cost(replace(x, lag=float(y))).spread.sum() for y in lags]
             lag, reach = float(lags[int(np.argmin(costs))]), 0.5
         return lag
 
-    def free_lag(self, kind: str) -> float:
+    def lag_of_linear_fit(self, kind: str) -> float:
         """Return the lag with which a linear map of the load's wrench fits best."""
         lags = self.usual_lag + np.arange(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 0.1, 0.25)
         lag, rows = self.usual_lag, np.ones(self.frames, bool)
         for _ in range(2):
-            costs = [self._linear_residual(kind, float(x), rows)[1] for x in lags]
+            costs = [self._residual_of_linear_fit(kind, float(x), rows)[1] for x in lags]
             lag = float(lags[int(np.argmin(costs))])
-            rows = _best_rows(self._linear_residual(kind, lag, rows)[0])
+            rows = _rows_of_smallest_residual(self._residual_of_linear_fit(kind, lag, rows)[0])
         return lag
 
-    def _linear_residual(
+    def _residual_of_linear_fit(
         self, kind: str, lag: float, rows: NDArray[np.bool_]
     ) -> tuple[Array, float]:
         w, p = self.predict(kind, lag)
@@ -259,12 +274,12 @@ class Search:
         return residual, float(np.log(residual[rows].var(axis=0) + self.floor**2).sum())
 
 
-def _best_rows(residual: Array) -> NDArray[np.bool_]:
+def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
     distance = (residual**2).sum(axis=1)
-    return np.asarray(distance <= np.quantile(distance, _KEPT_SHARE))
+    return np.asarray(distance <= np.quantile(distance, _BEST_ROWS_SHARE))
 
 
-def _rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
+def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     """Return the M (3, 3) with a determinant that minimises |w - gain M p|, both scaled."""
     H = np.zeros((3, 3))
     for channels, factor in zip((_FORCE, _TORQUE), gain, strict=True):
@@ -274,7 +289,7 @@ def _rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
     return np.asarray(U @ np.diag([1.0, 1.0, det * np.sign(np.linalg.det(U @ Vt))]) @ Vt)
 
 
-def _gains(w: Array, p: Array, x: Hypothesis) -> Array:
+def _fit_gains(w: Array, p: Array, x: Hypothesis) -> Array:
     gains = []
     for channels, M in ((_FORCE, x.force), (_TORQUE, x.torque)):
         q = p[:, channels] @ M.T
@@ -282,44 +297,48 @@ def _gains(w: Array, p: Array, x: Hypothesis) -> Array:
     return np.maximum(gains, 1e-9)
 
 
-def _deviations(x: Hypothesis, usual_lag: float) -> float:
-    """Return the number of deviations from the usual description, weighted by their freedom."""
+def _weighted_number_of_deviations(x: Hypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
-    count += _turn_deviations(x.force) + float(not np.allclose(x.force, x.torque))
+    count += _weight_of_rotation(x.force) + float(not np.allclose(x.force, x.torque))
     scaled = x.gain != 1.0
     return count + float(scaled[0]) + float(scaled[1])
 
 
-def _turn_deviations(M: Array) -> float:
+def _weight_of_rotation(M: Array) -> float:
     if np.allclose(np.abs(M), np.eye(3)):
         return 0.0 if M.trace() > 2.9 else 1.0
     return 1.5 if np.allclose(np.abs(M).max(axis=0), 1.0) else 2.5
 
 
-def offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
+def find_offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | None:
     """Return the frame at which the offsets of a residual (N, 6) jump, and both offsets, or None.
 
     Frames fit to one of two constant offsets, without a transition; contact begins gradually.
     """
     n = len(residual)
     # Offsets that change in the middle enlarge the spread, but no differences of frames.
-    noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (np.sqrt(2.0) * CALM_WIDTH)
-    deviation = np.minimum(np.exp(spread) / CALM_WIDTH, _NOISE_MARGIN * noise)
+    noise = np.median(np.abs(np.diff(residual, axis=0)), axis=0) / (
+        np.sqrt(2.0) * HALF_WIDTH_OF_NORMAL
+    )
+    deviation = np.minimum(np.exp(spread) / HALF_WIDTH_OF_NORMAL, _NOISE_MARGIN * noise)
     fewest = max(_FEWEST_STEP_FRAMES, int(_STEP_SHARE * n))
 
-    def inliers(part: Array) -> tuple[NDArray[np.bool_], Array]:
-        centre = calm_half(part, np.full(6, 1e-300))[1]
-        return (np.abs(part - centre) <= _INLIER * deviation).all(axis=1), centre
+    def inliers_and_centre(part: Array) -> tuple[NDArray[np.bool_], Array]:
+        centre = spread_and_centre_of_calm_half(part, np.full(6, 1e-300))[1]
+        return (np.abs(part - centre) <= _INLIER_DEVIATIONS * deviation).all(axis=1), centre
 
-    whole = inliers(residual)[0].sum()
+    whole = inliers_and_centre(residual)[0].sum()
     best: tuple[int, int, Array, Array] | None = None
     jumps = np.linalg.norm(np.diff(residual, axis=0) / deviation, axis=1)
-    for k in 1 + np.argsort(-jumps)[:_TRIED_STEPS]:
+    for k in 1 + np.argsort(-jumps)[:_NUM_TRIED_STEPS]:
         if not fewest <= k <= n - fewest:
             continue
-        (first, before), (second, after) = inliers(residual[:k]), inliers(residual[k:])
+        (first, before), (second, after) = (
+            inliers_and_centre(residual[:k]),
+            inliers_and_centre(residual[k:]),
+        )
         gain = int(first.sum() + second.sum() - whole)
         sharp = first[-2:].all() and second[:2].all()
         full = min(first.mean(), second.mean()) > 0.4
@@ -329,7 +348,7 @@ def offset_step(residual: Array, spread: Array) -> tuple[int, Array, Array] | No
     return None if best is None else best[1:]
 
 
-_MARGIN = 2 * MAX_LAG_FRAMES  # frames at both ends of the finely sampled motion
+_MARGIN_FRAMES = 2 * MAX_LAG_FRAMES  # frames at both ends of the finely sampled motion
 
 
 class Motion(NamedTuple):
@@ -356,7 +375,13 @@ class EpisodeSignals:
         if log.posed is not None:
             poses = log.posed.poses
             self._splines = PoseSplines(poses, spacing / poses.rate, limit_ends=True)
-        grid = np.arange(-_MARGIN * STEPS, (len(log) + _MARGIN) * STEPS) / STEPS
+        grid = (
+            np.arange(
+                -_MARGIN_FRAMES * LAG_STEPS_PER_FRAME,
+                (len(log) + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME,
+            )
+            / LAG_STEPS_PER_FRAME
+        )
         self._fine = self.motion(log.t[0] + grid * log.dt)
 
     def motion(self, t: Array) -> Motion:
@@ -372,28 +397,31 @@ class EpisodeSignals:
         R = rotation_matrices(self._splines.quaternion(t), "quaternion_wxyz")
         return Motion(*self._splines.motion(t, g), self._splines.gravity(t, g), R)
 
-    def delayed(self, lag: float) -> Motion:
+    def motion_at_lag(self, lag: float) -> Motion:
         """Return the motion (N, ...) at the frames, `lag` frames later."""
-        step = round((lag + _MARGIN) * STEPS)
-        if abs(step - (lag + _MARGIN) * STEPS) < 1e-6 and abs(lag) < _MARGIN:
-            rows = slice(step, step + STEPS * len(self.log), STEPS)
+        step = round((lag + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME)
+        if (
+            abs(step - (lag + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME) < 1e-6
+            and abs(lag) < _MARGIN_FRAMES
+        ):
+            rows = slice(step, step + LAG_STEPS_PER_FRAME * len(self.log), LAG_STEPS_PER_FRAME)
             return Motion(*(x[rows] for x in self._fine))
         return self.motion(self.log.t + lag * self.log.dt)
 
-    def regress(self, lag: float) -> Array:
+    def regressor_at_lag(self, lag: float) -> Array:
         """Return the regressor V (N, 6, 10), with the motion `lag` frames later."""
-        return regressor(*self.delayed(lag)[:3])
+        return regressor(*self.motion_at_lag(lag)[:3])
 
-    def predictor(self, phi: Array) -> Predict:
+    def reading_predictor(self, phi: Array) -> PredictReading:
         """Return reading and wrench of a load phi (10,) as a function of kind and lag [frames]."""
 
         @cache
-        def predict(kind: str, lag: float) -> tuple[Array, Array]:
-            at = self.delayed(lag)
+        def predict_reading(kind: str, lag: float) -> tuple[Array, Array]:
+            at = self.motion_at_lag(lag)
             s = at.s + at.gravity if kind == "weight removed" else at.s
             wrench = self.log.wrench
             if kind == "base":
                 wrench = (wrench.reshape(-1, 2, 3) @ at.R_WS).reshape(-1, 6)
             return wrench, non_contact_wrench(s, at.omega, at.alpha, phi)
 
-        return predict
+        return predict_reading

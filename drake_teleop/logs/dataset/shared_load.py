@@ -12,27 +12,30 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.contact.detection import MAX_NOISE_LEVEL, fit_noise_floor
-from drake_teleop.load.contact.noise_floor import NoiseFloor, Samples, finite_covariance
+from drake_teleop.load.contact.noise_floor import DetectorSamples, NoiseFloor, limit_covariance
 from drake_teleop.load.identification import Identification, is_precise_enough
 from drake_teleop.logs.dataset.episode_verdict import (
-    CALM_WIDTH,
-    STEPS,
+    HALF_WIDTH_OF_NORMAL,
+    LAG_STEPS_PER_FRAME,
     EpisodeSignals,
     Hypothesis,
-    Search,
-    as_described,
-    unexplained,
+    HypothesisSearch,
+    hypothesis_without_fault,
+    unexplained_reading,
 )
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.canonical import Log
 
-_SPACINGS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # knot distances [frames]
+_TRIED_KNOT_SPACINGS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # knot distances [frames]
 _LARGEST_SPACING_S = 0.25
 _SMALLEST_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
 _LARGEST_EXCESS, _MEMBER_EXCESS = 6.0, 2.0  # log spread beyond that of an episode's own load
 _LAG_STEP, _MAX_LAG = 0.5, 3.0  # frames
-_FREE_DEVIATIONS, _FREE_MARGIN = 5.0, 2  # of a frame without contact; frames around contact
-_MARGIN = 1.1  # over the largest level of free frames
+_FREE_DEVIATIONS, _CONTACT_MARGIN_FRAMES = (
+    5.0,
+    2,
+)  # of a frame without contact; frames around contact
+_THRESHOLD_MARGIN = 1.1  # over the largest level of free frames
 
 
 @dataclass(frozen=True)
@@ -56,14 +59,14 @@ class SharedLoad:
     threshold: float
 
 
-def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
+def find_shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
     """Return the load of a dataset from some of its episodes, or the given load.
 
     Episodes with another load or wrong axes, and contact, have no influence if they are few.
     """
-    spacing = _best_spacing(logs)
+    spacing = _best_knot_spacing(logs)
     episodes = [EpisodeSignals(log, spacing) for log in logs]
-    own = [own_load(signals) for signals in episodes]
+    own = [load_of_episode(signals) for signals in episodes]
     if load is None:
         candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
         if not candidates:
@@ -73,78 +76,98 @@ def shared_load(logs: Sequence[Log], load: Identification | None) -> SharedLoad:
                 remedy="set wrench.sign: -1 in a --description",
             )
         phi = min(
-            candidates, key=lambda phi: _excess(episodes, own, phi).clip(max=_LARGEST_EXCESS).sum()
+            candidates,
+            key=lambda phi: _excess_spread(episodes, own, phi).clip(max=_LARGEST_EXCESS).sum(),
         )
         for _ in range(2):
-            members = _excess(episodes, own, phi) < _MEMBER_EXCESS
+            members = _excess_spread(episodes, own, phi) < _MEMBER_EXCESS
             members = members if members.any() else np.ones(len(own), bool)
-            load = _pooled(episodes, own, members, phi)
+            load = _fit_load_to_members(episodes, own, members, phi)
             phi = load.phi
     assert load is not None
     # Uncertain inertias are nearer to the truth than those of a point mass.
     determined = np.isfinite(load.standard_deviations).all()
     phi = load.phi if determined else usable_phi(load)[0]
-    members = _excess(episodes, own, phi) < _MEMBER_EXCESS
+    members = _excess_spread(episodes, own, phi) < _MEMBER_EXCESS
     chosen = [k for k in range(len(own)) if members[k]] or list(range(len(own)))
-    usual = [_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
-    lag = round(float(np.median([x.lag for x in usual])) * STEPS) / STEPS
+    usual = [_hypothesis_at_best_lag(episodes[k], phi, own[k].lag) for k in chosen]
+    lag = (
+        round(float(np.median([x.lag for x in usual])) * LAG_STEPS_PER_FRAME) / LAG_STEPS_PER_FRAME
+    )
     typical = np.exp(np.median([x.spread for x in usual], axis=0))
-    free = [_free_samples(episodes[k], x, phi, typical) for k, x in zip(chosen, usual, strict=True)]
-    pooled = Samples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
-    floor = fit_noise_floor(*pooled, finite_covariance(phi, load.covariance, tared=True), fade=0.0)
-    threshold = max(MAX_NOISE_LEVEL, _MARGIN * float(floor.reached[0]))
+    free = [
+        _contact_free_samples(episodes[k], x, phi, typical)
+        for k, x in zip(chosen, usual, strict=True)
+    ]
+    pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
+    floor = fit_noise_floor(*pooled, limit_covariance(phi, load.covariance, tared=True), fade=0.0)
+    threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_MARGIN * float(floor.reached[0]))
     return SharedLoad(load, phi, spacing, lag, typical, floor, threshold)
 
 
-def _best_spacing(logs: Sequence[Log]) -> float:
+def _best_knot_spacing(logs: Sequence[Log]) -> float:
     frame = float(np.median([log.dt for log in logs]))
-    choices = [h for h in _SPACINGS if h == _SPACINGS[0] or h * frame <= _LARGEST_SPACING_S]
+    choices = [
+        h
+        for h in _TRIED_KNOT_SPACINGS
+        if h == _TRIED_KNOT_SPACINGS[0] or h * frame <= _LARGEST_SPACING_S
+    ]
     some = logs[:: max(1, len(logs) // 6)]
 
-    def cost(spacing: float) -> float:
+    def residual_cost_at(spacing: float) -> float:
         return float(
-            np.median([own_load(EpisodeSignals(log, spacing)).spread.sum() for log in some])
+            np.median([load_of_episode(EpisodeSignals(log, spacing)).spread.sum() for log in some])
         )
 
-    return min(choices, key=cost)
+    return min(choices, key=residual_cost_at)
 
 
-def own_load(signals: EpisodeSignals) -> Hypothesis:
+def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
     """Return the load that explains an episode best, and its lag."""
-    search = Search(signals.predictor(np.zeros(10)), signals.regress, 0.0, _SMALLEST_WIDTH)
+    search = HypothesisSearch(
+        signals.reading_predictor(np.zeros(10)), signals.regressor_at_lag, 0.0, _SMALLEST_WIDTH
+    )
     lags = np.arange(-_MAX_LAG, _MAX_LAG + 0.1, _LAG_STEP)
-    return min((search.other_load(float(lag)) for lag in lags), key=lambda x: x.spread.sum())
-
-
-def _excess(episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array) -> Array:
-    """Return by how much each episode's spread exceeds that with its own load."""
-    usual = [_at_best_lag(s, phi, x.lag).spread.sum() for s, x in zip(episodes, own, strict=True)]
-    return np.array(usual) - [x.spread.sum() for x in own]
-
-
-def _at_best_lag(signals: EpisodeSignals, phi: Array, near: float) -> Hypothesis:
-    search = Search(signals.predictor(phi), signals.regress, near, _SMALLEST_WIDTH)
-    lags = near + np.arange(-STEPS, STEPS + 1) / STEPS
     return min(
-        (search.judged(as_described(float(lag))) for lag in lags), key=lambda x: x.spread.sum()
+        (search.hypothesis_of_other_load(float(lag)) for lag in lags), key=lambda x: x.spread.sum()
     )
 
 
-def _pooled(
+def _excess_spread(
+    episodes: Sequence[EpisodeSignals], own: Sequence[Hypothesis], phi: Array
+) -> Array:
+    usual = [
+        _hypothesis_at_best_lag(s, phi, x.lag).spread.sum()
+        for s, x in zip(episodes, own, strict=True)
+    ]
+    return np.array(usual) - [x.spread.sum() for x in own]
+
+
+def _hypothesis_at_best_lag(signals: EpisodeSignals, phi: Array, near: float) -> Hypothesis:
+    search = HypothesisSearch(
+        signals.reading_predictor(phi), signals.regressor_at_lag, near, _SMALLEST_WIDTH
+    )
+    lags = near + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
+    return min(
+        (search.with_spread_and_cost(hypothesis_without_fault(float(lag))) for lag in lags),
+        key=lambda x: x.spread.sum(),
+    )
+
+
+def _fit_load_to_members(
     episodes: Sequence[EpisodeSignals],
     own: Sequence[Hypothesis],
     members: NDArray[np.bool_],
     phi: Array,
 ) -> Identification:
-    """Return the load fitted to the calm frames of the member episodes, with own offsets."""
     gram, right, squares, samples = np.zeros((10, 10)), np.zeros(10), np.zeros(6), 0
     offsets = []
     for k in (int(row) for row in np.flatnonzero(members)):
-        x = _at_best_lag(episodes[k], phi, own[k].lag)
-        r = unexplained(x, episodes[k].predictor(phi), episodes[k].regress)
-        sigma = np.exp(x.spread) / CALM_WIDTH
+        x = _hypothesis_at_best_lag(episodes[k], phi, own[k].lag)
+        r = unexplained_reading(x, episodes[k].reading_predictor(phi), episodes[k].regressor_at_lag)
+        sigma = np.exp(x.spread) / HALF_WIDTH_OF_NORMAL
         rows = (np.abs(r - x.offsets) < _FREE_DEVIATIONS * sigma).all(axis=1)
-        V, w = episodes[k].regress(x.lag)[rows], episodes[k].log.wrench[rows]
+        V, w = episodes[k].regressor_at_lag(x.lag)[rows], episodes[k].log.wrench[rows]
         A = ((V - V.mean(axis=0)) / sigma[:, None]).reshape(-1, 10)
         b = ((w - w.mean(axis=0)) / sigma).ravel()
         gram, right = gram + A.T @ A, right + A.T @ b
@@ -176,14 +199,18 @@ def _pooled(
     )
 
 
-def _free_samples(signals: EpisodeSignals, x: Hypothesis, phi: Array, typical: Array) -> Samples:
-    residual = unexplained(x, signals.predictor(phi), signals.regress) - x.offsets
-    far = (np.abs(residual) > _FREE_DEVIATIONS * typical / CALM_WIDTH).any(axis=1)
-    near = np.convolve(far, np.ones(2 * _FREE_MARGIN + 1), "same") > 0.5
-    return contact_samples(signals, x.lag, residual).at(~near)
+def _contact_free_samples(
+    signals: EpisodeSignals, x: Hypothesis, phi: Array, typical: Array
+) -> DetectorSamples:
+    residual = (
+        unexplained_reading(x, signals.reading_predictor(phi), signals.regressor_at_lag) - x.offsets
+    )
+    far = (np.abs(residual) > _FREE_DEVIATIONS * typical / HALF_WIDTH_OF_NORMAL).any(axis=1)
+    near = np.convolve(far, np.ones(2 * _CONTACT_MARGIN_FRAMES + 1), "same") > 0.5
+    return samples_for_detector(signals, x.lag, residual).select_rows(~near)
 
 
-def contact_samples(signals: EpisodeSignals, lag: float, contact: Array) -> Samples:
+def samples_for_detector(signals: EpisodeSignals, lag: float, contact: Array) -> DetectorSamples:
     """Return the input of the contact detector for a contact wrench (N, 6)."""
-    at = signals.delayed(lag)
-    return Samples(contact, at.s, at.omega, at.alpha, at.s + at.gravity)
+    at = signals.motion_at_lag(lag)
+    return DetectorSamples(contact, at.s, at.omega, at.alpha, at.s + at.gravity)

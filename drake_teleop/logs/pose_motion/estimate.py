@@ -14,50 +14,50 @@ from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
+    FitWindow,
     Spectra,
-    Window,
-    averaged_splines,
-    choose_spacing,
-    clock_rate,
+    choose_knot_spacing,
     correct_clock_rate,
     delay_deviation,
-    fit_levels,
+    estimate_clock_rate_error,
     fit_linear_model,
-    guess_spacing,
+    fit_noise_levels,
+    guess_knot_spacing,
+    splines_of_averaged_poses,
 )
-from drake_teleop.logs.pose_motion.poses import Inertial, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
-    LEVER,
-    LOAD,
-    PARAMETERS,
-    TURN,
-    ReadOff,
+    LEVER_PARAMETERS,
+    LOAD_PARAMETERS,
+    NUM_PARAMETERS,
+    ROTATION_PARAMETERS,
     RigidFit,
-    State,
+    RigidParameters,
+    UnitsAndAxes,
     fit_rigid,
-    read_off,
+    read_units_and_axes,
 )
 from drake_teleop.logs.pose_motion.spectra import (
     MAX_FREQUENCY_HZ,
-    Grid,
+    WrenchGrid,
     end_taper,
-    exclude,
+    exclude_from_taper,
     noise_moments,
 )
 from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-SEARCHED_S = 120.0
+SEARCHED_DURATION_S = 120.0
 """Length of the searched part of a record [s]."""
 MIN_SHIFT, MAX_SHIFT_DEVIATION = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
 MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG = 5.0, 1.0
 """Least rotation that is reported, and largest standard deviation of a known one [deg]."""
 _MIN_WALD, _MIN_DEVIATIONS = 50.0, 5.0
-_SHARE_OF_RATE = 0.45
+_MAX_FREQUENCY_OVER_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
-_MIN_INSTANTS, _MIN_INSTANTS_OF_LOAD = 100, 32
+_MIN_INSTANTS, _MIN_INSTANTS_WITH_KNOWN_LOAD = 100, 32
 _NEGLIGIBLE = 1e-3
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -82,11 +82,11 @@ class Frame:
     turned: bool
 
     @property
-    def position_known(self) -> NDArray[np.bool_]:
+    def is_position_known(self) -> NDArray[np.bool_]:
         return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
 
     @property
-    def rotation_known(self) -> NDArray[np.bool_]:
+    def is_rotation_known(self) -> NDArray[np.bool_]:
         return np.asarray(self.turn_deviations_deg < MAX_ROTATION_DEVIATION_DEG)
 
 
@@ -129,7 +129,7 @@ class PoseEstimate(PoseMotion):
     fit: RigidFit
     frame: Frame
     free: RigidFit
-    seen: ReadOff
+    seen: UnitsAndAxes
     t: Array
     rejected: NDArray[np.bool_]
     note: str
@@ -141,7 +141,7 @@ class PoseEstimate(PoseMotion):
 
     @property
     def covariance(self) -> Array:
-        return self.fit.covariance[LOAD, LOAD]
+        return self.fit.covariance[LOAD_PARAMETERS, LOAD_PARAMETERS]
 
 
 def estimate_from_poses(
@@ -155,7 +155,7 @@ def estimate_from_poses(
     delay: float | None = None,
     gain: float = 0.0,
     lost: NDArray[np.bool_] | None = None,
-    imu: Inertial | None = None,
+    imu: ImuData | None = None,
 ) -> PoseEstimate:
     """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses of P.
 
@@ -170,27 +170,29 @@ def estimate_from_poses(
         )
         splines, late, grid = found.splines, found.delay_s, window.grid
         window = replace(window, taper=_base_taper(grid, splines.poses, lost, late))
-        spectra = window.spectra(splines, late)
+        spectra = window.spectra_at_delay(splines, late)
         rejected, note = find_disturbances(spectra, splines.spacing)
-        window = replace(window, taper=exclude(window.taper, rejected, grid.dt))
-        spectra = window.spectra(splines, late)
-        Z = spectra.moments()
-        Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
-        levels = fit_levels(Z, spectra.of)
+        window = replace(window, taper=exclude_from_taper(window.taper, rejected, grid.dt))
+        spectra = window.spectra_at_delay(splines, late)
+        Z = spectra.second_moments()
+        Q = noise_moments(
+            splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.estimate_pose_noise()
+        )
+        levels = fit_noise_levels(Z, spectra.of)
         best = fit_linear_model(Z, levels)
 
-        def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
+        def fit_rigid_from(start: RigidParameters, free: NDArray[np.bool_]) -> RigidFit:
             return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
 
-        seen = read_off(best)
-        start = _start(p_SoPo_S, R_SP, seen)
-        fit_free = np.ones(PARAMETERS, bool)
+        seen = read_units_and_axes(best)
+        start = _start_of_rigid_fit(p_SoPo_S, R_SP, seen)
+        fit_free = np.ones(NUM_PARAMETERS, bool)
         fit_free[16] = delay is None
-        fit_free[LEVER], fit_free[TURN] = p_SoPo_S is None, R_SP is None
-        fit = free = fitted(start, fit_free)
+        fit_free[LEVER_PARAMETERS], fit_free[ROTATION_PARAMETERS] = p_SoPo_S is None, R_SP is None
+        fit = free = fit_rigid_from(start, fit_free)
         if p_SoPo_S is not None or R_SP is not None:
-            with_frame = fit_free | (np.arange(PARAMETERS) > 16)
-            free = fitted(_free_start(fit, start, seen), with_frame)
+            with_frame = fit_free | (np.arange(NUM_PARAMETERS) > 16)
+            free = fit_rigid_from(_start_with_free_frame(fit, start, seen), with_frame)
         return PoseEstimate(
             splines=splines,
             delay_s=spectra.delay + fit.state.tau,
@@ -216,13 +218,13 @@ def motion_of_load(
     *,
     delay: float | None = None,
     lost: NDArray[np.bool_] | None = None,
-    imu: Inertial | None = None,
+    imu: ImuData | None = None,
 ) -> PoseMotion:
     """Return the motion from poses of S with which an identified load fits a wrench best."""
     with one_blas_thread():
         motion, last, _ = _find_motion(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
-            fewest=_MIN_INSTANTS_OF_LOAD,
+            fewest=_MIN_INSTANTS_WITH_KNOWN_LOAD,
             load=load,
         )
         known = delay is not None
@@ -236,15 +238,15 @@ def _find_motion(
     gravity_W: ArrayLike,
     delay: float | None,
     lost: NDArray[np.bool_] | None,
-    imu: Inertial | None,
+    imu: ImuData | None,
     *,
     fewest: int,
     load: Array | None = None,
-) -> tuple[PoseMotion, Spectra, Window]:
+) -> tuple[PoseMotion, Spectra, FitWindow]:
     t = finite_array("t", t, np.size(t))
     wrench = finite_array("wrench", wrench, len(t), 6)
     gravity = finite_array("gravity_W", gravity_W, 3)
-    grid, poses = Grid.of(t, wrench, load), poses.continued()
+    grid, poses = WrenchGrid.from_samples(t, wrench, load), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
     taper = _base_taper(grid, poses, lost, guess)
     if (taper > 0.5).sum() < fewest:
@@ -252,45 +254,49 @@ def _find_motion(
             "wrench and poses have too little in common",
             remedy="record longer, without interruptions",
         )
-    top = min(MAX_FREQUENCY_HZ, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-    whole = Window(grid, taper, gravity, top)
+    top = min(
+        MAX_FREQUENCY_HZ,
+        _MAX_FREQUENCY_OVER_RATE * poses.rate,
+        _MAX_FREQUENCY_OVER_RATE * grid.stride / grid.dt,
+    )
+    whole = FitWindow(grid, taper, gravity, top)
     rows = _most_varied_part(grid)
-    part = whole.part(rows)
+    part = whole.select_rows(rows)
     near_poses = _poses_near(poses, part.grid)
-    cache = averaged_splines(near_poses)
-    spacing, late = guess_spacing(part, cache, guess, known=known)
-    first = part.spectra(PoseSplines(near_poses, spacing), late)
+    cache = splines_of_averaged_poses(near_poses)
+    spacing, late = guess_knot_spacing(part, cache, guess, known=known)
+    first = part.spectra_at_delay(PoseSplines(near_poses, spacing), late)
     disturbed = find_disturbances(first, spacing)[0]
-    part = replace(part, taper=exclude(part.taper, disturbed, grid.dt))
-    rate = 0.0 if known else clock_rate(part, cache, late, spacing)
+    part = replace(part, taper=exclude_from_taper(part.taper, disturbed, grid.dt))
+    rate = 0.0 if known else estimate_clock_rate_error(part, cache, late, spacing)
     if rate:
         near_poses, poses = (
             correct_clock_rate(x, rate, part.grid, late) for x in (near_poses, poses)
         )
-        cache = averaged_splines(near_poses)
+        cache = splines_of_averaged_poses(near_poses)
     choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:
         imu_rows = compare_imu(PoseSplines(near_poses, imu_spacing), imu, gravity)
         agrees = imu_rows is not None
         choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
-    chosen, spacing, late = choose_spacing(part, choices, late, known=known)
+    chosen, spacing, late = choose_knot_spacing(part, choices, late, known=known)
     imu_rows = chosen.imu_rows
     if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
         imu_rows = compare_imu(PoseSplines(poses, imu_spacing), imu, gravity)
-    last = part.spectra(chosen.at(spacing), late)
+    last = part.spectra_at_delay(chosen.splines_with_spacing(spacing), late)
     splines = PoseSplines(poses, spacing, imu_rows)
     return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
 
 
-def _poses_near(poses: Poses, grid: Grid) -> Poses:
+def _poses_near(poses: Poses, grid: WrenchGrid) -> Poses:
     inside = (poses.t >= grid.t[0] - 2 * MAX_DELAY_CHANGE_S) & (
         poses.t <= grid.t[-1] + 2 * MAX_DELAY_CHANGE_S
     )
     return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
 
 
-def _most_varied_part(grid: Grid) -> slice:
-    rows, length = len(grid.t), round(SEARCHED_S / grid.dt)
+def _most_varied_part(grid: WrenchGrid) -> slice:
+    rows, length = len(grid.t), round(SEARCHED_DURATION_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     starts = range(0, rows - length, length // 2)
@@ -300,7 +306,9 @@ def _most_varied_part(grid: Grid) -> slice:
     return slice(first, first + length)
 
 
-def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float) -> Array:
+def _base_taper(
+    grid: WrenchGrid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float
+) -> Array:
     stamps = poses.t - delay
     start, stop = max(grid.t[0], stamps[0]), min(grid.t[-1], stamps[-1])
     if stop - start < 1.0:
@@ -312,26 +320,30 @@ def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay:
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
     for k in np.flatnonzero(np.diff(stamps) > _MIN_GAP_S):
         bad |= (grid.t > stamps[k] - _GAP_MARGIN_S) & (grid.t < stamps[k + 1] + _GAP_MARGIN_S)
-    return exclude(taper, bad, grid.dt, grid.dt)
+    return exclude_from_taper(taper, bad, grid.dt, grid.dt)
 
 
-def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) -> State:
+def _start_of_rigid_fit(
+    p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: UnitsAndAxes
+) -> RigidParameters:
     R = np.eye(3) if R_SP is None else np.asarray(R_SP, float).T
-    if R_SP is None and seen.usable and not seen.mirrored:
+    if R_SP is None and seen.is_usable and not seen.is_mirrored:
         R = seen.R_SP.T
     p = np.zeros(3) if p_SoPo_S is None else np.asarray(p_SoPo_S, float)
-    return State(np.zeros(16), 0.0, -R @ p, R)
+    return RigidParameters(np.zeros(16), 0.0, -R @ p, R)
 
 
-def _free_start(fit: RigidFit, start: State, seen: ReadOff) -> State:
-    turned = seen.usable and not seen.mirrored and np.trace(seen.R_SP @ start.R) < 2.9
+def _start_with_free_frame(
+    fit: RigidFit, start: RigidParameters, seen: UnitsAndAxes
+) -> RigidParameters:
+    turned = seen.is_usable and not seen.is_mirrored and np.trace(seen.R_SP @ start.R) < 2.9
     if not turned:
         return fit.state
     R = seen.R_SP.T
-    return State(np.zeros(16), fit.state.tau, R @ start.R.T @ start.r, R)
+    return RigidParameters(np.zeros(16), fit.state.tau, R @ start.R.T @ start.r, R)
 
 
-def _estimate_frame(free: RigidFit, start: State) -> Frame:
+def _estimate_frame(free: RigidFit, start: RigidParameters) -> Frame:
     R_SP, r = free.state.R.T, free.state.r
     origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]

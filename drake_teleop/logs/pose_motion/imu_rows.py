@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.pose_motion.poses import Inertial
-from drake_teleop.logs.pose_motion.spectra import Complex, end_taper, exclude
-from drake_teleop.logs.pose_motion.splines import ImuRows, PoseSplines
+from drake_teleop.logs.pose_motion.poses import ImuData
+from drake_teleop.logs.pose_motion.spectra import Complex, end_taper, exclude_from_taper
+from drake_teleop.logs.pose_motion.splines import ImuSplineRows, PoseSplines
 
 _PRIOR_GAIN_STD = 0.1
-_STEPS, _MAX_SHIFT_S, _POWER_ITERATIONS, _MIN_FREQUENCIES = 4, 0.1, 10, 40
+_MAX_FIT_STEPS, _MAX_SHIFT_S, _POWER_ITERATIONS, _MIN_FREQUENCIES = 4, 0.1, 10, 40
 _MAX_GAIN_ERROR = 0.2  # largest entry of D
 # Share of 1 / h that splines pass, and largest unexplained share of the motion.
 _PASSED_SHARE, _MAX_UNEXPLAINED = 0.25, 0.05
@@ -22,7 +22,7 @@ _COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_LENGTH_S = 125.0, 500.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Sensor:
+class _SensorModel:
     """Sensor model y = b + (1 + D) x(t + tau) for the motion x, and its noise power."""
 
     D: Array
@@ -30,14 +30,14 @@ class _Sensor:
     tau: float
     power: float
 
-    def corrected(self, y: Array) -> Array:
+    def corrected_data(self, y: Array) -> Array:
         return np.asarray(np.linalg.solve(np.eye(3) + self.D, (y - self.b).T).T)
 
 
-def compare_imu(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> ImuRows | None:
+def compare_imu(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
     """Return IMU data corrected to fit splines of poses, or None if the two do not agree."""
-    powers = tuple(std**2 / splines.rate for std in splines.noise())
-    averaged, sensors = imu.averaged(_COMPARISON_RATE_HZ), []
+    powers = tuple(std**2 / splines.rate for std in splines.estimate_pose_noise())
+    averaged, sensors = imu.average_to_rate(_COMPARISON_RATE_HZ), []
     for which, y in enumerate((averaged.specific_force, averaged.angular_velocity)):
         sensor = None
         if y is not None:
@@ -49,20 +49,20 @@ def compare_imu(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> ImuRow
     fitted = [sensor for sensor in sensors if sensor is not None]
     if not fitted:
         return None
-    rows = imu.averaged(_ROWS_RATE_HZ)
+    rows = imu.average_to_rate(_ROWS_RATE_HZ)
     t = rows.t + fitted[-1].tau  # the gyroscope determines the clock best
     inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
     s, omega = (
-        None if sensor is None or y is None else sensor.corrected(y[inside])
+        None if sensor is None or y is None else sensor.corrected_data(y[inside])
         for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
     )
     own = [0.0 if sensor is None else sensor.power for sensor in sensors]
-    imu_rows = ImuRows(t[inside], rows.rate, (powers[0], powers[1]), (own[0], own[1]))
-    imu_rows = imu_rows.oriented(
+    imu_rows = ImuSplineRows(t[inside], rows.rate, (powers[0], powers[1]), (own[0], own[1]))
+    imu_rows = imu_rows.from_sensor_axes(
         PoseSplines(splines.poses, splines.spacing), gravity_W, s, omega
     )  # then by poses and IMU together
     both = PoseSplines(splines.poses, splines.spacing, imu_rows)
-    return imu_rows.oriented(both, gravity_W, s, omega)
+    return imu_rows.from_sensor_axes(both, gravity_W, s, omega)
 
 
 def _fit_sensor(
@@ -72,7 +72,7 @@ def _fit_sensor(
     gravity_W: Array,
     which: int,
     pose_noise: tuple[float, int],
-) -> _Sensor | None:
+) -> _SensorModel | None:
     """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y."""
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)
@@ -80,7 +80,7 @@ def _fit_sensor(
     lost, values = np.ones(len(even), bool), np.zeros((len(even), 3))
     lost[place], values[place] = False, y
     start, stop = max(t[0], splines.poses.t[0]), min(t[-1], splines.poses.t[-1])
-    taper = exclude(end_taper(even, start + _MAX_SHIFT_S, stop - _MAX_SHIFT_S), lost, dt)
+    taper = exclude_from_taper(end_taper(even, start + _MAX_SHIFT_S, stop - _MAX_SHIFT_S), lost, dt)
     if (taper > 0.5).sum() * dt < _MIN_LENGTH_S:
         return None
     frequency = np.fft.rfftfreq(len(even), dt)
@@ -88,15 +88,20 @@ def _fit_sensor(
     noise: NDArray[np.floating] = pose_noise[0] * (2.0 * np.pi * frequency[used]) ** pose_noise[1]
     energy = float(np.sum(taper**2)) / dt
 
-    def spectrum(x: Array) -> Complex:
+    def tapered_spectrum(x: Array) -> Complex:
         return np.asarray(np.fft.rfft(x * taper[:, None], axis=0)[used], np.complex128)
 
     # Third differences remove the motion; the squares of 1, 3, 3, 1 add up to 20.
     least = float(np.mean(np.diff(y, 3, axis=0) ** 2)) * dt / 20.0 + 1e-30
-    Y, one, tau, power = spectrum(values), spectrum(np.ones((len(even), 1))), 0.0, least
-    for step in range(_STEPS):
+    Y, one, tau, power = (
+        tapered_spectrum(values),
+        tapered_spectrum(np.ones((len(even), 1))),
+        0.0,
+        least,
+    )
+    for step in range(_MAX_FIT_STEPS):
         x = splines.motion(even + tau, gravity_W)[which]
-        X, change = spectrum(x), spectrum(np.gradient(x, dt, axis=0))
+        X, change = tapered_spectrum(x), tapered_spectrum(np.gradient(x, dt, axis=0))
         if step == 0:
             power = max(power, float(np.median(np.abs(Y - X) ** 2)) / energy)
         weight = 1.0 / np.sqrt(energy * (noise + power))
@@ -111,7 +116,7 @@ def _fit_sensor(
         or residual[1:].sum() > _MAX_UNEXPLAINED * (np.abs(X[1:]) ** 2).sum()
     ):
         return None
-    return _Sensor(D, b, tau, power)
+    return _SensorModel(D, b, tau, power)
 
 
 def _least_squares(

@@ -11,15 +11,15 @@ import numpy as np
 from drake_teleop.common.numeric import Array, parabola_minimum
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
-    FORCES,
-    Bands,
+    FORCE_COLUMNS,
     Complex,
-    Grid,
-    Levels,
-    bands,
+    FrequencyBands,
+    NoiseLevels,
+    WrenchGrid,
     end_taper,
-    moments,
+    frequency_bands,
     random_walk_shape,
+    second_moments,
     shift_spectrum,
     shift_taper,
     signal_spectrum,
@@ -28,12 +28,12 @@ from drake_teleop.logs.pose_motion.spectra import (
 )
 from drake_teleop.logs.pose_motion.splines import (
     MIN_POSES_PER_KNOT,
-    SIGNALS,
+    NUM_MOTION_SIGNALS,
     PoseSplines,
     SplineCache,
 )
 
-SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
+TRIED_KNOT_SPACINGS_S = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 """Knot distances that are tried first; then two between the best and its neighbours [s]."""
 MAX_DELAY_CHANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
@@ -42,11 +42,11 @@ ROUNDING = 1e-7
 _COARSE_STEP_S, _FINE_STEP_S, _FINEST_STEP_S = 0.016, 1e-3, 1e-5
 _ITERATIONS = 4
 _SEARCH_RATE_HZ = 125.0
-_RANK_TOLERANCE, _FULL_RANK = 1e-12, 1e-8
+_RANK_TOLERANCE, _FULL_RANK_TOLERANCE = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
-_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
+_TRIED_DRIFT_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
 _MIN_COST_REDUCTION = 3.0
-_SPACING_FACTOR, _SPACING_FACTOR_OF_LOAD, _MIN_COST_RISE = 0.84, 0.92, 25.0
+_SPACING_FACTOR, _SPACING_FACTOR_WITH_KNOWN_LOAD, _MIN_COST_RISE = 0.84, 0.92, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +71,23 @@ class LinearFit:
         return float(self.costs.sum())
 
 
-def fit_linear_model(Z: Array, levels: Levels) -> LinearFit:
+def fit_linear_model(Z: Array, levels: NoiseLevels) -> LinearFit:
     """Fit the wrench by 16 signals of the motion, from second moments Z (bands, 38, 38)."""
-    return _fit_moments(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z), levels)
+    return _fit_moments(
+        Z[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
+        Z[:, :NUM_MOTION_SIGNALS, FORCE_COLUMNS],
+        _wrench_powers(Z),
+        levels,
+    )
 
 
 def _wrench_powers(Z: Array) -> Array:
-    return np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
+    return np.diagonal(Z[:, FORCE_COLUMNS, FORCE_COLUMNS], axis1=1, axis2=2)
 
 
 def _fit_moments(
-    zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
+    zz: Array, zf: Array, ff: Array, levels: NoiseLevels, load: Array | None = None
 ) -> LinearFit:
-    """Fit the linear model to moments; fit only the constants if `load` is given."""
     floor = _rounding_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T
@@ -101,24 +105,24 @@ def _fit_moments(
         weight = 1.0 / power
         gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, *zz.shape[-2:])
         right = np.swapaxes(np.sum(zf * weight[..., None, :], axis=-3), -1, -2)
-        inverse = _inverses(gram)
+        inverse = _pseudo_inverses(gram)
         C = (inverse @ right[..., None])[..., 0]
         across = np.swapaxes(C, -1, -2)[..., None, :, :]
         explained = np.sum((2.0 * zf - zz @ across) * across, axis=-2)
-        power = np.maximum(levels.power(ff - explained), floor)
+        power = np.maximum(levels.noise_power(ff - explained), floor)
     return LinearFit(
         coefficients=C * scale[..., None, :],
         covariance=0.5 * inverse * both[..., None, :, :],
         power=power,
-        costs=levels.costs(power),
+        costs=levels.negative_log_likelihoods(power),
     )
 
 
-def _inverses(gram: Array) -> Array:
+def _pseudo_inverses(gram: Array) -> Array:
     largest = np.diagonal(gram, axis1=-2, axis2=-1).max(axis=-1, keepdims=True)
     try:
         pivots = np.diagonal(np.linalg.cholesky(gram), axis1=-2, axis2=-1) ** 2
-        if (pivots > _FULL_RANK * largest).all():
+        if (pivots > _FULL_RANK_TOLERANCE * largest).all():
             return np.asarray(np.linalg.inv(gram))  # three times faster
     except np.linalg.LinAlgError:
         pass
@@ -128,7 +132,7 @@ def _inverses(gram: Array) -> Array:
     return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
 
 
-def least_power(Z: Array, sizes: Array) -> Array:
+def rounding_error_power(Z: Array, sizes: Array) -> Array:
     """Return the power (6,) of rounding errors in the wrench channels."""
     return _rounding_power(_wrench_powers(Z), sizes)
 
@@ -139,11 +143,11 @@ def _rounding_power(ff: Array, sizes: Array) -> Array:
     return np.maximum(ROUNDING**2 * both, 1e-60)
 
 
-def fit_levels(Z: Array, of: Bands) -> Levels:
+def fit_noise_levels(Z: Array, of: FrequencyBands) -> NoiseLevels:
     """Return noise levels with the drift of lowest cost in each wrench channel, Eq. (T74)."""
-    levels = Levels.flat(of)
+    levels = NoiseLevels.white_within_groups(of)
     least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
-    for corner in _CORNERS_HZ:
+    for corner in _TRIED_DRIFT_CORNERS_HZ:
         rising = np.repeat(random_walk_shape(of, corner)[:, None], 6, axis=1)
         costs = fit_linear_model(Z, replace(levels, shape=rising)).costs
         better = costs < least
@@ -161,66 +165,81 @@ class Spectra:
         zeta: (M, 16) signals in time.
     """
 
-    of: Bands
+    of: FrequencyBands
     wrench: Complex
     signals: Complex
     delay: float
-    grid: Grid
+    grid: WrenchGrid
     taper: Array
     zeta: Array
 
     @property
-    def reach(self) -> float:
+    def max_delay_change_s(self) -> float:
         """Largest change of the delay in a search [s]."""
         return min(MAX_DELAY_CHANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
 
     @cached_property
-    def taper_fixed(self) -> bool:
+    def is_taper_fixed(self) -> bool:
         """Whether the weights of samples stay in place when the delay changes."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.load is not None)
 
-    def at(self, delay: float) -> Spectra:
+    def with_delay(self, delay: float) -> Spectra:
         shift, signals = delay - self.delay, self.signals
-        if self.taper_fixed:
+        if self.is_taper_fixed:
             before = shift_taper(self.grid, self.taper, shift)
             signals = signal_spectrum(self.grid, before, self.zeta, len(signals))
         late = shift_spectrum(signals, self.of.frequency, shift)
         late[:, 0] = self.signals[:, 0]
         return replace(self, signals=late)
 
-    def moments(self) -> Array:
+    def second_moments(self) -> Array:
         """Return second moments (bands, 38, 38) of signals, wrench, and derivatives of signals."""
         rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
         edges = taper_derivative(self.grid, self.taper)
         rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
         rates[:, 0] = 0.0
-        return moments(self.signals, self.wrench, self.of, rates)
+        return second_moments(self.signals, self.wrench, self.of, rates)
 
-    def fit(self) -> LinearFit:
+    def fit_coefficients(self) -> LinearFit:
         """Fit the coefficients of all signals, or only the constants if the load is known."""
-        Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
-        parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z)
-        fit = _fit_moments(*parts, Levels.flat(self.of), load)
+        Z, load = second_moments(self.signals, self.wrench, self.of), self.grid.load
+        parts = (
+            Z[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
+            Z[:, :NUM_MOTION_SIGNALS, FORCE_COLUMNS],
+            _wrench_powers(Z),
+        )
+        fit = _fit_moments(*parts, NoiseLevels.white_within_groups(self.of), load)
         if load is None:
             return fit
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
 
-    def costs(self, delays: Array) -> Array:
+    def costs_at_delays(self, delays: Array) -> Array:
         """Return the negative log likelihoods (D,) of fits with delays (D,) [s]."""
-        if self.taper_fixed:
-            Z = np.array([moments(x.signals, x.wrench, x.of) for x in map(self.at, delays)])
-            zz, zf = Z[..., :SIGNALS, :SIGNALS], Z[..., :SIGNALS, FORCES]
+        if self.is_taper_fixed:
+            Z = np.array(
+                [second_moments(x.signals, x.wrench, x.of) for x in map(self.with_delay, delays)]
+            )
+            zz, zf = (
+                Z[..., :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS],
+                Z[..., :NUM_MOTION_SIGNALS, FORCE_COLUMNS],
+            )
         else:
             zz, zf = self._delayed_moments(np.asarray(delays))
         power = np.abs(self.wrench) ** 2
-        fits = _fit_moments(zz, zf, self.of.sums(power), Levels.flat(self.of), self.grid.load)
+        fits = _fit_moments(
+            zz,
+            zf,
+            self.of.sums_over_bands(power),
+            NoiseLevels.white_within_groups(self.of),
+            self.grid.load,
+        )
         return fits.costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
         """Return moments of signals and wrench at delays (D,) [s], with a moving taper."""
-        of, Z = self.of, moments(self.signals, self.wrench, self.of)
+        of, Z = self.of, second_moments(self.signals, self.wrench, self.of)
         fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
         products = np.conj(self.signals)[:, :, None] * fixed[:, None]
         flat = products.reshape(len(products), -1)
@@ -231,9 +250,9 @@ class Spectra:
         for k in range(of.count):
             part = slice(starts[k], starts[k + 1])
             sums[:, k] = cosine[:, part] @ flat[part].real + sine[:, part] @ flat[part].imag
-        zf = sums.reshape(len(delays), of.count, SIGNALS, 7)
-        zf[:, :, 0, :6], zf[:, :, 0, 6] = Z[:, 0, FORCES], Z[:, 0, 0]
-        zz = np.repeat(Z[None, :, :SIGNALS, :SIGNALS], len(delays), axis=0)
+        zf = sums.reshape(len(delays), of.count, NUM_MOTION_SIGNALS, 7)
+        zf[:, :, 0, :6], zf[:, :, 0, 6] = Z[:, 0, FORCE_COLUMNS], Z[:, 0, 0]
+        zz = np.repeat(Z[None, :, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS], len(delays), axis=0)
         zz[..., 0] = zz[..., 0, :] = zf[..., 6]
         return zz, zf[..., :6]
 
@@ -245,24 +264,24 @@ class Spectra:
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class FitWindow:
     """Data of a fit: weights `taper` (M,), gravity (3,) [m/s^2], highest frequency [Hz]."""
 
-    grid: Grid
+    grid: WrenchGrid
     taper: Array
     gravity_W: Array
     top: float
 
-    def part(self, rows: slice) -> Window:
+    def select_rows(self, rows: slice) -> FitWindow:
         grid = self.grid
         wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
         grid = replace(grid, t=grid.t[rows], wrench=wrench)
         taper = self.taper[rows] * end_taper(grid.t, grid.t[0], grid.t[-1])
         return replace(self, grid=grid, taper=taper)
 
-    def spectra(self, splines: PoseSplines, delay: float) -> Spectra:
+    def spectra_at_delay(self, splines: PoseSplines, delay: float) -> Spectra:
         """Return spectra of the wrench, and of the motion `delay` [s] later."""
-        of = bands(self.grid, self.taper, self.top)
+        of = frequency_bands(self.grid, self.taper, self.top)
         count = len(of.frequency)
         zeta = splines.signals(self.grid.t + delay, self.gravity_W)
         wrench = wrench_spectrum(self.grid, self.taper, count)
@@ -276,103 +295,113 @@ def best_delay(
     """Return the delay of lowest cost within `reach`, to the step `finest` [s], and this cost."""
     step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
-    costs = spectra.costs(at)
+    costs = spectra.costs_at_delays(at)
     while step > finest:
         best = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
         centre = float(at[best] + step * parabola_minimum(*costs[best - 1 : best + 2]))
         step /= 8.0
         at = centre + step * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-        costs = spectra.costs(at)
+        costs = spectra.costs_at_delays(at)
     best = int(np.argmin(costs))
     return float(at[best]), float(costs[best])
 
 
 def delay_deviation(spectra: Spectra) -> float:
     """Return the standard deviation of the delay [s]; inf if undetermined."""
-    reach = spectra.reach
+    reach = spectra.max_delay_change_s
     beside = np.array([-_FINE_STEP_S, 0.0, _FINE_STEP_S])
-    left, least, right = spectra.costs(spectra.delay + beside)
-    far = spectra.costs(spectra.delay + np.arange(-reach, reach, _COARSE_STEP_S))
+    left, least, right = spectra.costs_at_delays(spectra.delay + beside)
+    far = spectra.costs_at_delays(spectra.delay + np.arange(-reach, reach, _COARSE_STEP_S))
     bend = left - 2.0 * least + right
     if bend <= 0.0 or far.max() - least < _MIN_COST_RISE or far.min() < least - 1.0:
         return np.inf
     return float(_FINE_STEP_S / np.sqrt(bend))
 
 
-def guess_spacing(
-    window: Window, cache: SplineCache, delay: float, *, known: bool
+def guess_knot_spacing(
+    window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
     """Return knot distance [s] and delay [s] of lowest cost on a coarse grid.
 
     The delay is not changed if `known`.
     """
     spacings, found = _allowed_spacings(cache)[::2], []
-    start = window.spectra(cache.at(spacings[0]), delay)
+    start = window.spectra_at_delay(cache.splines_with_spacing(spacings[0]), delay)
     for h in spacings:
-        spectra = start.with_motion(cache.at(h), window.gravity_W, delay)
+        spectra = start.with_motion(cache.splines_with_spacing(h), window.gravity_W, delay)
         if known:
-            found.append((spectra.fit().cost, h, delay))
+            found.append((spectra.fit_coefficients().cost, h, delay))
             continue
-        late, cost = best_delay(spectra, spectra.reach, _FINE_STEP_S)
+        late, cost = best_delay(spectra, spectra.max_delay_change_s, _FINE_STEP_S)
         found.append((cost, h, late))
     return min(found)[1:]
 
 
-def choose_spacing(
-    window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
+def choose_knot_spacing(
+    window: FitWindow, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
     """Return splines, knot distance [s] and delay [s] of about lowest cost.
 
     Knots are 8 or 16 % closer than at lowest cost. The delay is not changed if `known`.
     """
-    start = window.spectra(choices[0].at(SPACINGS[0]), delay)
+    start = window.spectra_at_delay(
+        choices[0].splines_with_spacing(TRIED_KNOT_SPACINGS_S[0]), delay
+    )
     found = []
     for cache in choices:
         spacings = _allowed_spacings(cache)
 
         def cost(h: float, cache: SplineCache = cache) -> float:
-            return start.with_motion(cache.at(h), window.gravity_W, delay).fit().cost
+            return (
+                start.with_motion(cache.splines_with_spacing(h), window.gravity_W, delay)
+                .fit_coefficients()
+                .cost
+            )
 
         costs = [(cost(h), h) for h in spacings]
         middle = min(costs)[1]
-        between = [float(np.sqrt(middle * h)) for h in _neighbours(middle, spacings)]
+        between = [float(np.sqrt(middle * h)) for h in _neighbouring_spacings(middle, spacings)]
         found.append(min(costs + [(cost(h), h) for h in between]))
     least = min(range(len(found)), key=lambda k: found[k])
     cache = choices[least]
-    finer = _SPACING_FACTOR if window.grid.load is None else _SPACING_FACTOR_OF_LOAD
+    finer = _SPACING_FACTOR if window.grid.load is None else _SPACING_FACTOR_WITH_KNOWN_LOAD
     best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
     if not known:
-        last = start.with_motion(cache.at(best), window.gravity_W, delay)
+        last = start.with_motion(cache.splines_with_spacing(best), window.gravity_W, delay)
         delay, _ = best_delay(last, 3 * _COARSE_STEP_S)
     return cache, best, delay
 
 
-def averaged_splines(poses: Poses) -> SplineCache:
+def splines_of_averaged_poses(poses: Poses) -> SplineCache:
     """Return splines of averaged poses, at the lowest rate that a search for the delay needs."""
-    return SplineCache(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
+    return SplineCache(poses.average_consecutive(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 
-def _neighbours(h: float, of: list[float]) -> list[float]:
+def _neighbouring_spacings(h: float, of: list[float]) -> list[float]:
     k = of.index(h)
     return of[max(0, k - 1) : k] + of[k + 1 : k + 2]
 
 
 def _allowed_spacings(cache: SplineCache) -> list[float]:
-    return [h for h in SPACINGS if h * cache.rate >= MIN_POSES_PER_KNOT] or [SPACINGS[0]]
+    return [h for h in TRIED_KNOT_SPACINGS_S if h * cache.rate >= MIN_POSES_PER_KNOT] or [
+        TRIED_KNOT_SPACINGS_S[0]
+    ]
 
 
-_STEPS, _MIN_LIKELIHOOD_GAIN = 3, 25.0
+_MAX_CLOCK_RATE_STEPS, _MIN_LIKELIHOOD_GAIN = 3, 25.0
 # A larger change of the delay [s] is not caused by a clock.
 _MAX_CHANGE_S = 0.2
 
 
-def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float) -> float:
+def estimate_clock_rate_error(
+    window: FitWindow, cache: SplineCache, delay: float, spacing: float
+) -> float:
     """Return the relative rate error of the poses' clock, such as 5e-5, or 0 if insignificant."""
-    first, grid = window.spectra(cache.at(spacing), delay), window.grid
+    first, grid = window.spectra_at_delay(cache.splines_with_spacing(spacing), delay), window.grid
     now, best = first, 0.0
-    least = start = now.fit().cost
-    for _ in range(_STEPS):
-        step, gain = _step(now)
+    least = start = now.fit_coefficients().cost
+    for _ in range(_MAX_CLOCK_RATE_STEPS):
+        step, gain = _clock_rate_and_delay_step(now)
         trial = best + step
         if gain < _MIN_LIKELIHOOD_GAIN and best == 0.0:
             return 0.0
@@ -380,21 +409,21 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
             break
         splines = PoseSplines(correct_clock_rate(cache.poses, trial, grid, delay), spacing)
         now = first.with_motion(splines, window.gravity_W, delay)
-        cost = now.fit().cost
+        cost = now.fit_coefficients().cost
         if not cost < least:
             break
         least, best = cost, trial
     return best if 2.0 * (start - least) > _MIN_LIKELIHOOD_GAIN else 0.0
 
 
-def correct_clock_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
+def correct_clock_rate(poses: Poses, rate: float, grid: WrenchGrid, delay: float) -> Poses:
     """Return the poses on the wrench's clock, for a relative rate error of the poses' clock."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 
 
-def _step(spectra: Spectra) -> tuple[float, float]:
-    fit, grid = spectra.fit(), spectra.grid
+def _clock_rate_and_delay_step(spectra: Spectra) -> tuple[float, float]:
+    fit, grid = spectra.fit_coefficients(), spectra.grid
     change = np.gradient(spectra.zeta, grid.dt, axis=0)
     from_middle = (grid.t - 0.5 * (grid.t[0] + grid.t[-1]))[:, None]
     count = len(spectra.of.frequency)

@@ -28,7 +28,7 @@ class Poses:
         """Median rate [Hz]."""
         return float(1.0 / np.median(np.diff(self.t)))
 
-    def continued(self) -> Poses:
+    def with_continuous_quaternions(self) -> Poses:
         """Return the poses with quaternions whose signs do not jump."""
         products = np.einsum("ki,ki->k", self.quaternion[1:], self.quaternion[:-1])
         if (products >= 0.0).all():
@@ -36,7 +36,7 @@ class Poses:
         sign = np.concatenate([[1.0], np.cumprod(np.where(products < 0.0, -1.0, 1.0))])
         return Poses(self.t, self.position, self.quaternion * sign[:, None])
 
-    def averaged(self, count: int) -> Poses:
+    def average_consecutive(self, count: int) -> Poses:
         """Return means of `count` consecutive poses, whose quaternion signs must not jump."""
         rows = len(self.t) // count * count
         t, p, q = (
@@ -47,7 +47,7 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
-class Inertial:
+class ImuData:
     """IMU data at the sensor origin So, in the axes of S, at times t (K,) [s].
 
     Attributes:
@@ -64,22 +64,26 @@ class Inertial:
         """Rate outside of gaps [Hz]."""
         return float(1.0 / np.median(np.diff(self.t)))
 
-    def averaged(self, fastest: float) -> Inertial:
+    def average_to_rate(self, fastest: float) -> ImuData:
         """Return means of consecutive rows, at a rate of at least `fastest` [Hz]."""
         count = max(1, int(self.rate / fastest))
         rows = len(self.t) // count * count
         at = self.t[:rows].reshape(-1, count)
         whole = at[:, -1] - at[:, 0] < count / self.rate
 
-        def means(x: Array | None) -> Array | None:
+        def means_of_consecutive(x: Array | None) -> Array | None:
             return None if x is None else x[:rows].reshape(-1, count, 3).mean(axis=1)[whole]
 
         means_t = at.mean(axis=1)[whole]
-        return Inertial(means_t, means(self.specific_force), means(self.angular_velocity))
+        return ImuData(
+            means_t,
+            means_of_consecutive(self.specific_force),
+            means_of_consecutive(self.angular_velocity),
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PosesOfLog:
     """Poses of S in a log, with gravity in the world [m/s^2], and the described pose frame P.
 
     Attributes:
@@ -91,9 +95,9 @@ class Posed:
     gravity_W: Array
     p_SoPo_S: Array = field(default_factory=lambda: np.zeros(3))
     R_SP: Array = field(default_factory=lambda: np.eye(3))
-    imu: Inertial | None = None
+    imu: ImuData | None = None
 
-    def earlier(self, start: float) -> Posed:
+    def with_times_from(self, start: float) -> PosesOfLog:
         """Return poses and IMU data with times relative to `start` [s]."""
         imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
         return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

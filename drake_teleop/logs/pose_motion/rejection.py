@@ -7,16 +7,16 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.linear_model import ROUNDING, Spectra
-from drake_teleop.logs.pose_motion.spectra import Grid, distance_to_flag
+from drake_teleop.logs.pose_motion.spectra import WrenchGrid, distance_to_flag
 from drake_teleop.logs.pose_motion.splines import MOTION_COLUMNS
 
-NOTHING_REJECTED = (
+NOTHING_REJECTED_NOTE = (
     "the residual is large where the load moves and small where it rests, so disturbances"
     " cannot be distinguished from errors of the motion: no sample was rejected"
 )
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS = 3.0, 4.5, 30
 _NORMAL_MAD = 1.4826
-_MAX_LOSS = 2.5
+_MAX_INFORMATION_LOSS = 2.5
 _PASSED_SHARE = 0.3
 _MIN_MARGIN_S = 0.1
 """Least margin on both sides of a rejected time span [s]."""
@@ -27,7 +27,9 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     # A Gaussian gain, one half at `_PASSED_SHARE` / h, does not ring.
     gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED_SHARE) ** 2)
     grid = spectra.grid
-    x, y = (_in_time(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench))
+    x, y = (
+        _spectrum_to_time_signal(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench)
+    )
     inside = spectra.taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]
@@ -42,31 +44,36 @@ def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool
     weights = inside.astype(float)
     for _ in range(_MAX_FITS):
         before = weights
-        distances = _distances(x, y, weights, inside)
+        distances = _normalized_residual_distances(x, y, weights, inside)
         weights = inside * np.minimum(1.0, _HUBER_LIMIT / np.maximum(distances, _HUBER_LIMIT))
         if np.abs(weights - before).max() < 0.01:
             break
     rejected = np.zeros(len(x), bool)
     for _ in range(_MAX_FITS):
-        last, rejected = rejected, _distances(x, y, weights, inside) > _REJECTION_LIMIT
+        last, rejected = (
+            rejected,
+            _normalized_residual_distances(x, y, weights, inside) > _REJECTION_LIMIT,
+        )
         weights = (inside & ~rejected).astype(float)
         if (rejected == last).all() or weights.sum() < 2 * x.shape[1]:
             break
     if not rejected.any():
         return rejected, ""
     rejected = distance_to_flag(rejected) * grid.dt <= max(_MIN_MARGIN_S, spacing)
-    if _information_loss(test_signals, inside, inside & ~rejected) > _MAX_LOSS:
-        return np.zeros(len(x), bool), NOTHING_REJECTED
+    if _information_loss(test_signals, inside, inside & ~rejected) > _MAX_INFORMATION_LOSS:
+        return np.zeros(len(x), bool), NOTHING_REJECTED_NOTE
     return rejected, ""
 
 
-def _in_time(spectrum: NDArray[np.complex128], grid: Grid) -> Array:
-    full = np.zeros((grid.length // 2 + 1, spectrum.shape[1]), np.complex128)
+def _spectrum_to_time_signal(spectrum: NDArray[np.complex128], grid: WrenchGrid) -> Array:
+    full = np.zeros((grid.transform_length // 2 + 1, spectrum.shape[1]), np.complex128)
     full[: len(spectrum)] = spectrum
-    return np.asarray(np.fft.irfft(full, grid.length, axis=0)[: len(grid.t)])
+    return np.asarray(np.fft.irfft(full, grid.transform_length, axis=0)[: len(grid.t)])
 
 
-def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
+def _normalized_residual_distances(
+    x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]
+) -> Array:
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)

@@ -10,17 +10,27 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, gain_effects
-from drake_teleop.load.moments import centripetal_matrix, coefficients
-from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
-from drake_teleop.logs.pose_motion.spectra import FORCES, MOMENTS_SIZE, RATES, Levels
-from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
+from drake_teleop.load.batch.uncertainty import TORQUE_ARM_M, parameter_errors_by_gains
+from drake_teleop.load.moments import centripetal_matrix, regressor_coefficients
+from drake_teleop.logs.pose_motion.linear_model import LinearFit, rounding_error_power
+from drake_teleop.logs.pose_motion.spectra import (
+    FORCE_COLUMNS,
+    MOMENTS_SIZE,
+    SIGNAL_RATE_COLUMNS,
+    NoiseLevels,
+)
+from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, NUM_MOTION_SIGNALS
 
-PARAMETERS = 23
+NUM_PARAMETERS = 23
 """Number of parameters: [offsets; phi] (16), tau, r (3), rho (3)."""
-LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20, 23)
-_STEPS, _CONVERGED = 40, 1e-4
-_MAX_RIGID_RATIO, _GAIN_ALLOWANCE, _NOISE_RATIO = 4.0, 1.5, 1.5
+LOAD_PARAMETERS, DELAY_PARAMETER, LEVER_PARAMETERS, ROTATION_PARAMETERS = (
+    slice(0, 16),
+    slice(16, 17),
+    slice(17, 20),
+    slice(20, 23),
+)
+_MAX_FIT_STEPS, _CONVERGENCE_TOLERANCE = 40, 1e-4
+_MAX_RIGID_RATIO, _GAIN_MISFIT_FACTOR, _NOISE_RATIO = 4.0, 1.5, 1.5
 _MAX_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
 _MIN_REST_SHARE = 0.1
 _ROTATION_STEP = 1e-4  # rad, step of a numerical derivative
@@ -28,7 +38,7 @@ _RANK_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class RigidParameters:
     """Parameters: theta = [offsets; phi] (16,), delay tau [s], r = p_PoSo (3,) [m], R_PS (3, 3)."""
 
     theta: Array
@@ -51,7 +61,7 @@ class RigidFit:
         one_weight: whether all bands had one weight.
     """
 
-    state: State
+    state: RigidParameters
     covariance: Array
     misfit: float
     degrees: float
@@ -59,32 +69,33 @@ class RigidFit:
     one_weight: bool = False
 
     @property
-    def rigid(self) -> bool:
+    def is_rigid(self) -> bool:
         """Whether the misfit is below four times its degrees of freedom."""
         return self.misfit < _MAX_RIGID_RATIO * self.degrees
 
     @property
-    def explained(self) -> bool:
+    def is_explained_by_gains(self) -> bool:
         """Whether a rigid load with the stated gain errors explains the wrench."""
         return (
-            self.misfit < _MAX_RIGID_RATIO * self.degrees + _GAIN_ALLOWANCE * self.misfit_of_gains
+            self.misfit
+            < _MAX_RIGID_RATIO * self.degrees + _GAIN_MISFIT_FACTOR * self.misfit_of_gains
         )
 
     @property
-    def inflation(self) -> float:
+    def deviation_inflation(self) -> float:
         """Factor (>= 1) on standard deviations due to misfit."""
-        left = self.misfit - _GAIN_ALLOWANCE * self.misfit_of_gains
+        left = self.misfit - _GAIN_MISFIT_FACTOR * self.misfit_of_gains
         return float(np.sqrt(max(1.0, left / (_NOISE_RATIO * self.degrees))))
 
 
-def motion_map(R: Array, r: Array) -> Array:
+def motion_transformation_matrix(R: Array, r: Array) -> Array:
     """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79), for R = R_PS, r = p_PoSo [m].
 
     It maps motion signals zeta (16) of pose frame P, and the wrench F, to the sensor frame S.
     """
-    M = np.zeros((19, SIGNALS + 6))
+    M = np.zeros((19, NUM_MOTION_SIGNALS + 6))
     M[0, 0] = 1.0
-    M[1:7, SIGNALS:] = np.eye(6)
+    M[1:7, NUM_MOTION_SIGNALS:] = np.eye(6)
     M[7:10, 1:4] = M[7:10, 4:7] = R.T
     M[7:10, 7:10] = -R.T @ cross_matrix(r)
     M[7:10, 10:16] = R.T @ centripetal_matrix(r)
@@ -110,8 +121,8 @@ def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
 
 def _coefficients_of(phi: Array) -> Array:
     theta = np.concatenate([np.zeros(6), phi])
-    M = motion_map(np.eye(3), np.zeros(3))[:, :SIGNALS]
-    return np.asarray(np.einsum("cjk,j->ck", coefficients(), theta) @ M)
+    M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
+    return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
 
 
 def _rotated_products(R: Array) -> Array:
@@ -125,8 +136,8 @@ def _rotated_products(R: Array) -> Array:
 def fit_rigid(
     Z: Array,
     Q: Array,
-    levels: Levels,
-    start: State,
+    levels: NoiseLevels,
+    start: RigidParameters,
     free: NDArray[np.bool_],
     linear: LinearFit,
     *,
@@ -137,37 +148,37 @@ def fit_rigid(
     Z (bands, 38, 38) are second moments, Q the part that noise of the poses adds. Parameters with
     `free` (23,) True are estimated. The residual of the fit `linear` gives the first weights.
     """
-    record = _Record(Z, Q, levels, free, linear.power)
-    solution = _solve(record, start)
+    record = _FitData(Z, Q, levels, free, linear.power)
+    solution = _solve_rigid_fit(record, start)
     # The linear model is not compensated for noise, so the compared fit must not be either.
-    plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state)
-    least = least_power(record.Z, levels.sizes)
-    power = np.maximum(levels.power(_residual_sums(record, plain.state)), least)
+    plain = _solve_rigid_fit(replace(record, Q=np.zeros_like(Q)), solution.state)
+    least = rounding_error_power(record.Z, levels.sizes)
+    power = np.maximum(levels.noise_power(_residual_sums(record, plain.state)), least)
     fit = RigidFit(
         solution.state,
         covariance=np.zeros((0, 0)),
-        misfit=2.0 * (float(levels.costs(power).sum()) - linear.cost),
-        degrees=6.0 * SIGNALS - float(free.sum()),
+        misfit=2.0 * (float(levels.negative_log_likelihoods(power).sum()) - linear.cost),
+        degrees=6.0 * NUM_MOTION_SIGNALS - float(free.sum()),
         misfit_of_gains=_misfit_of_gains(record, plain, gain),
     )
-    if not fit.rigid:
-        solution = _solve(record, solution.state, one_weight=True)
+    if not fit.is_rigid:
+        solution = _solve_rigid_fit(record, solution.state, one_weight=True)
         fit = replace(fit, state=solution.state, one_weight=True)
-    return replace(fit, covariance=_covariance(record, solution, fit.inflation, gain))
+    return replace(fit, covariance=_covariance(record, solution, fit.deviation_inflation, gain))
 
 
 @dataclass(frozen=True, eq=False)
-class _Record:
+class _FitData:
     Z: Array
     Q: Array
-    levels: Levels
+    levels: NoiseLevels
     free: NDArray[np.bool_]
     power: Array
 
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    state: State
+    state: RigidParameters
     B: Array
     W: Array
     inverse: Array
@@ -175,30 +186,32 @@ class _Solution:
     undetermined: NDArray[np.bool_]
 
 
-def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solution:
+def _solve_rigid_fit(
+    record: _FitData, state: RigidParameters, *, one_weight: bool = False
+) -> _Solution:
     sizes, clean = record.levels.sizes, record.Z - record.Q
     R = _residual_covariances(record, state, record.power * sizes[:, None])
-    for _ in range(_STEPS):
+    for _ in range(_MAX_FIT_STEPS):
         W: Array = np.linalg.inv(R).astype(np.float64)
         if one_weight:
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
-        B, Le = _columns(state)
-        gram, right = _normal(B, Le, clean, W)
-        inverse, undetermined = _inverse(gram, record.free)
+        B, Le = _residual_derivative(state)
+        gram, right = _normal_equations(B, Le, clean, W)
+        inverse, undetermined = _inverse_of_free_parameters(gram, record.free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
         step *= min(1.0, float(np.min(_MAX_STEP / np.maximum(np.abs(step), 1e-300))))
         state = _apply_step(state, step)
-        used = _used_freedom(B, record.Z, W, inverse)
+        used = _used_degrees_of_freedom(B, record.Z, W, inverse)
         R = _residual_covariances(record, state, _residual_sums(record, state), used)
-        if np.max(np.abs(step) / size) < _CONVERGED:
+        if np.max(np.abs(step) / size) < _CONVERGENCE_TOLERANCE:
             break
     return _Solution(state, B, W, inverse, R, undetermined)
 
 
-def _covariance(record: _Record, solution: _Solution, inflation: float, gain: float) -> Array:
+def _covariance(record: _FitData, solution: _Solution, inflation: float, gain: float) -> Array:
     B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
-    middle = _normal(B, np.zeros((6, MOMENTS_SIZE)), record.Z, W @ solution.R @ W)[0]
+    middle = _normal_equations(B, np.zeros((6, MOMENTS_SIZE)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
     covariance *= np.outer(*2 * [_weight_estimation_factors(record, solution)])
     larger = covariance * inflation**2
@@ -213,38 +226,38 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
     return larger
 
 
-def _weight_estimation_factors(record: _Record, solution: _Solution) -> Array:
+def _weight_estimation_factors(record: _FitData, solution: _Solution) -> Array:
     levels, B = record.levels, solution.B
     half = np.einsum("cjk,ji->cik", B, solution.inverse)
     weight = np.diagonal(solution.W, axis1=1, axis2=2)
     part = np.einsum("cik,bkm,cim->bci", half, record.Z, half, optimize=True) * weight[..., None]
-    part = levels.grouped(part).reshape(-1, PARAMETERS)
+    part = levels.sums_over_groups(part).reshape(-1, NUM_PARAMETERS)
     share = part / np.maximum(part.sum(axis=0), 1e-300)
-    freedom = np.repeat(2.0 * levels.grouped(levels.sizes), 6)
+    freedom = np.repeat(2.0 * levels.sums_over_groups(levels.sizes), 6)
     return np.sqrt(1.0 + 4.0 * np.sum(share * (1.0 - share) / freedom[:, None], axis=0))
 
 
-def _map(state: State) -> Array:
-    M = motion_map(state.R, state.r)
-    return np.hstack([M, state.tau * M[:, :SIGNALS]])
+def _motion_map_with_delay(state: RigidParameters) -> Array:
+    M = motion_transformation_matrix(state.R, state.r)
+    return np.hstack([M, state.tau * M[:, :NUM_MOTION_SIGNALS]])
 
 
-def _residual_map(state: State) -> Array:
-    L = -np.einsum("cjk,j->ck", coefficients(), state.theta)
+def _residual_coefficients(state: RigidParameters) -> Array:
+    L = -np.einsum("cjk,j->ck", regressor_coefficients(), state.theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     return L
 
 
-def _columns(state: State) -> tuple[Array, Array]:
+def _residual_derivative(state: RigidParameters) -> tuple[Array, Array]:
     """Return B = -de/dx (6, 23, 38) and the residual e (6, 38), in coefficients of y."""
-    L, M = _residual_map(state), _map(state)
-    B = np.zeros((6, PARAMETERS, MOMENTS_SIZE))
-    B[:, LOAD] = coefficients() @ M
-    B[:, DELAY, RATES] = -(L @ M)[:, None, :SIGNALS]
+    L, M = _residual_coefficients(state), _motion_map_with_delay(state)
+    B = np.zeros((6, NUM_PARAMETERS, MOMENTS_SIZE))
+    B[:, LOAD_PARAMETERS] = regressor_coefficients() @ M
+    B[:, DELAY_PARAMETER, SIGNAL_RATE_COLUMNS] = -(L @ M)[:, None, :NUM_MOTION_SIGNALS]
     for i, unit in enumerate(np.eye(3)):
-        lever = _map(replace(state, r=state.r + unit)) - M
+        lever = _motion_map_with_delay(replace(state, r=state.r + unit)) - M
         ahead, behind = (
-            _map(replace(state, R=_rotate(state.R, x * unit)))
+            _motion_map_with_delay(replace(state, R=_rotate_by_vector(state.R, x * unit)))
             for x in (_ROTATION_STEP, -_ROTATION_STEP)
         )
         B[:, 17 + i] = -L @ lever
@@ -252,15 +265,17 @@ def _columns(state: State) -> tuple[Array, Array]:
     return B, L @ M
 
 
-def _normal(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
+def _normal_equations(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
     columns = B.reshape(-1, MOMENTS_SIZE)
-    BZ = (columns @ Z).reshape(len(Z), 6, PARAMETERS, MOMENTS_SIZE)
+    BZ = (columns @ Z).reshape(len(Z), 6, NUM_PARAMETERS, MOMENTS_SIZE)
     WB = np.einsum("bcd,bcjk->dbjk", W, BZ, optimize=True)
     gram = np.einsum("dbjk,dik->ji", WB, B, optimize=True)
     return 0.5 * (gram + gram.T), np.einsum("dbjk,dk->j", WB, Le, optimize=True)
 
 
-def _inverse(gram: Array, free: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+def _inverse_of_free_parameters(
+    gram: Array, free: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.bool_]]:
     diagonal = np.diag(gram)
     used = free & (diagonal > 0.0)
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
@@ -271,29 +286,30 @@ def _inverse(gram: Array, free: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bo
     return (basis / values[kept]) @ basis.T, free & (~used | null)
 
 
-def _residual_powers(Z: Array, state: State) -> Array:
-    Le = _residual_map(state) @ _map(state)
+def _residual_powers(Z: Array, state: RigidParameters) -> Array:
+    Le = _residual_coefficients(state) @ _motion_map_with_delay(state)
     return np.asarray(Le @ Z @ Le.T)
 
 
-def _residual_sums(record: _Record, state: State) -> Array:
+def _residual_sums(record: _FitData, state: RigidParameters) -> Array:
     return np.asarray(np.diagonal(_residual_powers(record.Z, state), axis1=1, axis2=2))
 
 
 def _residual_covariances(
-    record: _Record, state: State, sums: Array, used: Array | None = None
+    record: _FitData, state: RigidParameters, sums: Array, used: Array | None = None
 ) -> Array:
     levels, sizes = record.levels, record.levels.sizes[:, None]
     P = _residual_powers(record.Q, state) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
-        _MIN_REST_SHARE * levels.power(sums, used), least_power(record.Z, levels.sizes)
+        _MIN_REST_SHARE * levels.noise_power(sums, used),
+        rounding_error_power(record.Z, levels.sizes),
     )
-    rest = np.maximum(levels.power(sums - own, used), least)
+    rest = np.maximum(levels.noise_power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
 
 
-def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
+def _used_degrees_of_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     diagonal = np.diagonal(W, axis1=1, axis2=2)
     half = np.einsum("cjk,ji->cik", B, inverse)
     gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)
@@ -301,11 +317,13 @@ def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
 
 
 def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    BF = (B.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, FORCES].reshape(len(Z), 6, PARAMETERS, 6)
-    return gain_effects(BF, W, inverse)
+    BF = (B.reshape(-1, MOMENTS_SIZE) @ Z)[:, :, FORCE_COLUMNS].reshape(
+        len(Z), 6, NUM_PARAMETERS, 6
+    )
+    return parameter_errors_by_gains(BF, W, inverse)
 
 
-def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float:
+def _misfit_of_gains(record: _FitData, solution: _Solution, gain: float) -> float:
     if gain == 0.0:
         return 0.0
     B, levels = solution.B, record.levels
@@ -314,23 +332,23 @@ def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float
     length = np.repeat([1.0, TORQUE_ARM_M], 3)
     left = left.reshape(6, 6, 6, MOMENTS_SIZE)  # of channel c by gain d, k
     for c in range(6):
-        left[c, c, :, FORCES] += np.diag(length[c] / length)
+        left[c, c, :, FORCE_COLUMNS] += np.diag(length[c] / length)
     left = left.reshape(6, 36, MOMENTS_SIZE)
     sums = gain**2 * np.einsum("cik,bkm,cim->bc", left, record.Z, left, optimize=True)
-    more = levels.power(np.maximum(sums, 0.0)) / record.power
-    return 2.0 * float(levels.costs(1.0 + more).sum())
+    more = levels.noise_power(np.maximum(sums, 0.0)) / record.power
+    return 2.0 * float(levels.negative_log_likelihoods(1.0 + more).sum())
 
 
-def _apply_step(state: State, step: Array) -> State:
-    return State(
-        state.theta + step[LOAD],
+def _apply_step(state: RigidParameters, step: Array) -> RigidParameters:
+    return RigidParameters(
+        state.theta + step[LOAD_PARAMETERS],
         state.tau + float(step[16]),
-        state.r + step[LEVER],
-        Rotation.from_matrix(_rotate(state.R, step[TURN])).as_matrix(),
+        state.r + step[LEVER_PARAMETERS],
+        Rotation.from_matrix(_rotate_by_vector(state.R, step[ROTATION_PARAMETERS])).as_matrix(),
     )
 
 
-def _rotate(R: Array, rho: Array) -> Array:
+def _rotate_by_vector(R: Array, rho: Array) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())
 
 
@@ -338,7 +356,7 @@ _ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class ReadOff:
+class UnitsAndAxes:
     """Units, axes and masses that the fit of a linear model of the wrench implies.
 
     Attributes:
@@ -356,27 +374,29 @@ class ReadOff:
     masses: Array
 
     @property
-    def usable(self) -> bool:
+    def is_usable(self) -> bool:
         """Whether M_g is known to 5 % of the mass."""
         return bool(self.deviation < 0.05 * self.masses.mean())
 
     @property
-    def mirrored(self) -> bool:
+    def is_mirrored(self) -> bool:
         """Whether the axes of wrench and poses are mirror images."""
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 
-def read_off(fit: LinearFit) -> ReadOff:
+def read_units_and_axes(fit: LinearFit) -> UnitsAndAxes:
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
-    kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
+    kappa, deviation = _position_unit_ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
     determined = bool((variances[:3, 4:7] > 0.0).all())
     U, masses, Vt = np.linalg.svd(M_g)
     largest = float(np.sqrt(variances[:3, 4:7].max())) if determined else np.inf
-    return ReadOff(kappa, deviation, largest, U @ Vt, masses)
+    return UnitsAndAxes(kappa, deviation, largest, U @ Vt, masses)
 
 
-def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[float, float]:
+def _position_unit_ratio(
+    a: Array, g: Array, variances_a: Array, variances_g: Array
+) -> tuple[float, float]:
     known = (variances_a > 0.0) & (variances_g > 0.0)
     if not known.any():
         return np.nan, np.inf

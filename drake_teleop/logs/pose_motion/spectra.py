@@ -11,29 +11,33 @@ from scipy.fft import next_fast_len
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed_noise_share
+from drake_teleop.logs.pose_motion.splines import (
+    NUM_MOTION_SIGNALS,
+    PoseSplines,
+    passed_noise_share,
+)
 
 Complex = NDArray[np.complex128]
 
 MAX_FREQUENCY_HZ = 25.0
 """Highest frequency that is used [Hz]."""
-RAMP_S = 1.0
+TAPER_RAMP_S = 1.0
 """Length of the taper's ramps at the ends of the record [s]."""
-EDGE_S = 0.2
+EXCLUSION_EDGE_S = 0.2
 """Length of the taper's ramps beside excluded samples [s]."""
 _GRID_RATE_HZ = 100.0
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
 _MIN_GROUP_SIZE = 8.0
 # Largest ratio of the ends of a band below this frequency [Hz].
 _NARROW_BELOW_HZ, _MAX_BAND_RATIO = 3.0, 4.0 / 3.0
-FORCES = slice(SIGNALS, SIGNALS + 6)
+FORCE_COLUMNS = slice(NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS + 6)
 """Columns of the wrench and of the signals' derivatives in the moments."""
-RATES = slice(SIGNALS + 6, 2 * SIGNALS + 6)
-MOMENTS_SIZE = 2 * SIGNALS + 6
+SIGNAL_RATE_COLUMNS = slice(NUM_MOTION_SIGNALS + 6, 2 * NUM_MOTION_SIGNALS + 6)
+MOMENTS_SIZE = 2 * NUM_MOTION_SIGNALS + 6
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class WrenchGrid:
     """Instants t (M,) of the motion signals [s], at about 100 Hz, and samples of the wrench.
 
     Attributes:
@@ -47,7 +51,7 @@ class Grid:
     load: Array | None = None
 
     @classmethod
-    def of(cls, t: Array, wrench: Array, load: Array | None = None) -> Grid:
+    def from_samples(cls, t: Array, wrench: Array, load: Array | None = None) -> WrenchGrid:
         dt = (t[-1] - t[0]) / (len(t) - 1)
         stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
@@ -58,17 +62,17 @@ class Grid:
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
-    def length(self) -> int:
+    def transform_length(self) -> int:
         """Number of samples of the Fourier transforms."""
         return int(next_fast_len(len(self.t), real=True))
 
     @cached_property
     def frequency(self) -> Array:
-        return np.asarray(np.fft.rfftfreq(self.length, self.dt), np.float64)
+        return np.asarray(np.fft.rfftfreq(self.transform_length, self.dt), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
-class Bands:
+class FrequencyBands:
     """Frequency bands, which form groups with a common noise level.
 
     Attributes:
@@ -91,16 +95,16 @@ class Bands:
         """Half the independent numbers (count,) of each band."""
         return np.asarray(np.bincount(self.band, self.weight), np.float64)
 
-    def sums(self, values: Array) -> Array:
+    def sums_over_bands(self, values: Array) -> Array:
         flat = values.reshape(len(values), -1) * self.weight[:, None]
         starts = np.searchsorted(self.band, np.arange(self.count))
         return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])
 
 
-def bands(grid: Grid, taper: Array, top: float) -> Bands:
+def frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
     """Return frequency bands up to `top` [Hz]; small groups are joined to the next."""
     frequency = grid.frequency[grid.frequency <= top]
-    worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.length)
+    worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.transform_length)
     weight = np.full(len(frequency), worth)
     weight[0] *= 0.5
     group = np.searchsorted(np.array(_GROUP_EDGES_HZ[1:]), frequency, side="right")
@@ -115,19 +119,21 @@ def bands(grid: Grid, taper: Array, top: float) -> Bands:
     )
     first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
     group = np.unique(group[first], return_inverse=True)[1]
-    return Bands(frequency, np.cumsum(first) - 1, weight, group)
+    return FrequencyBands(frequency, np.cumsum(first) - 1, weight, group)
 
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
     """Return a taper (M,): 1 from `start` to `stop` [s], 0 outside, with cosine ramps."""
-    ramp = min(RAMP_S, 0.1 * (stop - start))
+    ramp = min(TAPER_RAMP_S, 0.1 * (stop - start))
     x = np.clip(np.minimum(t - start, stop - t) / ramp, 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * x)
 
 
-def exclude(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
+def exclude_from_taper(
+    taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0
+) -> Array:
     """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
-    edge = np.clip((distance_to_flag(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
+    edge = np.clip((distance_to_flag(lost) * dt - margin) / EXCLUSION_EDGE_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
@@ -139,9 +145,9 @@ def distance_to_flag(flags: NDArray[np.bool_]) -> Array:
     return np.minimum(at - before, after - at)
 
 
-def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:
+def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> Complex:
     """Return the spectrum (count, 6) of the tapered wrench, scaled as those of the signals."""
-    fine = np.zeros(grid.length * grid.stride)
+    fine = np.zeros(grid.transform_length * grid.stride)
     n = len(grid.wrench)
     full = np.interp(np.arange(n) / grid.stride, np.arange(len(taper)), taper)
     out = np.empty((count, 6), np.complex128)
@@ -151,11 +157,11 @@ def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:
     return out
 
 
-def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Complex:
+def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> Complex:
     """Return the spectrum (count, 16) of tapered motion signals zeta (M, 16), Eq. (T73)."""
     out = np.empty((count, zeta.shape[1]), np.complex128)
     for c, column in enumerate(zeta.T):
-        out[:, c] = np.fft.rfft(column * taper, grid.length)[:count]
+        out[:, c] = np.fft.rfft(column * taper, grid.transform_length)[:count]
     return out
 
 
@@ -166,19 +172,25 @@ def shift_spectrum(spectrum: Complex, frequency: Array, shift: float) -> Complex
     return out
 
 
-def shift_taper(grid: Grid, taper: Array, shift: float) -> Array:
-    return _filter(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
+def shift_taper(grid: WrenchGrid, taper: Array, shift: float) -> Array:
+    return _filter_by_response(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
 
 
-def taper_derivative(grid: Grid, taper: Array) -> Array:
-    return _filter(grid, taper, 2j * np.pi * grid.frequency)
+def taper_derivative(grid: WrenchGrid, taper: Array) -> Array:
+    return _filter_by_response(grid, taper, 2j * np.pi * grid.frequency)
 
 
-def _filter(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Array:
-    return np.asarray(np.fft.irfft(np.fft.rfft(x, grid.length) * response, grid.length)[: len(x)])
+def _filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complexfloating]) -> Array:
+    return np.asarray(
+        np.fft.irfft(np.fft.rfft(x, grid.transform_length) * response, grid.transform_length)[
+            : len(x)
+        ]
+    )
 
 
-def moments(zeta: Complex, wrench: Complex, of: Bands, rates: Complex | None = None) -> Array:
+def second_moments(
+    zeta: Complex, wrench: Complex, of: FrequencyBands, rates: Complex | None = None
+) -> Array:
     """Return second moments (bands, 38, 38) of y = [zeta (16), F (6), d zeta/dt (16)].
 
     They are sums of Re y* y^T; (bands, 22, 22) without `rates`, the spectra of d zeta/dt.
@@ -199,7 +211,7 @@ _MIN_REMAINING_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Levels:
+class NoiseLevels:
     """Noise of the wrench, with one level for each group of bands and channel.
 
     Attributes:
@@ -212,53 +224,53 @@ class Levels:
     shape: Array
 
     @classmethod
-    def flat(cls, of: Bands) -> Levels:
+    def white_within_groups(cls, of: FrequencyBands) -> NoiseLevels:
         """Return levels of noise that is white within each group of bands."""
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
-    def power(self, sums: Array, used: Array | None = None) -> Array:
+    def noise_power(self, sums: Array, used: Array | None = None) -> Array:
         """Return the noise power (..., bands, 6) of residuals with power `sums` (..., bands, 6).
 
         `used` (bands, 6) are the degrees of freedom of fitted parameters.
         """
-        remaining = self.grouped(self.sizes)[:, None]
+        remaining = self.sums_over_groups(self.sizes)[:, None]
         if used is not None:
             remaining = np.maximum(
-                remaining - 0.5 * self.grouped(used), _MIN_REMAINING_SHARE * remaining
+                remaining - 0.5 * self.sums_over_groups(used), _MIN_REMAINING_SHARE * remaining
             )
-        level = np.add.reduceat(sums / self.shape, self._starts, axis=-2) / remaining
+        level = np.add.reduceat(sums / self.shape, self._first_bands_of_groups, axis=-2) / remaining
         return np.asarray(level[..., self.group, :] * self.shape)
 
-    def grouped(self, x: Array) -> Array:
+    def sums_over_groups(self, x: Array) -> Array:
         """Return the sums (groups, ...) of x (bands, ...) over the bands of each group."""
-        return np.asarray(np.add.reduceat(x, self._starts, axis=0))
+        return np.asarray(np.add.reduceat(x, self._first_bands_of_groups, axis=0))
 
     @cached_property
-    def _starts(self) -> NDArray[np.intp]:
+    def _first_bands_of_groups(self) -> NDArray[np.intp]:
         return np.flatnonzero(np.diff(self.group, prepend=-1))
 
-    def costs(self, power: Array) -> Array:
+    def negative_log_likelihoods(self, power: Array) -> Array:
         """Return negative log likelihoods (..., 6) of noise powers (..., bands, 6), Eq. (T75)."""
         return np.asarray(self.sizes @ np.log(power))
 
 
-def random_walk_shape(of: Bands, corner: float) -> Array:
+def random_walk_shape(of: FrequencyBands, corner: float) -> Array:
     """Return the mean (bands,) of 1 + (corner / f)^2 in each band, Eq. (T74)."""
     f = np.maximum(of.frequency, of.frequency[1])
-    return np.asarray(1.0 + of.sums((corner / f) ** 2) / of.sizes)
+    return np.asarray(1.0 + of.sums_over_bands((corner / f) ** 2) / of.sizes)
 
 
-PRODUCTS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
+OMEGA_PRODUCT_COLUMNS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
 """(3, 3) indices of the products of angular velocity among the signals."""
-_A, _G, _ALPHA = slice(1, 4), slice(4, 7), slice(7, 10)
+_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS, _ALPHA_COLUMNS = slice(1, 4), slice(4, 7), slice(7, 10)
 
 
 def noise_moments(
     splines: PoseSplines,
-    grid: Grid,
+    grid: WrenchGrid,
     taper: Array,
     zeta: Array,
-    of: Bands,
+    of: FrequencyBands,
     noise: tuple[float, float],
 ) -> Array:
     """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `Spectra.moments`.
@@ -270,12 +282,12 @@ def noise_moments(
     share = per_number * passed_noise_share(of.frequency, splines.spacing)
     position_power, rotation_power = (std**2 * share for std in noise)
     if splines.imu_rows is not None:
-        left = splines.imu_rows.share(of.frequency)
+        left = splines.imu_rows.remaining_noise_shares(of.frequency)
         position_power, rotation_power = position_power * left[0], rotation_power * left[1]
     weight = taper**2 / np.sum(taper**2)
     still, first, second, third = _rotation_covariances(zeta, weight)
-    eye = np.zeros((SIGNALS, SIGNALS))
-    eye[_A, _A] = np.eye(3)
+    eye = np.zeros((NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
+    eye[_ACCELERATION_COLUMNS, _ACCELERATION_COLUMNS] = np.eye(3)
     parts = [
         (position_power * w2**2, eye),
         (rotation_power, still),
@@ -284,30 +296,34 @@ def noise_moments(
     parts.append((rotation_power * w2**2, third))
     Q = np.zeros((of.count, MOMENTS_SIZE, MOMENTS_SIZE))
     for power, shape in parts:
-        Q[:, :SIGNALS, :SIGNALS] += of.sums(power)[:, None, None] * shape
-        Q[:, RATES, RATES] += of.sums(power * w2)[:, None, None] * shape
+        Q[:, :NUM_MOTION_SIGNALS, :NUM_MOTION_SIGNALS] += (
+            of.sums_over_bands(power)[:, None, None] * shape
+        )
+        Q[:, SIGNAL_RATE_COLUMNS, SIGNAL_RATE_COLUMNS] += (
+            of.sums_over_bands(power * w2)[:, None, None] * shape
+        )
     return Q
 
 
 def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
-    still, cross, products, alpha = np.zeros((4, SIGNALS, SIGNALS))
+    still, cross, products, alpha = np.zeros((4, NUM_MOTION_SIGNALS, NUM_MOTION_SIGNALS))
     mean = weight @ zeta
-    for left in (_A, _G):
-        for right in (_A, _G):
+    for left in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
+        for right in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
             # Mean of (x x d)(y x d)^T for a rotation d of unit covariance.
             both = (weight[:, None] * zeta[:, left]).T @ zeta[:, right]
             still[left, right] = np.trace(both) * np.eye(3) - both.T
-    for where in (_A, _G):
-        cross[where, _ALPHA] = -cross_matrix(mean[where])
-        cross[_ALPHA, where] = cross[where, _ALPHA].T
+    for where in (_ACCELERATION_COLUMNS, _GRAVITY_COLUMNS):
+        cross[where, _ALPHA_COLUMNS] = -cross_matrix(mean[where])
+        cross[_ALPHA_COLUMNS, where] = cross[where, _ALPHA_COLUMNS].T
     jacobian = np.zeros(
-        (3, 3, SIGNALS)
+        (3, 3, NUM_MOTION_SIGNALS)
     )  # derivative of the signals by omega_j, coefficient of omega_i
     for i in range(3):
         for j in range(3):
-            jacobian[j, i, PRODUCTS[i, j]] += 1.0 + (i == j)
-    ww = mean[PRODUCTS]
+            jacobian[j, i, OMEGA_PRODUCT_COLUMNS[i, j]] += 1.0 + (i == j)
+    ww = mean[OMEGA_PRODUCT_COLUMNS]
     for k in range(3):
         products += jacobian[k].T @ ww @ jacobian[k]
-    alpha[_ALPHA, _ALPHA] = np.eye(3)
+    alpha[_ALPHA_COLUMNS, _ALPHA_COLUMNS] = np.eye(3)
     return still, cross, products, alpha

@@ -13,20 +13,20 @@ from scipy.sparse import diags_array, eye_array
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.poses import Poses
 
-DEGREE = 5
+SPLINE_DEGREE = 5
 MIN_POSES_PER_KNOT = 2.0
 """Least average number of poses between two knots."""
-SIGNALS = 16
+NUM_MOTION_SIGNALS = 16
 """Number of columns of `PoseSplines.signals`."""
 GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
 """Columns of gravity, and columns that are zero at rest."""
 # Frequency times h where the residual is noise: just above the passed frequencies.
-_NOISE_BAND = (0.7, 1.5)
+_NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _CHUNK_ROWS = 2**17
 
 
 @dataclass(frozen=True, eq=False)
-class ImuRows:
+class ImuSplineRows:
     """IMU data at times t (K,) [s], corrected to axes, clock and zero bias of poses.
 
     Attributes:
@@ -43,22 +43,22 @@ class ImuRows:
     acceleration_W: Array | None = None
     quaternion_rate: Array | None = None
 
-    def oriented(
+    def from_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
-    ) -> ImuRows:
+    ) -> ImuSplineRows:
         """Return the rows of specific force s and omega (K, 3) in S, oriented by `splines`."""
         q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
         if s is not None:
-            acceleration = _in_P(q * (1.0, -1.0, -1.0, -1.0), n, s) + gravity_W
+            acceleration = _rotate_to_P(q * (1.0, -1.0, -1.0, -1.0), n, s) + gravity_W
         if omega is not None:
             w, v = q[:, :1], q[:, 1:]
             real = -np.sum(v * omega, axis=1, keepdims=True)
             rates = 0.5 * np.hstack([real, w * omega + _cross(v, omega)])
         return replace(self, acceleration_W=acceleration, quaternion_rate=rates)
 
-    def share(self, frequency: Array) -> tuple[Array, Array]:
+    def remaining_noise_shares(self, frequency: Array) -> tuple[Array, Array]:
         """Return the shares (K,) of position and rotation noise that remain, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
@@ -86,7 +86,7 @@ class PoseSplines:
         self,
         poses: Poses,
         spacing: float,
-        imu_rows: ImuRows | None = None,
+        imu_rows: ImuSplineRows | None = None,
         *,
         limit_ends: bool = False,
     ) -> None:
@@ -105,9 +105,11 @@ class PoseSplines:
         poses, imu_rows = self.poses, self.imu_rows
         values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._blocks)
         times = (t[x] for x in self._blocks)
-        gram, right = _normal(zip(times, values, strict=True), knots, DEGREE, 7)
+        gram, right = _spline_normal_equations(
+            zip(times, values, strict=True), knots, SPLINE_DEGREE, 7
+        )
         if imu_rows is None:
-            spline = BSpline(knots, solveh_banded(gram, right), DEGREE)
+            spline = BSpline(knots, solveh_banded(gram, right), SPLINE_DEGREE)
             return self._with_limited_ends(spline, gram, right) if self._limit_ends else spline
         columns = []
         shifted_t = imu_rows.t - self._start
@@ -123,14 +125,18 @@ class PoseSplines:
             band, side = gram, right[:, part]
             if rows is not None:
                 weight = pose * self.rate / (own * imu_rows.rate)
-                more, other = _normal_of_rates(shifted_t[inside], rows[inside], knots, order)
+                more, other = _normal_equations_of_rates(
+                    shifted_t[inside], rows[inside], knots, order
+                )
                 band, side = gram + weight * more, side + weight * other
             columns.append(solveh_banded(band, side))
-        return BSpline(knots, np.hstack(columns), DEGREE)
+        return BSpline(knots, np.hstack(columns), SPLINE_DEGREE)
 
     def _with_limited_ends(self, spline: BSpline, gram: Array, right: Array) -> BSpline:
-        t, count = self.poses.t - self._start, DEGREE + 1
-        inside = t[(t > t[0] + DEGREE * self.spacing) & (t < t[-1] - DEGREE * self.spacing)]
+        t, count = self.poses.t - self._start, SPLINE_DEGREE + 1
+        inside = t[
+            (t > t[0] + SPLINE_DEGREE * self.spacing) & (t < t[-1] - SPLINE_DEGREE * self.spacing)
+        ]
         if not len(inside):
             return spline
         values = np.hstack([self.poses.position, self.poses.quaternion])
@@ -139,25 +145,25 @@ class PoseSplines:
         for part in (slice(0, 3), slice(3, 7)):
             band = gram.copy()
             for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
-                basis = BSpline(spline.t, np.eye(gram.shape[1])[:, columns], DEGREE)
+                basis = BSpline(spline.t, np.eye(gram.shape[1])[:, columns], SPLINE_DEGREE)
                 for order in range(2, count):
                     power = np.square(spline(inside, order)[:, part]).mean() + 1e-300
                     x = basis(at, order)
                     outer = noise[part].mean() / power * np.multiply.outer(x, x)
                     for k in range(count):
-                        band[DEGREE - k, columns][k:] += np.diag(outer, k)
+                        band[SPLINE_DEGREE - k, columns][k:] += np.diag(outer, k)
             coefficients[:, part] = solveh_banded(band, right[:, part])
-        return BSpline(spline.t, coefficients, DEGREE)
+        return BSpline(spline.t, coefficients, SPLINE_DEGREE)
 
     def quaternion(self, t: Array) -> Array:
         """Return quaternions (N, 4) [w, x, y, z] of R_WP at times t, nearly of unit length."""
-        return np.asarray(self._at(t, 0)[:, 3:])
+        return np.asarray(self._spline_derivative(t, 0)[:, 3:])
 
     def position(self, t: Array) -> Array:
         """Return positions (N, 3) of Po in the world at times t [m]."""
-        return np.asarray(self._at(t, 0)[:, :3])
+        return np.asarray(self._spline_derivative(t, 0)[:, :3])
 
-    def _at(self, t: Array, order: int) -> Array:
+    def _spline_derivative(self, t: Array, order: int) -> Array:
         at = np.clip(t, self.poses.t[0], self.poses.t[-1]) - self._start
         return np.asarray(self._spline(at, order))
 
@@ -166,8 +172,8 @@ class PoseSplines:
 
         They are [1, acceleration, -gravity, alpha, products of omega].
         """
-        a, minus_g, omega, alpha = self._motion(t, gravity_W)
-        zeta = np.empty((len(t), SIGNALS))
+        a, minus_g, omega, alpha = self._motion_in_blocks(t, gravity_W)
+        zeta = np.empty((len(t), NUM_MOTION_SIGNALS))
         zeta[:, 0] = 1.0
         zeta[:, 1:4], zeta[:, 4:7], zeta[:, 7:10] = a, minus_g, alpha
         zeta[:, 10:13] = omega * omega
@@ -177,7 +183,7 @@ class PoseSplines:
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
         """Return specific force of Po, omega and alpha of P (N, 3) at times t, in P [SI]."""
-        a, minus_g, omega, alpha = self._motion(t, gravity_W)
+        a, minus_g, omega, alpha = self._motion_in_blocks(t, gravity_W)
         return a + minus_g, omega, alpha
 
     def gravity(self, t: Array, gravity_W: Array) -> Array:
@@ -186,28 +192,28 @@ class PoseSplines:
         for part in _row_blocks(len(t)):
             q = self.quaternion(t[part])
             gravity_rows = np.broadcast_to(gravity_W, out[part].shape)
-            out[part] = _in_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
+            out[part] = _rotate_to_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
         return out
 
-    def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
+    def _motion_in_blocks(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
         out = np.empty((4, len(t), 3))
         for part in _row_blocks(len(t)):
             out[:, part] = self._motion_at(t[part], gravity_W)
         return out[0], out[1], out[2], out[3]
 
     def _motion_at(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
-        x, first, second = (self._at(t, order) for order in range(3))
+        x, first, second = (self._spline_derivative(t, order) for order in range(3))
         q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
         n = np.sum(q * q, axis=1, keepdims=True)
-        omega = 2.0 * _relative_vector(q, qd) / n
+        omega = 2.0 * _vector_part_of_relative_quaternion(q, qd) / n
         alpha = (
-            2.0 * _relative_vector(q, qdd) / n
+            2.0 * _vector_part_of_relative_quaternion(q, qdd) / n
             - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
         )
         gravity_rows = np.broadcast_to(-gravity_W, (len(t), 3))
-        return _in_P(q, n, second[:, :3]), _in_P(q, n, gravity_rows), omega, alpha
+        return _rotate_to_P(q, n, second[:, :3]), _rotate_to_P(q, n, gravity_rows), omega, alpha
 
-    def noise(self) -> tuple[float, float]:
+    def estimate_pose_noise(self) -> tuple[float, float]:
         """Return the standard deviations per axis of noise of position [m] and rotation [rad]."""
         if self.imu_rows is not None:
             position_power, rotation_power = self.imu_rows.pose_powers
@@ -218,7 +224,9 @@ class PoseSplines:
         for part in self._blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
             position = self.poses.position[part] - fitted[:, :3]
-            turn = 2.0 * _relative_vector(fitted[:, 3:], self.poses.quaternion[part])
+            turn = 2.0 * _vector_part_of_relative_quaternion(
+                fitted[:, 3:], self.poses.quaternion[part]
+            )
             powers = self._noise_powers(position), self._noise_powers(turn)
             sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
         position_std, rotation_std = np.sqrt(sums / count)
@@ -227,7 +235,7 @@ class PoseSplines:
     def _noise_powers(self, residual: Array) -> Array:
         n = len(residual)
         frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
-        low, high = (share / self.spacing for share in _NOISE_BAND)
+        low, high = (share / self.spacing for share in _NOISE_BAND_OVER_KNOT_RATE)
         inside = (frequency >= min(low, 0.35 * self.rate)) & (frequency <= high)
         return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
@@ -235,7 +243,7 @@ class PoseSplines:
 class SplineCache:
     """Splines of the same poses by knot distance, each fitted once."""
 
-    def __init__(self, poses: Poses, imu_rows: ImuRows | None = None) -> None:
+    def __init__(self, poses: Poses, imu_rows: ImuSplineRows | None = None) -> None:
         self.poses, self.imu_rows = poses, imu_rows
         self._fit: dict[float, PoseSplines] = {}
 
@@ -244,7 +252,7 @@ class SplineCache:
         """Rate of the fitted poses and IMU data together [Hz]."""
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
-    def at(self, spacing: float) -> PoseSplines:
+    def splines_with_spacing(self, spacing: float) -> PoseSplines:
         if spacing not in self._fit:
             self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
         return self._fit[spacing]
@@ -253,35 +261,37 @@ class SplineCache:
 def passed_noise_share(frequency: Array, spacing: float) -> Array:
     """Return the share (K,) of white noise's power that splines pass at a frequency, Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
-    share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))
+    share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (SPLINE_DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)
 
 
 def _knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
     if with_imu:
-        return np.concatenate([np.repeat(t[0], DEGREE + 1), inner, np.repeat(t[-1], DEGREE + 1)])
+        return np.concatenate(
+            [np.repeat(t[0], SPLINE_DEGREE + 1), inner, np.repeat(t[-1], SPLINE_DEGREE + 1)]
+        )
     before = np.searchsorted(t, inner)
     first = np.unique(before, return_index=True)[1]
     inner = inner[first[(before[first] > 0) & (before[first] < len(t))]]
-    ends = np.repeat(t[[0, -1]], DEGREE + 1)
-    return np.concatenate([ends[: DEGREE + 1], inner, ends[DEGREE + 1 :]])
+    ends = np.repeat(t[[0, -1]], SPLINE_DEGREE + 1)
+    return np.concatenate([ends[: SPLINE_DEGREE + 1], inner, ends[SPLINE_DEGREE + 1 :]])
 
 
 def _thin_knots(knots: Array, t: Array) -> Array:
-    inner, kept, last = knots[DEGREE + 1 : -DEGREE - 1], [], 0
+    inner, kept, last = knots[SPLINE_DEGREE + 1 : -SPLINE_DEGREE - 1], [], 0
     for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
         if min(before - last, len(t) - before) >= MIN_POSES_PER_KNOT:
             kept.append(knot)
             last = before
-    return np.concatenate([knots[: DEGREE + 1], kept, knots[-DEGREE - 1 :]])
+    return np.concatenate([knots[: SPLINE_DEGREE + 1], kept, knots[-SPLINE_DEGREE - 1 :]])
 
 
 def _row_blocks(count: int) -> list[slice]:
     return [slice(k, k + _CHUNK_ROWS) for k in range(0, count, _CHUNK_ROWS)]
 
 
-def _normal(
+def _spline_normal_equations(
     parts: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
 ) -> tuple[Array, Array]:
     """Return the normal equations of a spline: band (degree + 1, n) and right side (n, width)."""
@@ -301,34 +311,34 @@ def _normal(
     return band, right
 
 
-def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
-    change = eye_array(len(knots) - DEGREE - 1, format="csr")
+def _normal_equations_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
+    change = eye_array(len(knots) - SPLINE_DEGREE - 1, format="csr")
     for k in range(order):  # maps coefficients of a spline to those of its derivative
-        inner, degree = knots[k : len(knots) - k], DEGREE - k
+        inner, degree = knots[k : len(knots) - k], SPLINE_DEGREE - k
         span = inner[degree + 1 : -1] - inner[1 : -degree - 1]
         n = len(span)
         step = diags_array([-degree / span, degree / span], offsets=[0, 1], shape=(n, n + 1))
         change = step @ change
-    degree, parts = DEGREE - order, _row_blocks(len(t))
+    degree, parts = SPLINE_DEGREE - order, _row_blocks(len(t))
     inner = knots[order : len(knots) - order]
-    band, right = _normal(((t[p], x[p]) for p in parts), inner, degree, x.shape[1])
+    band, right = _spline_normal_equations(((t[p], x[p]) for p in parts), inner, degree, x.shape[1])
     upper = diags_array(
         [band[degree - k, k:] for k in range(degree + 1)], offsets=list(range(degree + 1))
     ).tocsr()
     gram = (change.T @ (upper + upper.T - diags_array(band[degree])) @ change).tocsr()
-    out = np.zeros((DEGREE + 1, gram.shape[0]))
-    for k in range(DEGREE + 1):
-        out[DEGREE - k, k:] = gram.diagonal(k)
+    out = np.zeros((SPLINE_DEGREE + 1, gram.shape[0]))
+    for k in range(SPLINE_DEGREE + 1):
+        out[SPLINE_DEGREE - k, k:] = gram.diagonal(k)
     return out, change.T @ right
 
 
-def _relative_vector(q: Array, p: Array) -> Array:
+def _vector_part_of_relative_quaternion(q: Array, p: Array) -> Array:
     v, w = q[:, 1:], p[:, 1:]
     out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)
     return out
 
 
-def _in_P(q: Array, n: Array, x: Array) -> Array:
+def _rotate_to_P(q: Array, n: Array, x: Array) -> Array:
     v = -q[:, 1:]
     once = _cross(v, x)
     out: Array = x + 2.0 * (q[:, :1] * once + _cross(v, once)) / n

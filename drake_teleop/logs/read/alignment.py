@@ -20,11 +20,11 @@ _MIN_SAMPLES = 8
 _CHUNK_ROWS = 2**18
 _MIN_WINDOW_SAMPLES = 9
 _POLYNOMIAL_DEGREE = 5
-SMOOTHER_WINDOW = 1.8
+SMOOTHER_WINDOW_OVER_PERIOD = 1.8
 """Window length [s] of the smoother times its bandwidth [Hz]."""
 
 
-def spacing(t: Array) -> float:
+def mean_time_step(t: Array) -> float:
     """Return the mean step of times `t` (N,) [s]."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
@@ -32,7 +32,7 @@ def spacing(t: Array) -> float:
 def uniform_times(t: Array) -> Array:
     """Return equidistant times over the span of `t` (N,), at its median rate."""
     even = np.linspace(t[0], t[-1], len(t))
-    if np.abs(t - even).max() < 1e-3 * spacing(t):
+    if np.abs(t - even).max() < 1e-3 * mean_time_step(t):
         return t
     dt = float(np.median(np.diff(t)))
     return t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + 1e-6) + 1)
@@ -90,7 +90,7 @@ def smooth_derivatives(
     Filter of Savitzky and Golay (1964), window 1.8 / `bandwidth_hz` [s], at least 9 samples.
     """
     n = len(x)
-    weights = smoother(n, dt, bandwidth_hz)
+    weights = smoother_weights(n, dt, bandwidth_hz)
     half = weights.shape[1] // 2
     flat = x.reshape(n, -1)
     inner = [
@@ -107,15 +107,15 @@ def smooth_derivatives(
     return derivatives[0], derivatives[1], derivatives[2]
 
 
-def noise_gain(dt: float, bandwidth_hz: float | None) -> Array:
+def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
     """Return factors (3,) of `smooth_derivatives` on white noise: [1], [1/s], [1/s^2]."""
-    weights = smoother(10**9, dt, bandwidth_hz)
+    weights = smoother_weights(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
-def smoother(n: int, dt: float, bandwidth_hz: float | None) -> Array:
+def smoother_weights(n: int, dt: float, bandwidth_hz: float | None) -> Array:
     """Return weights (6, w) that map w <= n samples to the coefficients of their polynomial."""
-    window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
+    window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW_OVER_PERIOD / bandwidth_hz
     half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _POLYNOMIAL_DEGREE + 1, increasing=True)
     # The interval -1 ... 1 makes the fit well-conditioned; then scale to seconds.
@@ -135,10 +135,10 @@ def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[
     """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS."""
     _, first, second = smooth_derivatives(R_WS, dt, bandwidth_hz)
     R_SW = np.swapaxes(R_WS, 1, 2)
-    return skew_parts(R_SW @ first), skew_parts(R_SW @ second)
+    return vectors_of_skew_parts(R_SW @ first), vectors_of_skew_parts(R_SW @ second)
 
 
-def skew_parts(A: Array) -> Array:
+def vectors_of_skew_parts(A: Array) -> Array:
     """Return the vectors (N, 3) whose cross matrices are the skew parts of A (N, 3, 3)."""
     return 0.5 * np.stack(
         [A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], axis=1
@@ -153,7 +153,7 @@ def white_noise(x: Array) -> Array:
     return 1.4826 * np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / np.sqrt(20)
 
 
-def low_passed(log: Log, cutoff_hz: float | None) -> Log:
+def low_pass_log(log: Log, cutoff_hz: float | None) -> Log:
     """Return the log with zero-phase filtered wrench and motion; unchanged for static poses."""
     if log.static:
         return log
@@ -166,7 +166,7 @@ def low_passed(log: Log, cutoff_hz: float | None) -> Log:
     )
 
 
-def undelayed(log: Log, delay_s: float) -> Log:
+def remove_delay(log: Log, delay_s: float) -> Log:
     """Return the log with its motion advanced by the delay, without samples that lack motion."""
     if log.static or delay_s == 0:
         return log
@@ -188,7 +188,7 @@ def undelayed(log: Log, delay_s: float) -> Log:
         moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
         bridged = log.bridged[known] | moved
     return replace(
-        log.only(known),
+        log.select_rows(known),
         specific_force=s,
         angular_velocity=omega,
         angular_acceleration=alpha,
@@ -202,10 +202,12 @@ def far_from_gaps(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
-    return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
+    return ~widen_flags(
+        log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt))
+    )
 
 
-def near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
+def is_near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
     """Return (N,) True within `length_s` [s], or a period of the low-pass, of either end."""
     out = np.zeros(len(log), bool)
     if log.static:
@@ -217,14 +219,14 @@ def near_ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.
     return out
 
 
-def widened(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+def widen_flags(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     """Return flags (N,) that are also True within `by` samples of a set flag."""
     count = np.concatenate([[0], np.cumsum(flags)])
     at = np.arange(len(flags))
     return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]
 
 
-SEARCH_RANGE = 0.25
+DELAY_SEARCH_RANGE_S = 0.25
 _MAX_SAMPLES = 5000
 _MIN_DELAY_SAMPLES = 32
 
@@ -236,17 +238,17 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     phi (10,) if not given, are fitted.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
-    smooth = low_passed(log, cutoff)
-    reach = min(SEARCH_RANGE, 0.1 * float(log.t[-1] - log.t[0]))
+    smooth = low_pass_log(log, cutoff)
+    reach = min(DELAY_SEARCH_RANGE_S, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
     gap = ~far_from_gaps(log, cutoff)
-    gap = widened(gap, math.ceil(reach / log.dt)) if gap.any() else gap
+    gap = widen_flags(gap, math.ceil(reach / log.dt)) if gap.any() else gap
     inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_DELAY_SAMPLES:
         return None
     stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES)
-    cost = _shift_cost(smooth, inside[::stride], phi)
+    cost = _cost_of_shift(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([cost(shift) for shift in shifts])
     best = int(np.argmin(costs))
@@ -256,7 +258,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     return _refine_shift(cost, float(shifts[best]), step)
 
 
-def delay_of(
+def choose_delay(
     log: Log, cutoff_hz: float | None, delay: str | float, phi: Array | None = None
 ) -> tuple[float, str]:
     """Return the delay of the motion behind the wrench [s], and its source; `delay` may be "auto".
@@ -283,7 +285,7 @@ def _refine_shift(cost: Callable[[float], float], best: float, step: float) -> f
     return best
 
 
-def _shift_cost(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:
+def _cost_of_shift(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:
     t, wrench = log.t[rows], log.wrench[rows]
     # Common scales of forces and torques prevent large weights of channels without a signal; the
     # floor excludes rounding of a constant wrench.
@@ -292,7 +294,7 @@ def _shift_cost(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable
     scale, floor = np.sqrt(variance), 1e-9 * variance
     motion = np.hstack(log.motion)  # one interpolation for all signals
 
-    def residual(shift: float) -> Array:
+    def residual_at_shift(shift: float) -> Array:
         s, omega, alpha = np.split(resample(t + shift, log.t, motion), 3, axis=1)
         if phi is not None:
             return contact_wrench(wrench, np.zeros(6), s, omega, alpha, phi)
@@ -304,4 +306,4 @@ def _shift_cost(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable
         theta = np.linalg.lstsq(V.T @ V, V.T @ w, rcond=1e-12)[0]
         return (w - V @ theta).reshape(-1, 6) * scale
 
-    return lambda shift: float(np.log(residual(shift).var(axis=0) + floor).sum())
+    return lambda shift: float(np.log(residual_at_shift(shift).var(axis=0) + floor).sum())

@@ -19,7 +19,10 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, remedy_to_install_extra
 
-_MAX_VALUES, _MAX_ROW = 2**28, 64  # numbers of an array, and of one row: wider ones are images
+_MAX_VALUES, _MAX_NUMBERS_PER_ROW = (
+    2**28,
+    64,
+)  # numbers of an array, and of one row: wider ones are images
 
 
 def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[str, NDArray]:
@@ -31,14 +34,14 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
     h5py, found = import_optional("h5py", path), dict[str, NDArray]()
     with h5py.File(path, "r") as file:
 
-        def visit(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and _is_table(item, transpose):
+        def add_dataset(name: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset) and _is_numeric_table(item, transpose):
                 if item.external is not None or item.is_virtual:
                     raise ValueError(f"{name} is in another file")
                 array = np.asarray(item[()])
                 found[name.replace("/", ".")] = array.T if transpose else array
 
-        file[group].visititems(visit)
+        file[group].visititems(add_dataset)
     return found
 
 
@@ -51,13 +54,17 @@ def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
     return {
         name.replace("/", "."): np.asarray(item[rows])
         for name, item in arrays.items()
-        if _is_table(item, False)
+        if _is_numeric_table(item, False)
     }
 
 
-def _is_table(item: Any, transpose: bool) -> bool:
+def _is_numeric_table(item: Any, transpose: bool) -> bool:
     shape = item.shape[::-1] if transpose else item.shape
-    if item.dtype.kind not in "fiu" or not 1 <= len(shape) <= 3 or math.prod(shape[1:]) > _MAX_ROW:
+    if (
+        item.dtype.kind not in "fiu"
+        or not 1 <= len(shape) <= 3
+        or math.prod(shape[1:]) > _MAX_NUMBERS_PER_ROW
+    ):
         return False
     if math.prod(shape) > _MAX_VALUES:
         raise ValueError(f"an array of {math.prod(shape):.2g} numbers is too large")
@@ -75,15 +82,22 @@ def import_optional(name: str, path: Path) -> Any:
         ) from None
 
 
-_HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = 128, 14, 15, 2, 1 << 11, 20
+_MAT_HEADER_BYTES, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = (
+    128,
+    14,
+    15,
+    2,
+    1 << 11,
+    20,
+)
 _NUMERIC_CLASSES = range(6, 16)  # numeric classes
-_TYPES = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
+_MAT_NUMBER_TYPES = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
     12: "i8",
     13: "u8",
 }
 _FLAGS_AND_SIZE = [6, 5]
-_BROKEN = "it is damaged or incomplete"
+_DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
 
 def read_mat(path: Path) -> dict[str, NDArray]:
@@ -102,7 +116,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     elif version == 1:
         data = path.read_bytes()
         order = "<" if data[126:128] == b"IM" else ">"
-        for kind, content in _iterate_elements(memoryview(data)[_HEADER:], order):
+        for kind, content in _iterate_elements(memoryview(data)[_MAT_HEADER_BYTES:], order):
             _add_variable(kind, content, order, None, 0, found)
     else:
         for name, value in loadmat(path).items():
@@ -117,13 +131,13 @@ def _iterate_elements(data: memoryview, order: str) -> Iterator[tuple[int, memor
     start = 0
     while start < len(data):
         if len(data) - start < 8:
-            raise ValueError(_BROKEN)
+            raise ValueError(_DAMAGED_FILE_MESSAGE)
         kind, size = struct.unpack_from(f"{order}II", data, start)
         small = kind >> 16
         kind, size, begin = (kind & 0xFFFF, small, 4) if small else (kind, size, 8)
         content = data[start + begin : start + begin + size]
         if len(content) < size or (small and size > 4):
-            raise ValueError(_BROKEN)
+            raise ValueError(_DAMAGED_FILE_MESSAGE)
         if kind == _COMPRESSED:
             yield from _iterate_elements(memoryview(zlib.decompress(content)), order)
         else:
@@ -138,12 +152,12 @@ def _add_variable(
     if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE:  # objects have no size
         return
     if depth > _MAX_DEPTH:
-        raise ValueError(_BROKEN)
+        raise ValueError(_DAMAGED_FILE_MESSAGE)
     (flags, *_), size = (_parse_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
     if flags & 0xFF in _NUMERIC_CLASSES and not flags & _COMPLEX:
         if len(parts) != 4:
-            raise ValueError(_BROKEN)
+            raise ValueError(_DAMAGED_FILE_MESSAGE)
         _add_array(name, _parse_numbers(parts[3], order).reshape(size, order="F"), found)
     elif flags & 0xFF == _STRUCTURE and math.prod(size) == 1 and len(parts) > 4:
         (length, *_), names = _parse_numbers(parts[3], order).tolist(), bytes(parts[4][1])
@@ -155,9 +169,11 @@ def _add_variable(
 
 def _parse_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
     kind, content = part
-    if kind not in _TYPES:
-        raise ValueError(_BROKEN)
-    return np.frombuffer(content, f"{order}{_TYPES[kind]}").astype(_TYPES[kind])
+    if kind not in _MAT_NUMBER_TYPES:
+        raise ValueError(_DAMAGED_FILE_MESSAGE)
+    return np.frombuffer(content, f"{order}{_MAT_NUMBER_TYPES[kind]}").astype(
+        _MAT_NUMBER_TYPES[kind]
+    )
 
 
 def _add_array(name: str, array: NDArray, found: dict[str, NDArray]) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.explain import explain
-from drake_teleop.logs.causes.instants import Instants, free_delay, instants
-from drake_teleop.logs.read.alignment import resample, undelayed
+from drake_teleop.logs.causes.instants import Instants, block_means_of_record, delay_of_free_fit
+from drake_teleop.logs.read.alignment import remove_delay, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
@@ -22,14 +22,14 @@ MAX_LAG_S = 0.05
 """Lag between the clocks of IMU and pose that causes a warning [s]."""
 
 
-def describe_mounting(
+def estimate_auto_imu_mounting(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
     """Return the description with estimates for `auto` in the IMU's mounting, and notes."""
     imu = description.imu
     assert imu is not None
 
-    def with_imu(**changes: Any) -> Description:
+    def replace_imu_fields(**changes: Any) -> Description:
         return description.model_copy(update={"imu": imu.model_copy(update=changes)})
 
     frame: Any = imu.frame
@@ -39,21 +39,21 @@ def describe_mounting(
     mounting = None
     if description.pose is not None:
         alone = read(description.model_copy(update={"imu": None}))
-        at_Io = read(with_imu(frame=start, position=(0.0, 0.0, 0.0)))
+        at_Io = read(replace_imu_fields(frame=start, position=(0.0, 0.0, 0.0)))
         mounting = find_mounting(at_Io, alone, position=description.pose.position is not None)
     if frame == "auto":
         found = _require_rotation(mounting, f"{source}:imu.frame")
         frame = tuple(map(tuple, found.R_SI.tolist()))
         notes += _rotation_notes(found)
     if position == "auto":
-        at_Io = read(with_imu(frame=frame, position=(0.0, 0.0, 0.0)))
+        at_Io = read(replace_imu_fields(frame=frame, position=(0.0, 0.0, 0.0)))
         lever = _choose_lever_arm(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         notes.append(
             f"imu.position found: {_format_mm(lever)} mm, from the {lever.source}; write it into"
-            f" the description as imu.position: {_round(lever.p_SoIo_S)}"
+            f" the description as imu.position: {_round_for_yaml(lever.p_SoIo_S)}"
         )
-    return with_imu(frame=frame, position=position), tuple(notes)
+    return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
 
 def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
@@ -63,10 +63,10 @@ def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
     elif mounting.mirrored:
         problem = "the axes of the IMU are mirrored relative to those of the pose"
         remedy = "exchange two of its columns, or change imu.sign"
-    elif not mounting.fits:
-        problem = f"no rotation makes IMU and pose agree ({_unexplained_shares(mounting)})"
+    elif not mounting.fits_pose:
+        problem = f"no rotation makes IMU and pose agree ({_unexplained_shares_text(mounting)})"
         remedy = "find wrong units, signs or clocks by `drake-teleop inspect` with `frame: sensor`"
-    elif not mounting.determined:
+    elif not mounting.is_determined:
         worst = float(mounting.deviations_deg.max())
         problem = f"one direction has a standard deviation of {worst:.2g} deg"
         remedy = "turn the sensor about two axes, by more than 30 deg"
@@ -79,18 +79,18 @@ def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
     )
 
 
-def _unexplained_shares(found: Mounting) -> str:
+def _unexplained_shares_text(found: Mounting) -> str:
     shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_turning}
     return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
 
 
 def _rotation_notes(found: Mounting) -> list[str]:
-    nearest = found.right_angled.astype(int).tolist()
-    oblique = f"{found.oblique_deg:.1f} deg from the right-angled mounting {nearest}"
+    nearest = found.nearest_right_angled_rotation.astype(int).tolist()
+    oblique = f"{found.angle_to_right_angled_deg:.1f} deg from the right-angled mounting {nearest}"
     std = f"{float(found.deviations_deg.max()):.2g} deg"
     notes = [
         f"imu.frame found: {oblique}, standard deviation {std}; write it into the description as"
-        f" imu.frame: {_round(found.R_SI)}"
+        f" imu.frame: {_round_for_yaml(found.R_SI)}"
     ]
     if not found.is_right_angled:
         notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
@@ -104,11 +104,13 @@ def _rotation_notes(found: Mounting) -> list[str]:
 
 def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
     lever = None
-    if mounting is not None and mounting.fits:
+    if mounting is not None and mounting.fits_pose:
         lever = mounting.lever
-    if lever is None or not lever.determined.all():
+    if lever is None or not lever.is_determined_by_axis.all():
         other = lever_arm_from_wrench(at_Io)
-        if lever is None or (other and other.determined.sum() > lever.determined.sum()):
+        if lever is None or (
+            other and other.is_determined_by_axis.sum() > lever.is_determined_by_axis.sum()
+        ):
             lever = other
     if lever is None:
         raise DrakeTeleopError(
@@ -117,8 +119,10 @@ def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> Leve
             where=where,
             remedy="give imu.position in metres, or pose.position",
         )
-    if not lever.determined.all():
-        axes = ", ".join(a for a, known in zip("xyz", lever.determined, strict=True) if not known)
+    if not lever.is_determined_by_axis.all():
+        axes = ", ".join(
+            a for a, known in zip("xyz", lever.is_determined_by_axis, strict=True) if not known
+        )
         raise DrakeTeleopError(
             f"the motion does not determine {axes} of the accelerometer's position"
             f" ({_format_mm(lever)} mm, from the {lever.source})",
@@ -128,7 +132,7 @@ def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> Leve
     return lever
 
 
-def _round(x: Array) -> list:
+def _round_for_yaml(x: Array) -> list:
     return list((np.round(x, 4) + 0.0).tolist())
 
 
@@ -139,7 +143,7 @@ def _format_mm(lever: LeverArm) -> str:
     )
 
 
-def describe_pose_frame(
+def estimate_auto_pose_frame(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
     """Return the description with estimates for `auto` in the pose frame, and notes."""
@@ -165,18 +169,18 @@ def describe_pose_frame(
     notes: list[str] = []
     if pose.position_in_sensor == "auto":
         _require_determined(
-            frame.position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
+            frame.is_position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
         )
         changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
         deviation = 1e3 * float(frame.position_deviations.max())
-        notes.append(_result_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
+        notes.append(_estimate_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
     if pose.rotation_in_sensor == "auto":
         _require_determined(
-            frame.rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
+            frame.is_rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
         )
         changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
         deviation = float(frame.turn_deviations_deg.max())
-        notes.append(_result_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
+        notes.append(_estimate_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
     return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
 
 
@@ -190,7 +194,7 @@ def _require_determined(known: Any, where: str, quantity: str) -> None:
         )
 
 
-def _result_note(name: str, value: Any, deviation: str) -> str:
+def _estimate_note(name: str, value: Any, deviation: str) -> str:
     written = (np.round(value, 4) + 0.0).tolist()
     return (
         f"pose.{name} found, standard deviation {deviation}; write it into the description as"
@@ -198,15 +202,15 @@ def _result_note(name: str, value: Any, deviation: str) -> str:
     )
 
 
-def log_instants(log: Log) -> Instants:
+def block_means_of_log(log: Log) -> Instants:
     gravity = None
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:
         gravity, motion = log.gravity_W, (*log.motion, log.R_WS)
-    return instants(log.t, log.wrench, motion, gravity, log.bridged)
+    return block_means_of_record(log.t, log.wrench, motion, gravity, log.bridged)
 
 
-def weight_wrench(weight: Array, gravity: Array) -> Array:
+def wrench_of_weight(weight: Array, gravity: Array) -> Array:
     """Return the wrench (N, 6) of a weight [m, m c] at rest, for gravity (N, 3) in S, Eq. (1)."""
     return np.hstack([-weight[0] * gravity, np.cross(weight[1:], -gravity)])
 
@@ -217,27 +221,32 @@ def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     The delay is estimated from `motion_log`, the same log with motion, and removed.
     """
     assert motion_log.gravity is not None
-    at = np.clip(log.t + free_delay(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1])
+    at = np.clip(
+        log.t + delay_of_free_fit(block_means_of_log(motion_log)), motion_log.t[0], motion_log.t[-1]
+    )
     return replace(
         log,
-        wrench=log.wrench + weight_wrench(weight, resample(at, motion_log.t, motion_log.gravity)),
+        wrench=log.wrench
+        + wrench_of_weight(weight, resample(at, motion_log.t, motion_log.gravity)),
     )
 
 
 _MAX_DEVIATION_DEG = 2.0
 
 
-def describe_gravity(
+def estimate_auto_gravity(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
     explanation = explain(
-        log_instants(log), lambda delay_s: log_instants(undelayed(log, delay_s)), ("gravity",)
+        block_means_of_log(log),
+        lambda delay_s: block_means_of_log(remove_delay(log, delay_s)),
+        ("gravity",),
     )
     if explanation.theta[6] > 0.0:
-        change, covariance = explanation.state.extension("gravity")
+        change, covariance = explanation.state.parameters_of_extension("gravity")
         estimated = description.gravity_W - change
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
         across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2

@@ -28,19 +28,26 @@ from drake_teleop.logs.read.tables import Table
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-SUFFIXES = (".mcap", ".db3", ".bag")
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 _MAX_ARRAY_LENGTH = 64
-_BLOCK_MESSAGES, _RECEIVED = 10_000, "received at"
+_MESSAGES_PER_BLOCK, _RECEPTION_COLUMN = 10_000, "received at"
 # MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
 _CHUNK_OPCODE, _MAX_UNPACK_RATIO, _MAX_UNPACKED_BYTES = 6, 200, 100_000_000
 _MAX_MEMORY_BYTES = 1_500_000_000  # bytes
-_TOO_LARGE, _CUT_REMEDY = (
+_TOO_LARGE_MESSAGE, _CUT_REMEDY = (
     "its uncompressed size is too large",
     "cut it, or write the topics one by one",
 )
-_GROUPS = ("force", "torque", "linear_acceleration", "angular_velocity", "orientation", "position")
-_GROUP_NAMES = {name: name for name in _GROUPS}
-_GROUP_NAMES |= {"rotation": "orientation", "translation": "position"}
+_VECTOR_GROUPS = (
+    "force",
+    "torque",
+    "linear_acceleration",
+    "angular_velocity",
+    "orientation",
+    "position",
+)
+_GROUP_OF_FIELD = {name: name for name in _VECTOR_GROUPS}
+_GROUP_OF_FIELD |= {"rotation": "orientation", "translation": "position"}
 _STREAM_TYPES = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
@@ -64,10 +71,10 @@ class Topic:
 
 def is_bag(path: Path) -> bool:
     """Return whether a path is a folder with metadata.yaml, or a .mcap, .db3 or .bag file."""
-    return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in SUFFIXES
+    return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in BAG_SUFFIXES
 
 
-def topics_of(path: Path) -> list[Topic]:
+def list_topics(path: Path) -> list[Topic]:
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
@@ -99,9 +106,9 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
     columns = _join_blocks(blocks)
-    received = columns.pop(_RECEIVED)
+    received = columns.pop(_RECEPTION_COLUMN)
     absent = _remove_absent_groups(columns)
-    columns |= _short_names(columns)
+    columns |= _short_column_names(columns)
     columns["received"] = received
     if "header.stamp" in columns and not columns["header.stamp"].any():
         del columns["header.stamp"]
@@ -113,7 +120,7 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):
-        raise topic_missing(stream.file)
+        raise missing_topic_error(stream.file)
     return read_table(stream.file, header=stream.header)
 
 
@@ -140,7 +147,7 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dic
     return draft, head
 
 
-def topic_missing(path: Path) -> DrakeTeleopError:
+def missing_topic_error(path: Path) -> DrakeTeleopError:
     return DrakeTeleopError(
         "is a bag, and no topic is specified",
         where=str(path),
@@ -177,7 +184,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     except DrakeTeleopError:
         raise
     except MemoryError:
-        raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT_REMEDY) from None
+        raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_CUT_REMEDY) from None
     # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
@@ -195,7 +202,7 @@ def _check_unpacked_size(path: Path) -> None:
             total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK_OPCODE else 0
             file.seek(min(length - 24, limit), 1)
             if total > limit:
-                raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT_REMEDY)
+                raise DrakeTeleopError(_TOO_LARGE_MESSAGE, where=str(path), remedy=_CUT_REMEDY)
 
 
 @contextmanager
@@ -220,16 +227,16 @@ def _read_blocks(
     children: set[str] = set()
     blocks: list[dict[str, NDArray]] = []
 
-    def select_child() -> Iterator[tuple[int, Any]]:
+    def messages_of_child_frame() -> Iterator[tuple[int, Any]]:
         for received, part in pairs:
             children.add(getattr(part, "child_frame_id", ""))
             if child_frame in (None, getattr(part, "child_frame_id", "")):
                 yield received, part
 
-    found = select_child()
-    while block := list(itertools.islice(found, _BLOCK_MESSAGES)):
-        received = {_RECEIVED: np.array([time for time, _ in block]) * 1e-9}
-        blocks.append(_columns([part for _, part in block]) | received)
+    found = messages_of_child_frame()
+    while block := list(itertools.islice(found, _MESSAGES_PER_BLOCK)):
+        received = {_RECEPTION_COLUMN: np.array([time for time, _ in block]) * 1e-9}
+        blocks.append(_columns_of_messages([part for _, part in block]) | received)
     if (child_frame is None and len(children) > 1) or (child_frame and child_frame not in children):
         named = ", ".join(sorted(filter(None, children)))
         what = f"no child frame {child_frame!r}" if child_frame else "several child frames"
@@ -249,7 +256,7 @@ def _join_blocks(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
     }
 
 
-def _columns(messages: list[Any]) -> dict[str, NDArray]:
+def _columns_of_messages(messages: list[Any]) -> dict[str, NDArray]:
     columns: dict[str, NDArray] = {}
     for path, sample in _numeric_fields(messages[0], ""):
         get = attrgetter(path)
@@ -289,10 +296,10 @@ def _remove_absent_groups(columns: dict[str, NDArray]) -> tuple[str, ...]:
     return absent
 
 
-def _short_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
+def _short_column_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]
-        if group in _GROUP_NAMES and axis in ("x", "y", "z", "w"):
-            found.setdefault(f"{_GROUP_NAMES[group]}.{axis}", []).append(path)
+        if group in _GROUP_OF_FIELD and axis in ("x", "y", "z", "w"):
+            found.setdefault(f"{_GROUP_OF_FIELD[group]}.{axis}", []).append(path)
     return {short: columns[paths[0]] for short, paths in found.items() if len(paths) == 1}

@@ -15,26 +15,26 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
-from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.pose_motion.poses import PosesOfLog
 from drake_teleop.logs.read.clocks import MIN_RATE_HZ
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.tables import Table
 
-WRENCH = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
-SPECIFIC_FORCE = ("s_x", "s_y", "s_z")
-ANGULAR_VELOCITY = ("omega_x", "omega_y", "omega_z")
-ANGULAR_ACCELERATION = ("alpha_x", "alpha_y", "alpha_z")
-ORIENTATION = ("q_w", "q_x", "q_y", "q_z")
-POSITION = ("p_x", "p_y", "p_z")
+WRENCH_COLUMNS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+SPECIFIC_FORCE_COLUMNS = ("s_x", "s_y", "s_z")
+ANGULAR_VELOCITY_COLUMNS = ("omega_x", "omega_y", "omega_z")
+ANGULAR_ACCELERATION_COLUMNS = ("alpha_x", "alpha_y", "alpha_z")
+QUATERNION_COLUMNS = ("q_w", "q_x", "q_y", "q_z")
+POSITION_COLUMNS = ("p_x", "p_y", "p_z")
 _KINEMATICS = {
-    "specific_force": SPECIFIC_FORCE,
-    "angular_velocity": ANGULAR_VELOCITY,
-    "angular_acceleration": ANGULAR_ACCELERATION,
-    "orientation": ORIENTATION,
-    "position": POSITION,
+    "specific_force": SPECIFIC_FORCE_COLUMNS,
+    "angular_velocity": ANGULAR_VELOCITY_COLUMNS,
+    "angular_acceleration": ANGULAR_ACCELERATION_COLUMNS,
+    "orientation": QUATERNION_COLUMNS,
+    "position": POSITION_COLUMNS,
 }
 _MAX_REST_SPEED = 0.05  # rad/s
-_MIN_TURN = np.radians(10.0)
+_MIN_GRAVITY_ROTATION_RAD = np.radians(10.0)
 _ROW_SHAPES: dict[str, tuple[int, ...]] = {
     "t": (),
     "wrench": (6,),
@@ -84,7 +84,7 @@ class Log:
     bridged: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
     source: str = "log"
-    posed: Posed | None = None
+    posed: PosesOfLog | None = None
     gain_std: float = 0.0
     R_WS: Array | None = None
     gravity_W: Array | None = None
@@ -132,12 +132,12 @@ class Log:
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
-    def earlier(self, start: float) -> Log:
+    def with_times_from(self, start: float) -> Log:
         """Return the log with times relative to `start` [s]."""
-        posed = None if self.posed is None else self.posed.earlier(start)
+        posed = None if self.posed is None else self.posed.with_times_from(start)
         return replace(self, t=self.t - start, posed=posed)
 
-    def only(self, rows: slice | NDArray[np.bool_]) -> Log:
+    def select_rows(self, rows: slice | NDArray[np.bool_]) -> Log:
         if not isinstance(rows, slice) and rows.all():
             return self
         arrays = {name: getattr(self, name) for name in _ROW_SHAPES}
@@ -154,7 +154,12 @@ def write_log(log: Log, path: str | Path) -> None:
     import polars as pl
 
     path = Path(path)
-    names = (*WRENCH, *SPECIFIC_FORCE, *ANGULAR_VELOCITY, *ANGULAR_ACCELERATION)
+    names = (
+        *WRENCH_COLUMNS,
+        *SPECIFIC_FORCE_COLUMNS,
+        *ANGULAR_VELOCITY_COLUMNS,
+        *ANGULAR_ACCELERATION_COLUMNS,
+    )
     values = np.hstack([log.wrench, *log.motion])
     frame = pl.DataFrame({"t": log.t} | dict(zip(names, values.T, strict=True)))
     if path.suffix not in (".csv", ".parquet"):
@@ -173,30 +178,36 @@ def describe_canonical(path: Path, table: Table) -> Description:
     more than 10 deg in a fifth of the steps.
     """
 
-    def present(names: Sequence[str]) -> bool:
+    def are_columns_present(names: Sequence[str]) -> bool:
         found = [name for name in names if name in table.columns]
         if found and len(found) < len(names):
             table.numbers(names, len(names), str(path))
         return bool(found)
 
-    if not {"t", *WRENCH} & set(table.columns):
+    if not {"t", *WRENCH_COLUMNS} & set(table.columns):
         raise DrakeTeleopError(
             "is not a canonical log: it has none of the columns t, f_x ... tau_z",
             where=str(path),
             remedy="describe it in a YAML file; `drake-teleop inspect` drafts one",
         )
-    table.numbers(WRENCH, 6, str(path))
+    table.numbers(WRENCH_COLUMNS, 6, str(path))
     fields: dict[str, dict[str, Any]] = {
-        name: {"columns": names} for name, names in _KINEMATICS.items() if present(names)
+        name: {"columns": names}
+        for name, names in _KINEMATICS.items()
+        if are_columns_present(names)
     }
     if "orientation" in fields:
         fields["orientation"]["form"] = "quaternion_wxyz"
-    wrench = {"file": path, "force": {"columns": WRENCH[:3]}, "torque": {"columns": WRENCH[3:]}}
-    if _at_rest(table, fields):
+    wrench = {
+        "file": path,
+        "force": {"columns": WRENCH_COLUMNS[:3]},
+        "torque": {"columns": WRENCH_COLUMNS[3:]},
+    }
+    if _are_rows_at_rest(table, fields):
         kinematics = "orientation" if "orientation" in fields else "specific_force"
         return Description.model_validate({"static": wrench | {kinematics: fields[kinematics]}})
     if "orientation" not in fields and not {"specific_force", "angular_velocity"} <= fields.keys():
-        missing = ANGULAR_VELOCITY if "specific_force" in fields else SPECIFIC_FORCE
+        missing = ANGULAR_VELOCITY_COLUMNS if "specific_force" in fields else SPECIFIC_FORCE_COLUMNS
         raise DrakeTeleopError(
             f"a wrench without kinematics: no columns {' '.join(missing)}",
             where=str(path),
@@ -213,26 +224,28 @@ def describe_canonical(path: Path, table: Table) -> Description:
     return Description.model_validate(streams)
 
 
-def _at_rest(table: Table, fields: Container[str]) -> bool:
+def _are_rows_at_rest(table: Table, fields: Container[str]) -> bool:
     where, q = str(table.path), "orientation" in fields
     if not q and "specific_force" not in fields:
         return False
     if "angular_velocity" in fields:
-        speed = table.numbers(ANGULAR_VELOCITY, 3, where)
+        speed = table.numbers(ANGULAR_VELOCITY_COLUMNS, 3, where)
         if len(speed) and np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
             return False
     if "t" not in table.columns:
         return True
-    t = table.single("t", where)
+    t = table.single_column("t", where)
     if not np.isfinite(t).all():
         return False  # the reader raises an error that names the row
     steps = np.diff(t)
     if not len(steps) or not np.median(steps) > 1 / MIN_RATE_HZ:
         return False
     if q:
-        vertical = rotation_matrices(table.numbers(ORIENTATION, 4, where), "quaternion_wxyz")[:, 2]
+        vertical = rotation_matrices(
+            table.numbers(QUATERNION_COLUMNS, 4, where), "quaternion_wxyz"
+        )[:, 2]
     else:
-        vertical = table.numbers(SPECIFIC_FORCE, 3, where)
+        vertical = table.numbers(SPECIFIC_FORCE_COLUMNS, 3, where)
     vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
     turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
-    return bool(np.quantile(turned, 0.8) > _MIN_TURN)
+    return bool(np.quantile(turned, 0.8) > _MIN_GRAVITY_ROTATION_RAD)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.description import Time
-from drake_teleop.logs.read.description_fields import UNITS
+from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.tables import Table
 
 EPISODE_GAP_S = 1.0
@@ -25,7 +25,7 @@ _MAX_STEP_RATIO = 4.0
 # Limits of an episode, in median steps: distance of its start from that of the first episode, and
 # each of its first steps. Least number of its rows.
 _MAX_START_STEPS, _MAX_FIRST_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
-_WINDOW = 50
+_SMOOTHING_WINDOW_STAMPS = 50
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Clock:
     notes: tuple[str, ...] = ()
     episodes: int = 1
 
-    def select(self, x: Array) -> Array:
+    def select_timed_rows(self, x: Array) -> Array:
         """Return the rows of x (total, ...) that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
@@ -64,7 +64,7 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     notes = []
     if len(rows) < len(t):
         notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
-    _check_forward(t[rows], rows, table, where)
+    _check_stamps_go_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
         before = len(rows)
         rows = _remove_repetitions(rows, t, table, columns, where)
@@ -77,14 +77,15 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     shared = int((np.diff(t) == 0).sum())
     if shared:
         even = spread_shared_stamps(t)
-        _check_increasing(even, rows, table, where)
+        _check_stamps_increase(even, rows, table, where)
         notes.append(
             f"{shared} rows share the time stamp of the previous row: all rows are spaced evenly"
-            f" over {_WINDOW} stamps, which changes times by up to {np.abs(even - t).max():.2g} s"
+            f" over {_SMOOTHING_WINDOW_STAMPS} stamps, which changes times by up to"
+            f" {np.abs(even - t).max():.2g} s"
         )
         t = even
     _check_rate(t, time, where)
-    _check_even(t, rows, table, where)
+    _check_stamps_are_even(t, rows, table, where)
     return Clock(_to_common_clock(t, time), rows, total, tuple(notes), episodes)
 
 
@@ -106,10 +107,10 @@ def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
             where=f"{where}.unit",
             remedy="leave it out",
         )
-    columns = whole.all_raw(names, f"{where}.column")
-    t = columns[:, 0] * UNITS[time.unit]
+    columns = whole.raw_side_by_side(names, f"{where}.column")
+    t = columns[:, 0] * SI_VALUE_OF_UNIT[time.unit]
     if time.nanoseconds is not None:
-        t = t + columns[:, 1] * UNITS["ns"]
+        t = t + columns[:, 1] * SI_VALUE_OF_UNIT["ns"]
     t, episodes = join_episodes(t)
     return (t if table.kept is None else t[table.kept]), episodes
 
@@ -165,18 +166,18 @@ def spread_shared_stamps(t: Array) -> Array:
     step = float(np.median(np.diff(distinct)))
     per_stamp = len(t) / len(distinct)
     parts = np.split(t, np.flatnonzero(np.diff(t) > 3 * step) + 1)
-    half = math.ceil(0.5 * _WINDOW * per_stamp)
+    half = math.ceil(0.5 * _SMOOTHING_WINDOW_STAMPS * per_stamp)
     return np.concatenate([_smooth_stamps(part, half, step / per_stamp) for part in parts])
 
 
-def find_gaps(t: Array, bandwidth_hz: float | None) -> Array:
+def find_gaps_in_times(t: Array, bandwidth_hz: float | None) -> Array:
     """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s]."""
     steps = np.diff(t)
-    at = np.flatnonzero(steps > shortest_gap(float(np.median(steps)), bandwidth_hz))
+    at = np.flatnonzero(steps > min_gap_length(float(np.median(steps)), bandwidth_hz))
     return np.stack([t[at], t[at + 1]], axis=1)
 
 
-def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
+def min_gap_length(step: float, bandwidth_hz: float | None) -> float:
     """Return the least length of a gap [s]: four steps, and half a period of the bandwidth."""
     return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
@@ -214,13 +215,14 @@ def _remove_repetitions(
     return rows[np.concatenate([[True], ~same])]
 
 
-def _check_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
+def _check_stamps_go_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps < 0).any():
         first = int(np.argmax(steps < 0))
         raise DrakeTeleopError(
             f"{int((steps < 0).sum())} time stamps decrease, the first in row"
-            f" {table.line(rows[first + 1])} of {table.path.name}, by {-steps[first]:.3g} s",
+            f" {table.line_in_file(rows[first + 1])} of {table.path.name}, by {-steps[first]:.3g}"
+            " s",
             where=where,
             remedy="cut the log there, sort the rows, or use another clock: time.column, time.rate",
         )
@@ -232,10 +234,10 @@ def _check_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -
         )
 
 
-def _check_increasing(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
+def _check_stamps_increase(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps <= 0).any():
-        row = table.line(rows[int(np.argmax(steps <= 0))])
+        row = table.line_in_file(rows[int(np.argmax(steps <= 0))])
         raise DrakeTeleopError(
             f"the time stamps do not increase around row {row} of {table.path.name}",
             where=where,
@@ -249,9 +251,11 @@ def _check_rate(t: Array, time: Time, where: str) -> None:
     step = float(np.median(np.diff(t)))
     if 1 / MAX_RATE_HZ <= step <= 1 / MIN_RATE_HZ:
         return
-    counts = step / UNITS[time.unit]
+    counts = step / SI_VALUE_OF_UNIT[time.unit]
     # Typical sensor rates are 20 Hz to 10 kHz.
-    likely = [unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * UNITS[unit] <= 0.05]
+    likely = [
+        unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * SI_VALUE_OF_UNIT[unit] <= 0.05
+    ]
     remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
     if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"
@@ -262,12 +266,12 @@ def _check_rate(t: Array, time: Time, where: str) -> None:
     )
 
 
-def _check_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
+def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if len(t) < 3 or t[-1] - t[0] <= _MAX_STEP_RATIO * len(t) * np.median(steps):
         return
     longest = int(np.argmax(steps))
-    row = table.line(rows[longest + 1])
+    row = table.line_in_file(rows[longest + 1])
     raise DrakeTeleopError(
         f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
         f" {steps.mean():.3g} s, longest {steps[longest]:.3g} s to row {row} of {table.path.name}",

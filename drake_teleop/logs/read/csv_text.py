@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import polars as pl
 
-_HEAD_BYTES = 2**16  # bytes from which the format is detected
-_TYPE_ROWS = 1000  # rows from which column types are inferred
+_INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
+_ROWS_FOR_TYPES = 1000  # rows from which column types are inferred
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _LONE_CR = re.compile(rb"\r(?!\n)")
 _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
@@ -32,13 +32,13 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     import polars as pl
 
     with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
+        head = file.read(_INSPECTED_HEAD_BYTES)
     source: Path | bytes = path
     if head.startswith(_UTF_16):
         source = path.read_text("utf-16").encode()
-        head = source[:_HEAD_BYTES]
-    if (text := _normalize(path, source, head)) is not None:
-        source, head = text, text[:_HEAD_BYTES]
+        head = source[:_INSPECTED_HEAD_BYTES]
+    if (text := _normalize_separators_and_encoding(path, source, head)) is not None:
+        source, head = text, text[:_INSPECTED_HEAD_BYTES]
     lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
     table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
     before = next(table, 0)
@@ -61,15 +61,17 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         skip_lines=before,
         try_parse_dates=True,
     )
-    frame = _parse(parse)
+    frame = _parse_with_types(parse)
     if names is not None:
         frame.columns = names
     return frame, before + (2 if header else 1)
 
 
-def _normalize(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
+def _normalize_separators_and_encoding(
+    path: Path, source: Path | bytes, head: bytes
+) -> bytes | None:
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - _HEAD_BYTES))
+        file.seek(max(0, path.stat().st_size - _INSPECTED_HEAD_BYTES))
         tail = file.read() if isinstance(source, Path) else source
     returns, commas = bool(_LONE_CR.search(head)), _QUOTED_NUMBER.findall(head)
     # "1,500" can be 1500.
@@ -87,12 +89,11 @@ def _content_length(text: bytes) -> int:
     return len(text) if line < 0 else line + 1
 
 
-def _parse(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
-    """Parse with types from the first rows if these are numeric, else from all rows (slow)."""
+def _parse_with_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):
-        frame = parse(infer_schema_length=_TYPE_ROWS)
+        frame = parse(infer_schema_length=_ROWS_FOR_TYPES)
         if all(kind.is_numeric() for kind in frame.dtypes):
             return frame
     return parse(infer_schema_length=None)

@@ -23,10 +23,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import EULER_AXES
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses, PosesOfLog
 from drake_teleop.logs.read.description_fields import (
+    SI_VALUE_OF_UNIT,
     STANDARD_GRAVITY,
-    UNITS,
     Acceleration,
     AngularAcceleration,
     AngularVelocity,
@@ -45,7 +45,7 @@ from drake_teleop.logs.read.description_fields import (
     Weight,
 )
 
-NO_YAML = "in a log description of this table; the canonical form has no such line"
+ONLY_IN_DESCRIPTION = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
 
 
@@ -198,14 +198,14 @@ class Imu(_Recorded):
     def _check_signals(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
             raise ValueError("give specific_force, angular_velocity, or both")
-        if self.automatic and not self.specific_force:
+        if self.is_mounting_auto and not self.specific_force:
             raise ValueError(
                 "auto: frame and position are found from specific_force; give it, or them"
             )
         return self
 
     @property
-    def automatic(self) -> bool:
+    def is_mounting_auto(self) -> bool:
         return self.frame == "auto" or self.position == "auto"
 
 
@@ -240,7 +240,7 @@ class Pose(_Recorded):
         return self
 
     @property
-    def automatic(self) -> bool:
+    def is_frame_auto(self) -> bool:
         return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
 
     @property
@@ -308,7 +308,7 @@ class Description(Strict):
             raise ValueError("the specific force is missing: add imu.specific_force or pose")
         if self.pose is None and self.imu is not None and self.imu.frame == "auto":
             raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
-        if self.pose is not None and self.pose.automatic and self.wrench.frame == "base":
+        if self.pose is not None and self.pose.is_frame_auto and self.wrench.frame == "base":
             raise ValueError("pose: auto needs a wrench in the axes of the sensor, not in base")
         self._check_weight(self.wrench)
         return self
@@ -316,7 +316,7 @@ class Description(Strict):
     def _check_weight(self, wrench: Wrench) -> None:
         if wrench.weight is not None and self.pose is None:
             raise ValueError("wrench.weight follows from the orientation: add pose")
-        pose = self.pose is not None and self.pose.automatic
+        pose = self.pose is not None and self.pose.is_frame_auto
         kinds = {"pose: auto": pose, "gravity: auto": self.gravity == "auto"}
         kinds["wrench.weight"] = wrench.weight is not None
         both = [name for name, present in kinds.items() if present]
@@ -328,15 +328,15 @@ class Description(Strict):
         """Gravity (3,) in the world [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
-    def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
+    def add_pose_frame(self, poses: Poses, imu: ImuData | None = None) -> PosesOfLog:
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
-        return Posed(poses, self.gravity_W, np.array(origin), rotation, imu)
+        return PosesOfLog(poses, self.gravity_W, np.array(origin), rotation, imu)
 
-    def scale(self, unit: str) -> float:
+    def si_value(self, unit: str) -> float:
         """Return the SI value of a unit; "g" is the magnitude of the described gravity."""
-        return float(np.linalg.norm(self.gravity_W)) if unit == "g" else UNITS[unit]
+        return float(np.linalg.norm(self.gravity_W)) if unit == "g" else SI_VALUE_OF_UNIT[unit]
 
 
 def json_schema() -> str:
@@ -383,12 +383,12 @@ def _validation_error(error: ValidationError, path: Path) -> DrakeTeleopError:
     first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
     *outer, last = first["loc"] or ("",)
     unknown = first["type"] == "extra_forbidden"
-    location = [part for part in outer if _is_field(part)]
-    location += [last] if unknown or _is_field(last) else []
+    location = [part for part in outer if _is_field_or_index(part)]
+    location += [last] if unknown or _is_field_or_index(last) else []
     where = f"{path}:{'.'.join(map(str, location))}" if location else str(path)
     remedy = "docs/log-description.md lists fields and units"
     if unknown:
-        known = list(_fields_at(location[:-1]))
+        known = list(_allowed_fields_at(location[:-1]))
         near = difflib.get_close_matches(str(location[-1]), known, n=1)
         what = f"unknown field {location[-1]!r}"
         remedy = f"did you mean {near[0]!r}" if near else f"the fields are {', '.join(known)}"
@@ -401,12 +401,12 @@ def _validation_error(error: ValidationError, path: Path) -> DrakeTeleopError:
     return DrakeTeleopError(what, where=where, remedy=remedy)
 
 
-def _is_field(part: str | int) -> bool:
+def _is_field_or_index(part: str | int) -> bool:
     # Pydantic adds the tried branch of a union to the location, such as "tuple[...]".
     return isinstance(part, int) or part.isidentifier()
 
 
-def _fields_at(location: Sequence[str | int]) -> Iterator[str]:
+def _allowed_fields_at(location: Sequence[str | int]) -> Iterator[str]:
     model: Any = Description
     for part in location:
         options = typing.get_args(model.model_fields[part].annotation) or (

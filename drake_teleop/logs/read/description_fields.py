@@ -13,7 +13,7 @@ ROTATION_TOLERANCE = 0.01
 """Largest deviation of entries of R^T R from the identity."""
 _MIN_SCALE = 1e-12
 STANDARD_GRAVITY = 9.80665
-UNITS = {
+SI_VALUE_OF_UNIT = {
     "s": 1.0,
     "ms": 1e-3,
     "us": 1e-6,
@@ -122,19 +122,19 @@ GainStd = Annotated[
         " calibration says",
     ),
 ]
-_NUMBERS: list[dict[str, Any]] = [
+_NUMBER_OR_VECTOR_SCHEMA: list[dict[str, Any]] = [
     {"type": "number"},
     {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
 ]
 _GRAVITY_SCHEMA = {
-    "anyOf": [*_NUMBERS, {"type": "string", "const": "auto"}],
+    "anyOf": [*_NUMBER_OR_VECTOR_SCHEMA, {"type": "string", "const": "auto"}],
     "description": "magnitude, or the vector in the world, m/s^2; auto: the direction is found",
 }
 Gravity = Annotated[
     Vector | Literal["auto"], BeforeValidator(_parse_gravity), WithJsonSchema(_GRAVITY_SCHEMA)
 ]
 _SCALE_SCHEMA = {
-    "anyOf": _NUMBERS,
+    "anyOf": _NUMBER_OR_VECTOR_SCHEMA,
     "description": "factor on the numbers of the file, or one for each column; -1 for another sign",
 }
 Scale = Annotated[Vector, BeforeValidator(_parse_scale), WithJsonSchema(_SCALE_SCHEMA)]

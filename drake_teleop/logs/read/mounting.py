@@ -18,19 +18,19 @@ from drake_teleop.logs.read.alignment import (
     estimate_delay,
     far_from_gaps,
     low_pass,
-    low_passed,
+    low_pass_log,
+    remove_delay,
     resample,
-    undelayed,
 )
 from drake_teleop.logs.read.canonical import Log
 
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
 _MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
 Pairs = list[tuple[Array, Array]]
-"""Signal of the pose and of the IMU, for each sensor, see `signal_pairs`."""
+"""Signal of the pose and of the IMU, for each sensor, see `comparable_signals`."""
 
 
-def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
+def comparable_signals(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
     """Return pairs of signals (N, 3): of the pose at times `t`, and of the IMU on its own clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
@@ -38,7 +38,7 @@ def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
     return pairs
 
 
-def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
+def lag_of_imu_clock(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
     """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
 
     The axes of the IMU may differ by any affine map. Effects linear in `arm` (N, k) are removed.
@@ -46,20 +46,20 @@ def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
-    def without_arm(x: Array) -> Array:
+    def remove_arm(x: Array) -> Array:
         return x - U @ (U.T @ x)
 
-    expected, sensed = [without_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
+    expected, sensed = [remove_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
 
-    def cost(shift: float) -> float:
-        moved = without_arm(resample(t + shift, t_imu, sensed))
+    def unexplained_at_shift(shift: float) -> float:
+        moved = remove_arm(resample(t + shift, t_imu, sensed))
         return sum(
             _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
         )
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
-    costs = np.array([cost(shift) for shift in shifts])
+    costs = np.array([unexplained_at_shift(shift) for shift in shifts])
     best = int(np.argmin(costs))
     lag = float(shifts[best])
     if 0 < best < len(shifts) - 1:
@@ -111,9 +111,9 @@ def _unexplained_share(y: Array, x: Array) -> float:
     return float((y * y).sum() - explained) / total
 
 
-_BLOCKS = 20
+_NUM_JACKKNIFE_BLOCKS = 20
 # Directions with smaller singular values, relative to the largest, are undetermined.
-RANK = 1e-5
+MIN_SINGULAR_RATIO = 1e-5
 _MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
@@ -127,12 +127,13 @@ def solve_least_squares(
     """
     linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
     rows, channels, _ = linear.shape
-    found = _fit(residual, x, linear)
-    found = _fit(residual, found.x, linear)  # with updated weights
-    return found.x, jackknife(found.jac, found.fun, channels * (rows // _BLOCKS))
+    found = _minimize_residual(residual, x, linear)
+    found = _minimize_residual(residual, found.x, linear)  # with updated weights
+    width = channels * (rows // _NUM_JACKKNIFE_BLOCKS)
+    return found.x, jackknife_deviations(found.jac, found.fun, width)
 
 
-def _fit(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
+def _minimize_residual(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
     from scipy.optimize import approx_fprime, least_squares
 
     errors, others = residual(x), len(x) - linear.shape[2]
@@ -140,21 +141,21 @@ def _fit(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
     sigma = np.repeat(np.sqrt(power + 1e-12 * power.max() + 1e-30), 3)
     known = (linear / sigma[:, None]).reshape(errors.size, linear.shape[2])
 
-    def weighted(z: Array) -> Array:
+    def weigh(z: Array) -> Array:
         return (residual(z) / sigma).ravel()
 
-    def derivatives(z: Array) -> Array:
-        found = approx_fprime(z[:others], lambda y: weighted(np.append(y, z[others:])))
+    def jacobian(z: Array) -> Array:
+        found = approx_fprime(z[:others], lambda y: weigh(np.append(y, z[others:])))
         return np.hstack([found, known])
 
-    return least_squares(weighted, x, jac=derivatives, x_scale="jac", max_nfev=_MAX_EVALUATIONS)
+    return least_squares(weigh, x, jac=jacobian, x_scale="jac", max_nfev=_MAX_EVALUATIONS)
 
 
-def jackknife(jacobian: Array, residual: Array, width: int) -> Array:
+def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     """Return jackknife standard deviations (n,) of the parameters, for blocks of `width` rows."""
     size = np.linalg.norm(jacobian, axis=0) + 1e-300
     _, singular, Vt = np.linalg.svd(jacobian / size, full_matrices=False)
-    known = singular > RANK * singular[0]
+    known = singular > MIN_SINGULAR_RATIO * singular[0]
     basis = Vt[known].T
     J = (jacobian / size) @ basis
     gram, steps = J.T @ J, []
@@ -171,9 +172,9 @@ MAX_LEVER_DEVIATION = 0.005
 """Largest standard deviation of a determined coordinate [m]."""
 MAX_UNEXPLAINED = 0.05
 """Largest unexplained share of the variance of a valid fit."""
-CUTOFF_HZ = 8.0
+COMPARISON_CUTOFF_HZ = 8.0
 """Cut-off of the low-pass on all signals [Hz]."""
-COMPARED_SAMPLES = 1500
+MAX_COMPARED_SAMPLES = 1500
 """Number of compared samples."""
 # Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
 _MIN_SIGNAL_RATIO = 20.0
@@ -194,7 +195,7 @@ class LeverArm:
     source: str
 
     @property
-    def determined(self) -> NDArray[np.bool_]:
+    def is_determined_by_axis(self) -> NDArray[np.bool_]:
         """Booleans (3,): True where the standard deviation is below 5 mm."""
         return self.deviations < MAX_LEVER_DEVIATION
 
@@ -204,16 +205,16 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
 
     Return None for a poor fit (contact), or few samples outside of gaps.
     """
-    cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
+    cutoff = min(COMPARISON_CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
-    smooth = low_passed(undelayed(log, delay), cutoff)
+    smooth = low_pass_log(remove_delay(log, delay), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
-    t = common_times(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
-    if len(t) < COMPARED_SAMPLES // 10:
+    t = common_times_of_logs(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
+    if len(t) < MAX_COMPARED_SAMPLES // 10:
         return None
     wrench = resample(t, smooth.t, smooth.wrench)
 
-    def residual(x: Array) -> Array:
+    def residual_at(x: Array) -> Array:
         s, omega, alpha = (resample(t + x[3], smooth.t, signal) for signal in smooth.motion)
         s = s - lever_matrix(omega, alpha) @ x[:3]
         return contact_wrench(wrench, x[4:10], s, omega, alpha, x[10:])
@@ -222,18 +223,19 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     V = regressor(*motion)
     size = np.linalg.norm(V - V.mean(axis=0), axis=(0, 1)) + 1e-12
     centred = ((V - V.mean(axis=0)) / size).reshape(-1, 10)
-    phi = np.linalg.lstsq(centred, (wrench - wrench.mean(axis=0)).ravel(), rcond=RANK)[0] / size
+    target = (wrench - wrench.mean(axis=0)).ravel()
+    phi = np.linalg.lstsq(centred, target, rcond=MIN_SINGULAR_RATIO)[0] / size
     offsets = (wrench - V @ phi).mean(axis=0)
-    x, deviations = solve_least_squares(residual, np.concatenate([np.zeros(4), offsets, phi]))
-    left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual(x), wrench))
+    x, deviations = solve_least_squares(residual_at, np.concatenate([np.zeros(4), offsets, phi]))
+    left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
     if (left > MAX_UNEXPLAINED * whole).any():
         return None
-    observable = observable_axes(lever_matrix(*motion[1:]), smooth, cutoff)
+    observable = are_axes_observable(lever_matrix(*motion[1:]), smooth, cutoff)
     return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
 
 
-def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
-    t = np.linspace(start, stop, COMPARED_SAMPLES)
+def common_times_of_logs(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
+    t = np.linspace(start, stop, MAX_COMPARED_SAMPLES)
     known = [np.interp(t, log.t, far_from_gaps(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
@@ -244,7 +246,7 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
     return cross_matrix(alpha) + W @ W
 
 
-def observable_axes(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
+def are_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     """Return (3,) True for axes along which the motion far exceeds its noise."""
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
@@ -255,7 +257,7 @@ def observable_axes(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
     return alone > _MIN_SIGNAL_RATIO * (noise.sum() - noise)
 
 
-RIGHT_ANGLED_DEG = 5.0
+MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
 """Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""
 MAX_DEVIATION_DEG = 1.0
 """Largest standard deviation of a determined rotation [deg]."""
@@ -295,25 +297,25 @@ class Mounting:
     lever: LeverArm | None
 
     @property
-    def angle_deg(self) -> float:
-        return _angle_deg(self.R_SI)
+    def rotation_angle_deg(self) -> float:
+        return _rotation_angle_deg(self.R_SI)
 
     @property
-    def right_angled(self) -> Array:
+    def nearest_right_angled_rotation(self) -> Array:
         """Rotation (3, 3) nearest to R_SI, of the 24 that map axes to axes."""
         return max(right_angled_rotations(), key=lambda R: float(np.trace(R.T @ self.R_SI)))
 
     @property
-    def oblique_deg(self) -> float:
-        return _angle_deg(self.right_angled.T @ self.R_SI)
+    def angle_to_right_angled_deg(self) -> float:
+        return _rotation_angle_deg(self.nearest_right_angled_rotation.T @ self.R_SI)
 
     @property
     def is_right_angled(self) -> bool:
         """Whether R_SI maps axes to axes, within 5 deg."""
-        return self.oblique_deg < RIGHT_ANGLED_DEG
+        return self.angle_to_right_angled_deg < MAX_RIGHT_ANGLE_ERROR_DEG
 
     @property
-    def fits(self) -> bool:
+    def fits_pose(self) -> bool:
         """Whether IMU and pose agree, with small unexplained shares."""
         omega_agrees = (
             self.unexplained_turning is None or self.unexplained_turning < MAX_UNEXPLAINED
@@ -325,9 +327,9 @@ class Mounting:
         return not self.mirrored and omega_agrees and known
 
     @property
-    def determined(self) -> bool:
+    def is_determined(self) -> bool:
         """Whether the fit is valid and gives R_SI to 1 deg about every axis."""
-        return self.fits and bool((self.deviations_deg < MAX_DEVIATION_DEG).all())
+        return self.fits_pose and bool((self.deviations_deg < MAX_DEVIATION_DEG).all())
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
@@ -338,15 +340,15 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_MAX_LAG_S, 0.2 * float(stop - start))
-    cutoff = min(CUTOFF_HZ, 0.2 / imu.dt)
-    sensed, smooth = low_passed(imu, cutoff), low_passed(pose, cutoff)
-    t = common_times(start + reach, stop - reach, (imu, pose), cutoff)
-    if len(t) < COMPARED_SAMPLES // 10:
+    cutoff = min(COMPARISON_CUTOFF_HZ, 0.2 / imu.dt)
+    sensed, smooth = low_pass_log(imu, cutoff), low_pass_log(pose, cutoff)
+    t = common_times_of_logs(start + reach, stop - reach, (imu, pose), cutoff)
+    if len(t) < MAX_COMPARED_SAMPLES // 10:
         return None
     # Without a gyroscope both readings contain the angular velocity of the pose.
     omega_imu, omega = (resample(t, log.t, log.angular_velocity) for log in (imu, pose))
     gyroscope = not np.allclose(omega_imu, omega, atol=1e-9)
-    pairs = signal_pairs(t, sensed, smooth, gyroscope)
+    pairs = comparable_signals(t, sensed, smooth, gyroscope)
     expected = pairs[0][0]
     if expected.var(axis=0).sum() < 0.25:
         return None
@@ -355,29 +357,31 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     if not gyroscope:
         omega, alpha = (resample(t, pose.t, x) for x in smooth.motion[1:])
         arm = lever_matrix(omega, alpha).reshape(-1, 9)
-    lag = best_shift(t, pairs, imu.t, reach, arm)
+    lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
     middle, drift = clock_drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
     R, mirrored = _kabsch(resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected)
 
     # The estimated lag allows the use of more samples.
     margin = min(reach, abs(middle) + 0.5 * abs(drift) * float(stop - start) + 0.1)
-    t = common_times(start + margin, stop - margin, (imu, pose), cutoff)
-    pairs = signal_pairs(t, sensed, smooth, gyroscope)
+    t = common_times_of_logs(start + margin, stop - margin, (imu, pose), cutoff)
+    pairs = comparable_signals(t, sensed, smooth, gyroscope)
     pose_omega = resample(t, pose.t, smooth.angular_velocity)
     K = lever_matrix(pose_omega, resample(t, pose.t, smooth.angular_acceleration))
 
-    x, deviations, left = _refine(t, drift * (t - centre), imu.t, pairs, K, R, middle)
+    x, deviations, left = _refine_rotation_and_lag(
+        t, drift * (t - centre), imu.t, pairs, K, R, middle
+    )
     lever = None
     if position:
         lever = LeverArm(
-            x[4:7], np.where(observable_axes(K, pose, cutoff), deviations[4:7], np.inf), "pose"
+            x[4:7], np.where(are_axes_observable(K, pose, cutoff), deviations[4:7], np.inf), "pose"
         )
     powers = left.reshape(len(t), -1, 3).var(axis=0).sum(axis=1)
     shares = [float(part / y.var(axis=0).sum()) for part, (y, _) in zip(powers, pairs, strict=True)]
     speeds = [float(np.linalg.norm(log.angular_velocity, axis=1).std()) for log in (imu, pose)]
     return Mounting(
-        R_SI=_rotate(R, x[:3]),
+        R_SI=_rotated_by_vector(R, x[:3]),
         lag_s=lag if drift else float(x[3]),
         lag_middle_s=float(x[3]),
         middle_s=centre,
@@ -391,7 +395,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
     )
 
 
-def _refine(
+def _refine_rotation_and_lag(
     t: Array,
     drift_lag: Array,
     t_imu: Array,
@@ -402,20 +406,21 @@ def _refine(
 ) -> tuple[Array, Array, Array]:
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
-    def residual(x: Array) -> Array:
-        rotated = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3) @ _rotate(R, x[:3]).T
+    def pose_residual(x: Array) -> Array:
+        resampled = resample(t + x[3] + drift_lag, t_imu, moving).reshape(-1, 3)
+        rotated = resampled @ _rotated_by_vector(R, x[:3]).T
         left = rotated.reshape(known.shape) - known
         left[:, 0] -= K @ x[4:7]
         return left.reshape(len(t), -1) + x[7:]
 
     first = np.zeros(7 + 3 * len(pairs))
     first[3] = lag
-    first[7:] = -residual(first).mean(axis=0)
+    first[7:] = -pose_residual(first).mean(axis=0)
     linear = np.zeros((len(t), 3 * len(pairs), len(first) - 4))
     linear[:, :3, :3] = -K
     linear[:, :, 3:] = np.eye(3 * len(pairs))
-    x, deviations = solve_least_squares(residual, first, linear)
-    return x, deviations, residual(x)
+    x, deviations = solve_least_squares(pose_residual, first, linear)
+    return x, deviations, pose_residual(x)
 
 
 def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
@@ -428,9 +433,9 @@ def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
     return R, bool(reflected < 0.25 * direct and reflected < 0.05)
 
 
-def _rotate(R: Array, vector: Array) -> Array:
+def _rotated_by_vector(R: Array, vector: Array) -> Array:
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 
-def _angle_deg(R: Array) -> float:
+def _rotation_angle_deg(R: Array) -> float:
     return float(np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1))))

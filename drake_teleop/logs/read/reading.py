@@ -14,27 +14,27 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.common.rotations import nearest_rotation, quaternions_of, rotation_matrices
-from drake_teleop.logs.pose_motion.poses import Inertial, Poses
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.read.alignment import (
-    SMOOTHER_WINDOW,
+    SMOOTHER_WINDOW_OVER_PERIOD,
     angular_motion,
+    mean_time_step,
     resample,
     smooth_derivatives,
-    spacing,
     uniform_times,
 )
 from drake_teleop.logs.read.auto_frames import (
-    describe_gravity,
-    describe_mounting,
-    describe_pose_frame,
+    estimate_auto_gravity,
+    estimate_auto_imu_mounting,
+    estimate_auto_pose_frame,
     restore_weight,
-    weight_wrench,
+    wrench_of_weight,
 )
-from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
+from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps, read_clock
+from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
-    NO_YAML,
+    ONLY_IN_DESCRIPTION,
     Description,
     Imu,
     Pose,
@@ -44,23 +44,23 @@ from drake_teleop.logs.read.description import (
 )
 from drake_teleop.logs.read.streams import (
     MAX_VALUES,
-    MINIMUM_SAMPLES,
+    MIN_STREAM_SAMPLES,
     Orientations,
     Stream,
-    common_time,
-    in_S,
-    move_to_So,
-    on_clock,
-    wrench_in_S,
+    common_time_of_streams,
+    resample_to_clock,
+    specific_force_at_So,
+    world_to_S,
+    wrench_world_to_S,
 )
-from drake_teleop.logs.read.table_files import FORMATS, read_table
+from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table, decimal_step
 
-MINIMUM_POSES = 3
+MIN_STATIC_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
 _CHUNK_ROWS = 2**16
-_GAP_RATIO = 4.0
-_Describe = Callable[..., tuple[Description, tuple[str, ...]]]
+_MAX_GAP_OVER_STEP = 4.0
+_EstimateAuto = Callable[..., tuple[Description, tuple[str, ...]]]
 
 
 def read_log(
@@ -68,10 +68,9 @@ def read_log(
 ) -> Log:
     """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
 
-    Signals are interpolated on the wrench's clock at its median rate; faster streams are low-passed
-    first. Angular velocity is from the gyroscope, else from the orientation; angular acceleration
-    from the file, else differentiated; specific force from the accelerometer, else from the
-    position, else it is -gravity.
+    Signals are resampled to the wrench's clock at its median rate. Angular velocity is from the
+    gyroscope, else from the orientation; angular acceleration from the file, else differentiated;
+    specific force from the accelerometer, else from the position, else it is -gravity.
 
     Args:
         path: the file.
@@ -90,18 +89,18 @@ def read_log(
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
         reader = _Reader(load_description(path), str(path), bandwidth_hz)
-        return reader.log(differentiate=differentiate)
-    if path.suffix.lower() in FORMATS:
+        return reader.read_stream_log(differentiate=differentiate)
+    if path.suffix.lower() in TABLE_READERS:
         table = read_table(path)
         description = describe_canonical(path, table)
         reader = _Reader(description, str(path), bandwidth_hz, {path: table})
-        return reader.log(keep_origin=True, differentiate=differentiate)
+        return reader.read_stream_log(keep_origin=True, differentiate=differentiate)
     if is_bag(path):
-        raise topic_missing(path)
+        raise missing_topic_error(path)
     raise DrakeTeleopError(
         f"format {path.suffix!r} is not known",
         where=str(path),
-        remedy=f"give a canonical log ({', '.join(FORMATS)}) or a log description (.yaml)",
+        remedy=f"give a canonical log ({', '.join(TABLE_READERS)}) or a log description (.yaml)",
     )
 
 
@@ -113,7 +112,7 @@ def read_description(
     differentiate: bool = True,
 ) -> Log:
     """Return the log of a description with absolute paths, as `read_log`."""
-    return _Reader(description, source, 30.0, tables).log(differentiate=differentiate)
+    return _Reader(description, source, 30.0, tables).read_stream_log(differentiate=differentiate)
 
 
 class _Reader:
@@ -132,67 +131,67 @@ class _Reader:
         self._one_sided_s = 0.0
         self._tables = dict(tables or {})
 
-    def log(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
+    def read_stream_log(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
         if self._description.static is not None:
             if keep_origin:
                 self._notes.append("each row is interpreted as a pose at rest")
-            return self._static(self._description.static)
+            return self._read_static_poses(self._description.static)
         assert self._description.wrench is not None
         weight = self._description.wrench.weight
         causes = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
         free = tuple(name for name, is_free in causes.items() if is_free)
         if self._description.gravity == "auto":
-            self._replace_auto(describe_gravity)
-        if self._description.pose is not None and self._description.pose.automatic:
-            self._replace_auto(describe_pose_frame, differentiate=False)
-        if self._description.imu is not None and self._description.imu.automatic:
-            self._replace_auto(describe_mounting)
-        table = self._table(self._description.wrench)
-        clock = self._clock("wrench", self._description.wrench, table)
-        wrench = clock.select(self._forces("wrench", self._description.wrench, table, clock.total))
+            self._replace_auto(estimate_auto_gravity)
+        if self._description.pose is not None and self._description.pose.is_frame_auto:
+            self._replace_auto(estimate_auto_pose_frame, differentiate=False)
+        if self._description.imu is not None and self._description.imu.is_mounting_auto:
+            self._replace_auto(estimate_auto_imu_mounting)
+        table = self._table_of_stream(self._description.wrench)
+        clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
+        wrench = self._read_wrench("wrench", self._description.wrench, table, clock.total)
+        wrench = clock.select_timed_rows(wrench)
         pose = imu = None
         if self._description.pose is not None:
-            pose = self._pose(self._description.pose, differentiate=differentiate)
+            pose = self._read_pose(self._description.pose, differentiate=differentiate)
         if self._description.imu is not None:
-            imu = self._imu(self._description.imu, pose)
+            imu = self._read_imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
-        t = common_time(clock.t, streams, self._source)
+        t = common_time_of_streams(clock.t, streams, self._source)
         wrench = resample(t, clock.t, wrench)
-        log = self._assemble(t, wrench, imu, pose)
+        log = self._make_log(t, wrench, imu, pose)
         gain_std = self._description.wrench.gain_std
         log = replace(log, gain_std=gain_std, free=free, described=self._description)
         if pose is not None and pose.raw is not None:
             inertial = None if imu is None else imu.inertial
-            log = replace(log, posed=self._description.posed(pose.raw, inertial))
-        log = log if keep_origin else log.earlier(float(clock.t[0]))
+            log = replace(log, posed=self._description.add_pose_frame(pose.raw, inertial))
+        log = log if keep_origin else log.with_times_from(float(clock.t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
         other = self._description.model_copy(update={"wrench": without})
-        return restore_weight(log, np.array(weight), self._read_other(other))
+        return restore_weight(log, np.array(weight), self._read_edited(other))
 
-    def _replace_auto(self, describe: _Describe, *, differentiate: bool = True) -> None:
-        self._description, notes = describe(
-            self._description, self._source, partial(self._read_other, differentiate=differentiate)
-        )
+    def _replace_auto(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
+        read = partial(self._read_edited, differentiate=differentiate)
+        self._description, notes = describe(self._description, self._source, read)
         self._notes += notes
 
-    def _read_other(self, description: Description, *, differentiate: bool = True) -> Log:
+    def _read_edited(self, description: Description, *, differentiate: bool = True) -> Log:
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
-                self._table(stream)
+                self._table_of_stream(stream)
         reader = _Reader(description, self._source, 30.0, self._tables)
-        return reader.log(differentiate=differentiate)
+        return reader.read_stream_log(differentiate=differentiate)
 
-    def _table(self, stream: Wrench | Imu | Pose | Static) -> Table:
+    def _table_of_stream(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.source not in self._tables:
             self._tables[stream.source] = read_stream(stream)
         table = self._tables[stream.source]
-        return table if isinstance(stream, Static) else table.filled(stream.columns)
+        return table if isinstance(stream, Static) else table.rows_with_numbers(stream.columns)
 
-    def _forces(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
+    def _read_wrench(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
-            self._vectors(name, field, quantity, table, rows, stream.sign)
+            self._read_vectors(name, field, quantity, table, rows, stream.sign)
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         ]
         if isinstance(stream.frame, tuple):
@@ -200,14 +199,15 @@ class _Reader:
             both = [vectors @ R.T for vectors in both]
         return np.hstack(both)
 
-    def _vectors(
+    def _read_vectors(
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
     ) -> Array:
         where = f"{self._source}:{name}.{field}.columns"
         values = table.numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
-        values *= sign * self._description.scale(quantity.unit) * np.array(quantity.scale)
-        of_table = f" ({NO_YAML})" if Path(self._source).suffix.lower() in FORMATS else ""
+        values *= sign * self._description.si_value(quantity.unit) * np.array(quantity.scale)
+        is_table = Path(self._source).suffix.lower() in TABLE_READERS
+        of_table = f" ({ONLY_IN_DESCRIPTION})" if is_table else ""
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
@@ -215,18 +215,18 @@ class _Reader:
         table.check_size(values, *MAX_VALUES[field], where, remedy)
         return values
 
-    def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
-        table = self._table(stream)
-        clock = self._clock("pose", stream, table)
+    def _read_pose(self, stream: Pose, *, differentiate: bool) -> Stream:
+        table = self._table_of_stream(stream)
+        clock = self._read_clock_and_gaps("pose", stream, table)
         t, raw = uniform_times(clock.t), None
         quaternion, position = self._poses_of_S(stream, table, clock)
         if position is not None:
-            raw = Poses(clock.t, position, quaternion).continued()
+            raw = Poses(clock.t, position, quaternion).with_continuous_quaternions()
             wrench, imu = self._description.wrench, self._description.imu
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, raw=raw)
-        dt = spacing(t)
-        self._extend_one_sided(dt)
+        dt = mean_time_step(t)
+        self._extend_one_sided_ends(dt)
         raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -236,7 +236,7 @@ class _Reader:
         return Stream(
             "pose",
             t,
-            in_S(R_WS, acceleration - self._description.gravity_W),
+            world_to_S(R_WS, acceleration - self._description.gravity_W),
             *angular_motion(R_WS, dt, self._bandwidth_hz),
             R_WS,
             raw,
@@ -246,13 +246,11 @@ class _Reader:
         """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
-            position = self._vectors("pose", "position", stream.position, table, clock.total)
-            position = clock.select(position)
-        where = f"{self._source}:pose.orientation"
-        orientations = Orientations(
-            self._description, stream.orientation, table, clock.total, where
-        )
-        quaternion = orientations.output(len(clock.rows))
+            position = self._read_vectors("pose", "position", stream.position, table, clock.total)
+            position = clock.select_timed_rows(position)
+        where, form = f"{self._source}:pose.orientation", stream.orientation
+        orientations = Orientations(self._description, form, table, clock.total, where)
+        quaternion = orientations.allocate_quaternions(len(clock.rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK_ROWS):
             part = slice(start, start + _CHUNK_ROWS)
@@ -267,34 +265,34 @@ class _Reader:
             quaternion[part] = q
         return quaternion, position
 
-    def _imu(self, stream: Imu, pose: Stream | None) -> Stream:
-        table = self._table(stream)
-        clock = self._clock("imu", stream, table)
+    def _read_imu(self, stream: Imu, pose: Stream | None) -> Stream:
+        table = self._table_of_stream(stream)
+        clock = self._read_clock_and_gaps("imu", stream, table)
         raw_t, t = clock.t, uniform_times(clock.t)
-        dt = spacing(t)
+        dt = mean_time_step(t)
 
-        def vectors(field: str, sign: float = 1.0) -> Array | None:
+        def imu_vectors(field: str, sign: float = 1.0) -> Array | None:
             quantity = getattr(stream, field)
             if quantity is None:
                 return None
-            values = self._vectors("imu", field, quantity, table, clock.total, sign)
-            values = resample(t, raw_t, clock.select(values))
-            return self._to_S("imu", stream.frame, values, t, pose)
+            values = self._read_vectors("imu", field, quantity, table, clock.total, sign)
+            values = resample(t, raw_t, clock.select_timed_rows(values))
+            return self._rotate_to_S("imu", stream.frame, values, t, pose)
 
-        s = vectors("specific_force", stream.sign)
-        omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
+        s = imu_vectors("specific_force", stream.sign)
+        omega, alpha = imu_vectors("angular_velocity"), imu_vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            self._extend_one_sided(dt)
+            self._extend_one_sided_ends(dt)
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            s = move_to_So(s, np.array(stream.position), t, omega, alpha, pose)
+            s = specific_force_at_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        outside_gaps = raw_t[at] - raw_t[at - 1] < _GAP_RATIO * dt  # outside of gaps
+        outside_gaps = raw_t[at] - raw_t[at - 1] < _MAX_GAP_OVER_STEP * dt  # outside of gaps
         both = (None if x is None else x[outside_gaps] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, inertial=Inertial(t[outside_gaps], *both))
+        return Stream("imu", t, s, omega, alpha, inertial=ImuData(t[outside_gaps], *both))
 
-    def _to_S(
+    def _rotate_to_S(
         self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None
     ) -> Array:
         if isinstance(frame, tuple):
@@ -302,47 +300,47 @@ class _Reader:
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise self._no_orientation(name)
-        return in_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+            raise self._orientation_error(name)
+        return world_to_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
 
-    def _no_orientation(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
+    def _orientation_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         return DrakeTeleopError(
             "base axes cannot be turned to S without an orientation",
             where=f"{self._source}:{name}.frame",
             remedy=remedy,
         )
 
-    def _static(self, stream: Static) -> Log:
-        table = self._table(stream)
-        wrench = self._forces("static", stream, table, table.rows)
+    def _read_static_poses(self, stream: Static) -> Log:
+        table = self._table_of_stream(stream)
+        wrench = self._read_wrench("static", stream, table, table.rows)
         R_SW = None
         if stream.gravity is not None:
-            gravity = self._vectors("static", "gravity", stream.gravity, table, table.rows)
+            gravity = self._read_vectors("static", "gravity", stream.gravity, table, table.rows)
         elif stream.specific_force is not None:
-            s = self._vectors("static", "specific_force", stream.specific_force, table, table.rows)
-            gravity = -s
+            quantity = stream.specific_force
+            gravity = -self._read_vectors("static", "specific_force", quantity, table, table.rows)
         else:
             assert stream.orientation is not None
-            where = f"{self._source}:static.orientation"
-            orientations = Orientations(
-                self._description, stream.orientation, table, table.rows, where
-            )
+            where, form = f"{self._source}:static.orientation", stream.orientation
+            orientations = Orientations(self._description, form, table, table.rows, where)
             R_WS = orientations.rotations(np.arange(table.rows))
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
             if R_SW is None:
                 remedy = "give static.orientation instead of gravity or specific_force"
-                raise self._no_orientation("static", remedy)
-            wrench = wrench_in_S(R_SW, wrench)
+                raise self._orientation_error("static", remedy)
+            wrench = wrench_world_to_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
-            wrench = wrench + weight_wrench(np.array(stream.weight), gravity)
+            wrench = wrench + wrench_of_weight(np.array(stream.weight), gravity)
         n = len(wrench)
-        if n < MINIMUM_POSES:
+        if n < MIN_STATIC_POSES:
             raise DrakeTeleopError(
                 f"{n} poses are too few",
                 where=f"{self._source}:static",
-                remedy=f"record at least {MINIMUM_POSES}, better 12, with different orientations",
+                remedy=(
+                    f"record at least {MIN_STATIC_POSES}, better 12, with different orientations"
+                ),
             )
         rest = np.zeros((n, 3))
         return Log(
@@ -351,33 +349,32 @@ class _Reader:
             source=self._source,
             gain_std=stream.gain_std,
             described=self._description,
-            resolution=self._resolution(stream, table),
+            resolution=self._quantization_step(stream, table),
         )
 
-    def _resolution(self, stream: Static, table: Table) -> tuple[float, float]:
+    def _quantization_step(self, stream: Static, table: Table) -> tuple[float, float]:
         force, torque = (
             decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
-            * (self._description.scale(quantity.unit) * np.abs(quantity.scale).max())
+            * (self._description.si_value(quantity.unit) * np.abs(quantity.scale).max())
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
         )
         return force, torque
 
-    def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        """Return the times of a stream; record notes and gaps of the stream."""
+    def _read_clock_and_gaps(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
         t = clock.t
-        if len(t) < MINIMUM_SAMPLES or len(uniform_times(t)) < MINIMUM_SAMPLES:
+        if len(t) < MIN_STREAM_SAMPLES or len(uniform_times(t)) < MIN_STREAM_SAMPLES:
             raise DrakeTeleopError(
                 f"{len(t)} samples in {table.path.name} are too few",
                 where=f"{self._source}:{name}",
-                remedy=f"record at least {MINIMUM_SAMPLES}, evenly spaced",
+                remedy=f"record at least {MIN_STREAM_SAMPLES}, evenly spaced",
             )
         self._notes += [f"{name}: {note}" for note in clock.notes]
         if stream.topic and stream.time.column == "stamp" and "header.stamp" not in table.columns:
             self._notes.append(
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
-        found_gaps = find_gaps(t, self._bandwidth_hz)
+        found_gaps = find_gaps_in_times(t, self._bandwidth_hz)
         if clock.episodes > 1:
             described = (self._description.wrench, self._description.imu, self._description.pose)
             files = len({stream.source for stream in described if stream is not None})
@@ -389,59 +386,60 @@ class _Reader:
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
         if len(found_gaps):
-            half = self._half_window(float(np.median(np.diff(t))))
+            half = self._half_window_s(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half, half]))
         return clock
 
-    def _half_window(self, dt: float) -> float:
-        window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
+    def _half_window_s(self, dt: float) -> float:
+        window = SMOOTHER_WINDOW_OVER_PERIOD / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
-    def _extend_one_sided(self, dt: float) -> None:
-        self._one_sided_s = max(self._one_sided_s, self._half_window(dt))
+    def _extend_one_sided_ends(self, dt: float) -> None:
+        self._one_sided_s = max(self._one_sided_s, self._half_window_s(dt))
 
-    def _assemble(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
-        def signal(field: str) -> Array:
+    def _make_log(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
+        def signal_on_clock(field: str) -> Array:
             for stream in (imu, pose):
                 values = None if stream is None else getattr(stream, field)
                 if stream is not None and values is not None:
-                    return on_clock(t, stream, values)
+                    return resample_to_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
         gravity = R_WS = None
         described, described_pose = self._description.wrench, self._description.pose
         in_base = described is not None and described.frame == "base"
         if pose is not None and pose.R_WS is not None:
-            R_WS = nearest_rotation(on_clock(t, pose, pose.R_WS))
+            R_WS = nearest_rotation(resample_to_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
             if in_base:
-                wrench = wrench_in_S(np.swapaxes(R_WS, 1, 2), wrench)
+                wrench = wrench_world_to_S(np.swapaxes(R_WS, 1, 2), wrench)
         if in_base and pose is None:
-            raise self._no_orientation("wrench")
+            raise self._orientation_error("wrench")
         accelerometer = imu is not None and imu.specific_force is not None
         if not accelerometer and described_pose and described_pose.position is None:
             self._notes.append(
                 "neither accelerometer nor position: the acceleration of S is taken as zero"
             )
+        names = ("specific_force", "angular_velocity", "angular_acceleration")
+        s, omega, alpha = map(signal_on_clock, names)
         return Log(
-            *(t, wrench, signal("specific_force"), signal("angular_velocity")),
-            signal("angular_acceleration"),
+            *(t, wrench, s, omega, alpha),
             gravity=gravity,
             R_WS=R_WS,
             gravity_W=None if R_WS is None else self._description.gravity_W,
-            bridged=self._bridged(t),
+            bridged=self._flag_bridged_samples(t),
             notes=tuple(self._notes),
             source=self._source,
             one_sided_s=self._one_sided_s,
         )
 
-    def _bridged(self, t: Array) -> NDArray[np.bool_] | None:
+    def _flag_bridged_samples(self, t: Array) -> NDArray[np.bool_] | None:
         if not self._gaps:
             return None
         flags = np.zeros(len(t), bool)
         for start, stop in np.concatenate(self._gaps):
             flags[slice(*np.searchsorted(t, [start, stop]))] = True
-        if (~flags).sum() < MINIMUM_SAMPLES:
+        if (~flags).sum() < MIN_STREAM_SAMPLES:
             raise DrakeTeleopError(
                 f"only {int((~flags).sum())} samples are outside of gaps",
                 where=self._source,

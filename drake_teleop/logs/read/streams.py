@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import (
-    WIDTHS,
+    NUM_COLUMNS_OF_FORM,
     nearest_rotation,
     quaternions_of,
     rotation_error,
     rotation_matrices,
 )
-from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.read.alignment import low_pass, resample, spacing, uniform_times
+from drake_teleop.logs.pose_motion.poses import ImuData, Poses
+from drake_teleop.logs.read.alignment import low_pass, mean_time_step, resample, uniform_times
 from drake_teleop.logs.read.description import Description, Orientation
 from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.tables import Table
 
-MINIMUM_SAMPLES = 16
+MIN_STREAM_SAMPLES = 16
 MAX_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
@@ -50,31 +50,31 @@ class Stream:
     angular_acceleration: Array | None = None
     R_WS: Array | None = None
     raw: Poses | None = None
-    inertial: Inertial | None = None
+    inertial: ImuData | None = None
 
     @property
     def dt(self) -> float:
-        return spacing(self.t)
+        return mean_time_step(self.t)
 
 
-def on_clock(t: Array, stream: Stream, values: Array) -> Array:
+def resample_to_clock(t: Array, stream: Stream, values: Array) -> Array:
     """Return `values` of a stream at times `t` [s], low-passed if the stream is faster."""
-    rate = 1 / spacing(t)
+    rate = 1 / mean_time_step(t)
     faster = stream.dt * rate < 0.9
     return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
 
 
-def in_S(R_WS: Array, vectors_W: Array) -> Array:
+def world_to_S(R_WS: Array, vectors_W: Array) -> Array:
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
-def wrench_in_S(R_SW: Array, wrench_W: Array) -> Array:
+def wrench_world_to_S(R_SW: Array, wrench_W: Array) -> Array:
     """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
 
 
-def move_to_So(
+def specific_force_at_So(
     s: Array,
     p_SoIo_S: Array,
     t: Array,
@@ -103,12 +103,12 @@ class Orientations:
         where: str,
     ) -> None:
         self._orientation, self._table, self._where = orientation, table, where
-        width = WIDTHS[orientation.form]
+        width = NUM_COLUMNS_OF_FORM[orientation.form]
         self._columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
         if orientation.form in ("rotation_vector", "euler"):
-            self._columns *= description.scale(orientation.unit)
+            self._columns *= description.si_value(orientation.unit)
 
-    def output(self, count: int) -> Array:
+    def allocate_quaternions(self, count: int) -> Array:
         """Return memory (count, 4) for quaternions of increasing rows; it may be the columns'."""
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
@@ -136,7 +136,7 @@ class Orientations:
     def _check_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
-            row = self._table.line(rows[worst])
+            row = self._table.line_in_file(rows[worst])
             raise DrakeTeleopError(
                 f"row {row} of {self._table.path.name} is not a rotation",
                 where=self._where,
@@ -144,7 +144,7 @@ class Orientations:
             )
 
 
-def common_time(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
+def common_time_of_streams(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
     """Return uniform times at the wrench's rate, within the time spans of all streams."""
     start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
     stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
@@ -159,14 +159,14 @@ def common_time(wrench_t: Array, streams: Sequence[Stream], source: str) -> Arra
             remedy="check time.unit of each stream, or shift its clock by time.offset",
         )
     uniform = uniform_times(wrench_t)
-    dt = spacing(uniform)
+    dt = mean_time_step(uniform)
     # Rounding of the clocks must not exclude the first and last sample.
     inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
     t = uniform[inside]
-    if len(t) < MINIMUM_SAMPLES:
+    if len(t) < MIN_STREAM_SAMPLES:
         raise DrakeTeleopError(
             f"the streams have only {len(t)} samples in common ({spans})",
             where=source,
-            remedy=f"record at least {MINIMUM_SAMPLES}, or check time.offset",
+            remedy=f"record at least {MIN_STREAM_SAMPLES}, or check time.offset",
         )
     return t

@@ -27,8 +27,8 @@ from drake_teleop.logs.read.tables import Table
 if TYPE_CHECKING:
     import polars as pl
 
-_TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
-_CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
+_TEXT_SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log")
+_CANONICAL_NAMES = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _Column = TypeVar("_Column")
 _MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
 _MAX_CELLS_IN_MEMORY = 2**24
@@ -40,12 +40,12 @@ def read_table(path: Path, *, header: bool = True) -> Table:
 
     The columns of a text file without header are named from "0" on.
     """
-    kind = FORMATS.check(path.suffix.lower(), str(path))
+    kind = TABLE_READERS.check(path.suffix.lower(), str(path))
     if not (os.path.isdir if kind == ".zarr" else os.path.isfile)(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     refuse_fork()
     with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
-        columns = _read_text(path, header) if kind in _TEXT else FORMATS[kind](path)
+        columns = _read_text(path, header) if kind in _TEXT_SUFFIXES else TABLE_READERS[kind](path)
         table = columns if isinstance(columns, Table) else Table(path, columns)
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
@@ -57,7 +57,7 @@ def _read_text(path: Path, header: bool = True) -> Table:
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_to_numpy(series) for series in frame.get_columns()]
     columns = dict(zip(_strip_names(names), found, strict=True))
-    return Table(path, _with_canonical(columns), first_row)
+    return Table(path, _add_canonical_names(columns), first_row)
 
 
 def _strip_names(names: list[str]) -> list[str]:
@@ -67,15 +67,13 @@ def _strip_names(names: list[str]) -> list[str]:
     return stripped
 
 
-def _with_canonical(columns: dict[str, _Column]) -> dict[str, _Column]:
-    """Add lower-case column names if the table is a canonical log."""
+def _add_canonical_names(columns: dict[str, _Column]) -> dict[str, _Column]:
     small = {name.lower(): column for name, column in columns.items()}
-    canonical = len(small) == len(columns) and _CANONICAL.issubset(small)
-    return small | columns if canonical and not _CANONICAL.issubset(columns) else columns
+    canonical = len(small) == len(columns) and _CANONICAL_NAMES.issubset(small)
+    return small | columns if canonical and not _CANONICAL_NAMES.issubset(columns) else columns
 
 
 def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
-    """Return the columns of a file that polars reads; a large Parquet file is read on access."""
     import polars as pl
 
     kind = path.suffix.lower()
@@ -94,7 +92,7 @@ def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
     return _collect_columns(frame, columns)
 
 
-def expanded_columns(frame: pl.LazyFrame) -> dict[str, NDArray]:
+def columns_with_nested(frame: pl.LazyFrame) -> dict[str, NDArray]:
     """Return the columns of a frame by name, and elements of lists and structures as columns.
 
     Columns of text and binary data, such as images, are omitted.
@@ -115,9 +113,9 @@ def _column_expressions(frame: pl.LazyFrame) -> dict[str, pl.Expr]:
 
     columns: dict[str, pl.Expr] = {}
     for name, dtype in frame.collect_schema().items():
-        columns |= _expand(name.strip(), pl.col(name), dtype, frame)
+        columns |= _expand_nested_column(name.strip(), pl.col(name), dtype, frame)
     _strip_names(list(frame.collect_schema()))
-    return _with_canonical(columns)
+    return _add_canonical_names(columns)
 
 
 def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[str, NDArray]:
@@ -125,14 +123,16 @@ def _collect_columns(frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> dict[s
     return {series.name: _to_numpy(series) for series in whole.get_columns()}
 
 
-def _expand(label: str, column: pl.Expr, dtype: Any, frame: pl.LazyFrame) -> dict[str, pl.Expr]:
+def _expand_nested_column(
+    label: str, column: pl.Expr, dtype: Any, frame: pl.LazyFrame
+) -> dict[str, pl.Expr]:
     import polars as pl
 
     if isinstance(dtype, pl.Struct):
         parts: dict[str, pl.Expr] = {}
         for field in dtype.fields:
             of_field = column.struct.field(field.name)
-            parts |= _expand(f"{label}.{field.name}", of_field, field.dtype, frame)
+            parts |= _expand_nested_column(f"{label}.{field.name}", of_field, field.dtype, frame)
         return parts
     if isinstance(dtype, pl.List):
         lengths = frame.select(column.list.len().drop_nulls().unique()).collect().to_series()
@@ -223,23 +223,23 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
 _Arrays = Callable[[Path], dict[str, NDArray]]
 
 
-def _arrays(read: _Arrays) -> _Arrays:
+def _columns_reader(read: _Arrays) -> _Arrays:
     return lambda path: array_columns(read(path))
 
 
-FORMATS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(
+TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] = Registry(
     "log format",
     {
-        **dict.fromkeys(_TEXT, _read_text),
+        **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
         **dict.fromkeys(
             (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _frame_columns
         ),
-        ".npz": _arrays(_read_npz),
-        ".npy": _arrays(_read_npy),
-        ".mat": _arrays(read_mat),
-        ".h5": _arrays(_read_hdf5),
-        ".hdf5": _arrays(_read_hdf5),
-        ".zarr": _arrays(_read_zarr),
+        ".npz": _columns_reader(_read_npz),
+        ".npy": _columns_reader(_read_npy),
+        ".mat": _columns_reader(read_mat),
+        ".h5": _columns_reader(_read_hdf5),
+        ".hdf5": _columns_reader(_read_hdf5),
+        ".zarr": _columns_reader(_read_zarr),
     },
 )
 """Readers of files by suffix; a reader returns columns by name."""

@@ -42,11 +42,11 @@ class Table:
     whole: Table | None = None
     kept: NDArray[np.intp] | None = None
 
-    def line(self, row: int) -> int:
+    def line_in_file(self, row: int) -> int:
         """Return the number in the file of a row of this table, for messages."""
         return self.first_row + int(row if self.kept is None else self.kept[row])
 
-    def filled(self, names: Sequence[str | int]) -> Table:
+    def rows_with_numbers(self, names: Sequence[str | int]) -> Table:
         """Return the rows in which at least one of the named columns has a number."""
         names = [str(name) for name in names if str(name) in self.columns]
         if not names or np.isfinite(self.raw(names[0], "")).all():
@@ -71,7 +71,7 @@ class Table:
         """Return the numbers (N, width) of the named columns, side by side."""
         out, found = np.empty((0, width)), 0
         for name in names:  # one after the other, to save memory
-            column = self._column(str(name), where)
+            column = self._finite_column(str(name), where)
             rows = len(column) if rows is None else rows
             self._check_rows([name], [column], where, rows)
             out = out if found else np.empty((rows, width))
@@ -98,7 +98,7 @@ class Table:
                     remedy="name columns that belong together",
                 )
 
-    def all_raw(self, names: Sequence[str | int], where: str) -> Array:
+    def raw_side_by_side(self, names: Sequence[str | int], where: str) -> Array:
         columns = [self.raw(name, where) for name in names]
         self._check_rows(names, columns, where, None)
         return np.hstack(columns)
@@ -107,14 +107,14 @@ class Table:
         """Return the numbers (N, k) of a column, with NaN and infinity; errors name `where`."""
         name = str(name)
         if name not in self.columns:
-            return self._column(name, where)
+            return self._finite_column(name, where)
         column = self.columns[name]
-        numbers = _as_numbers(column, partial(self._cell_error, name))
+        numbers = _column_to_numbers(column, partial(self._cell_error, name))
         numbers = numbers.reshape(len(column), math.prod(numbers.shape[1:]))
         self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
-    def single(self, name: str | int, where: str) -> Array:
+    def single_column(self, name: str | int, where: str) -> Array:
         """Return the numbers (N,) of a column, with NaN and infinity."""
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
@@ -141,13 +141,13 @@ class Table:
             first = int(np.argmax(bad))
             worst = values[first][np.argmax(np.abs(values[first]))]
             raise DrakeTeleopError(
-                f"{worst:g} {unit}".rstrip() + f" in row {self.line(first)} of"
+                f"{worst:g} {unit}".rstrip() + f" in row {self.line_in_file(first)} of"
                 f" {self.path.name} is outside {-largest:g} to {largest:g}",
                 where=where,
                 remedy=remedy,
             )
 
-    def _column(self, name: str, where: str) -> Array:
+    def _finite_column(self, name: str, where: str) -> Array:
         if name not in self.columns:
             if name.rpartition(".")[0] in self.absent:
                 raise DrakeTeleopError(
@@ -167,7 +167,8 @@ class Table:
         if bad.any():
             first = int(np.argmax(bad))
             raise DrakeTeleopError(
-                f"no finite number in {int(bad.sum())} rows, the first is row {self.line(first)}",
+                f"no finite number in {int(bad.sum())} rows, the first is row"
+                f" {self.line_in_file(first)}",
                 where=f"{self.path}:{name}",
                 remedy="cut the log before it or repair the rows",
             )
@@ -175,7 +176,7 @@ class Table:
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(
-            f"{cell!r} in row {self.line(row)} is not a number",
+            f"{cell!r} in row {self.line_in_file(row)} is not a number",
             where=f"{self.path}:{name}",
             remedy="correct the cell or delete the row"
             + (
@@ -207,7 +208,7 @@ class _SelectedRows(UserDict[str, Any]):
         return column[self._rows] if self._rows[-1] < len(column) else column
 
 
-def _as_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleopError]) -> Array:
+def _column_to_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleopError]) -> Array:
     if column.dtype.kind in "fiu":
         return column.astype(float, copy=False)
     if column.dtype.kind in "mM":  # seconds, since 1970 or midnight

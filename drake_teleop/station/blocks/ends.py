@@ -19,18 +19,18 @@ from pydrake.systems.framework import (
 from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import finite_array
 from drake_teleop.station.channel.channel import (
-    PORTS,
-    SHORTEST_TIMEOUT,
-    initial_ends,
-    master_end,
-    slave_end,
+    MIN_TIMEOUT_S,
+    NUM_PORT_SIGNALS,
+    initial_state_of_ends,
+    step_master_end,
+    step_slave_end,
 )
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 
-class _PassivityEnd(DoubleOnly, LeafSystem):
+class _PassivityEndBlock(DoubleOnly, LeafSystem):
     """Base class of both ends of a passivity method.
 
     Args:
@@ -54,18 +54,18 @@ class _PassivityEnd(DoubleOnly, LeafSystem):
         R_WB: ArrayLike | None = None,
         scales: ArrayLike = (1.0, 1.0),
         force_scale: float = 1.0,
-        timeout: float = SHORTEST_TIMEOUT,
+        timeout: float = MIN_TIMEOUT_S,
     ) -> None:
         super().__init__()
         start, scales = finite_array("start", start, 7), finite_array("scales", scales, 2)
         rotation = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
-        parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
+        parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         frame = np.concatenate([rotation.ravel(), scales])
         self._method = methods.steps_of(passivity.method)
         self._constants = period, timeout, frame, parameters
-        ends = initial_ends(passivity.method, parameters, start)
+        ends = initial_state_of_ends(passivity.method, parameters, start)
         # Ends, command, port energies, rendered wrench and contact flag, packet.
-        results = [ends, start, np.zeros(PORTS), np.zeros(7), np.zeros(PACKET_SIZE)]
+        results = [ends, start, np.zeros(NUM_PORT_SIGNALS), np.zeros(7), np.zeros(PACKET_SIZE)]
         self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
         self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUTS]
         self._groups = [int(self.DeclareDiscreteState(part)) for part in results[:3]]
@@ -94,19 +94,19 @@ class _PassivityEnd(DoubleOnly, LeafSystem):
         ]
         self._run(inputs, np.ascontiguousarray(received[:-1]), bool(received[-1] > 0.5), *parts)
 
-    def _results(self, context: Context) -> list[Any]:
+    def _step_results(self, context: Context) -> list[Any]:
         results: list[Any] = self.get_cache_entry(self._step).Eval(context)
         return results
 
     def _calc_packet(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._results(context)[-1])
+        output.SetFromVector(self._step_results(context)[-1])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._results(context), self._groups, strict=False):
+        for part, group in zip(self._step_results(context), self._groups, strict=False):
             discrete_state.set_value(group, part)
 
 
-class PassivityAtMaster(_PassivityEnd):
+class PassivityAtMaster(_PassivityEndBlock):
     """Master's end of a passivity method: renders a wrench, sends pose and energy.
 
     .. pydrake_system::
@@ -136,13 +136,13 @@ class PassivityAtMaster(_PassivityEnd):
     ) -> None:  # fmt: skip
         work = ports[:2]
         constants = *self._constants, ends, work, packet, wrench
-        master_end(self._method, *inputs, received, fresh, *constants)
+        step_master_end(self._method, *inputs, received, fresh, *constants)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._results(context)[3][:6])
+        output.SetFromVector(self._step_results(context)[3][:6])
 
 
-class PassivityAtSlave(_PassivityEnd):
+class PassivityAtSlave(_PassivityEndBlock):
     """Slave's end of a passivity method: commands a pose, sends wrench and energy.
 
     .. pydrake_system::
@@ -178,4 +178,4 @@ class PassivityAtSlave(_PassivityEnd):
         *values, saturated, contact = inputs
         flags = bool(saturated[0] > 0.5), float(contact[0])
         constants = *self._constants, ends, pose, ports, packet
-        slave_end(self._method, *values, *flags, received, fresh, *constants)
+        step_slave_end(self._method, *values, *flags, received, fresh, *constants)

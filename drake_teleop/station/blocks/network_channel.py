@@ -65,8 +65,8 @@ class NetworkChannel(DoubleOnly, LeafSystem):
                 where="NetworkChannel.silence",
                 remedy="set silence: hold, or use a passivity method",
             )
-        self._parameters = network.parameters(config, seed, direction, period, least=1)
-        parts = network.initial_state(self._parameters, np.zeros(size))
+        self._parameters = network.network_parameters(config, seed, direction, period, least=1)
+        parts = network.initial_network_state(self._parameters, np.zeros(size))
         state = [*parts, np.zeros(1), np.zeros(size + 1)]
         self._packet = self.DeclareVectorInputPort("packet", size)
         self._groups = [int(self.DeclareDiscreteState(part)) for part in state]
@@ -90,17 +90,17 @@ class NetworkChannel(DoubleOnly, LeafSystem):
             part[:] = context.get_discrete_state(group).value()
         receiver, in_transit, count, received = parts
         k, line = int(count[0]), (receiver, in_transit)
-        network.send(self._parameters, line, k, self._packet.Eval(context))
-        _, fresh = network.receive(self._parameters, line, k + 1, received[:-1])
+        network.send_packet(self._parameters, line, k, self._packet.Eval(context))
+        _, fresh = network.receive_packet(self._parameters, line, k + 1, received[:-1])
         count[0], received[-1] = k + 1, fresh
 
-    def _parts(self, context: Context) -> list[Array]:
+    def _split_state(self, context: Context) -> list[Array]:
         parts: list[Array] = self.get_cache_entry(self._step).Eval(context)
         return parts
 
     def _calc_arriving(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._parts(context)[-1])
+        output.SetFromVector(self._split_state(context)[-1])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._parts(context), self._groups, strict=True):
+        for part, group in zip(self._split_state(context), self._groups, strict=True):
             discrete_state.set_value(group, part)

@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, LeafSystem
 from drake_teleop.common.blocks import DoubleOnly
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.load.regressor import BEFORE_JOINTS, SPECIFIC_FORCE, sample_parts
+from drake_teleop.load.regressor import FIRST_JOINT_INDEX, SAMPLE_SPECIFIC_FORCE, signals_of_sample
 from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
@@ -19,11 +19,11 @@ class _SamplePorts:
     """Ports of a sample's parts, in place of the port `sample`."""
 
     def __init__(self, system: LeafSystem) -> None:
-        sizes = list(sample_parts(0).items())[:-1]
+        sizes = list(signals_of_sample(0).items())[:-1]
         self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
 
     def Eval(self, context: Context) -> Array:
-        sample, first = np.zeros(BEFORE_JOINTS), 0
+        sample, first = np.zeros(FIRST_JOINT_INDEX), 0
         for port in self._ports:
             # Unconnected: `saturated` is 0.
             if port.size() > 1 or port.HasValue(context):
@@ -72,7 +72,7 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
             finite_array("noise_std", noise_std, 6),
             np.zeros(9) if motion_std is None else finite_array("motion_std", motion_std, 9),
             period,
-            BEFORE_JOINTS,
+            FIRST_JOINT_INDEX,
             np.zeros(16) if initial is None else finite_array("initial", initial, 16),
         )
 
@@ -123,7 +123,7 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
 
     def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
         gravity = self._orientation.Eval(context).reshape(3, 3).T @ self._gravity_W
-        acceleration = sample[SPECIFIC_FORCE] + gravity
+        acceleration = sample[SAMPLE_SPECIFIC_FORCE] + gravity
         return bool(
             contact_detection.update_flag(memory, sample, estimate, acceleration, self._settings)
         )

@@ -16,21 +16,21 @@ from drake_teleop.common.numeric import finite_array
 from drake_teleop.load.compensation import (
     add_weight_into,
     scaled_wrench_into,
-    unknown_gravity,
+    unknown_gravity_error,
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
 
 _GRAVITY_W = (0.0, 0.0, -9.81)
-_MOTION = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+_MOTION_PORTS = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
-def _for_scalar(function: Any, T: Any) -> Callable[..., None]:
+def _function_for_scalar_type(function: Any, T: Any) -> Callable[..., None]:
     """Return the compiled function for double, its Python source for other scalar types."""
     return function if T is float else function.py_func
 
 
-def _vector(T: Any, size: int) -> Any:
+def _basic_vector_of_type(T: Any, size: int) -> Any:
     return np.zeros(size) if T is float else np.full(size, T(0.0), dtype=object)
 
 
@@ -60,7 +60,7 @@ def NonContactWrench_(T: Any) -> Any:
             LeafSystem_[T].__init__(self, converter)
             self._phi = np.zeros(10) if phi is None else finite_array("phi", phi, 10)
             self._parameter = self.DeclareNumericParameter(BasicVector_[T](self._phi))
-            self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION]
+            self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION_PORTS]
             self._load = self.DeclareVectorInputPort("load", 10)
             inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
             calculate = weak_callback(self._calc)
@@ -74,9 +74,9 @@ def NonContactWrench_(T: Any) -> Any:
                 phi = self._load.Eval(context)
             else:
                 phi = context.get_numeric_parameter(self._parameter).CopyToVector()
-            wrench = _vector(T, 6)
+            wrench = _basic_vector_of_type(T, 6)
             motion = [port.Eval(context) for port in self._motion]
-            _for_scalar(non_contact_wrench_into, T)(*motion, phi, wrench)
+            _function_for_scalar_type(non_contact_wrench_into, T)(*motion, phi, wrench)
             output.SetFromVector(wrench)
 
     return Impl
@@ -124,7 +124,7 @@ def WrenchScaling_(T: Any) -> Any:
             self._config = config = ForceScalingConfig() if config is None else config
             self._R_WB = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
             self._gravity_W, self._scales = finite_array("gravity_W", gravity_W, 3), config.scales()
-            ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION)]
+            ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION_PORTS)]
             ports += [("load_estimate", 16), ("R_WS", 9)]
             inputs = [self.DeclareVectorInputPort(*port) for port in ports]
             self._inputs, self._orientation = inputs[:-1], inputs[-1]
@@ -141,8 +141,8 @@ def WrenchScaling_(T: Any) -> Any:
 
         def _scaled(self, context: Any, scales: tuple[float, float, float]) -> Any:
             measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
-            wrench = _vector(T, 6)
-            _for_scalar(scaled_wrench_into, T)(
+            wrench = _basic_vector_of_type(T, 6)
+            _function_for_scalar_type(scaled_wrench_into, T)(
                 measured, estimate[:6], s, omega, alpha, *self._parts(estimate), *scales, wrench
             )
             return wrench
@@ -167,10 +167,10 @@ def WrenchScaling_(T: Any) -> Any:
             excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
             if any(excess):
                 if not self._orientation.HasValue(context):
-                    raise unknown_gravity("WrenchScaling: gravity in S", "connect R_WS")
+                    raise unknown_gravity_error("WrenchScaling: gravity in S", "connect R_WS")
                 gravity = self._R_WS(context).T @ self._gravity_W
                 parts = self._parts(self._inputs[-1].Eval(context))
-                _for_scalar(add_weight_into, T)(gravity, *parts, *excess, wrench)
+                _function_for_scalar_type(add_weight_into, T)(gravity, *parts, *excess, wrench)
             return wrench
 
         def _calc_to_master(self, context: Any, output: Any) -> None:
@@ -180,9 +180,11 @@ def WrenchScaling_(T: Any) -> Any:
                     where="WrenchScaling.wrench_to_master",
                     remedy="connect the orientation of S",
                 )
-            wrench, k = _vector(T, 6), self._config.force_scale
+            wrench, k = _basic_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)
-            _for_scalar(wrench_to_master_into, T)(scaled, R_WS, self._R_WB, k, k, wrench)
+            _function_for_scalar_type(wrench_to_master_into, T)(
+                scaled, R_WS, self._R_WB, k, k, wrench
+            )
             output.SetFromVector(wrench)
 
     return Impl

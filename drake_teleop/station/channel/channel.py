@@ -22,31 +22,37 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.memory import FILL_TIME, LIMIT, LOAD_WRENCH, MEMORY_SIZE, Slots
+from drake_teleop.station.passivity.memory import (
+    FILL_TIME,
+    LOAD_WRENCH,
+    MEMORY_SIZE,
+    WRENCH_LIMIT,
+    SlotAllocator,
+)
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import (
     CONTACT_FLAG,
     INPUTS_FINITE,
     LOAD,
     PACKET_SIZE,
-    dot,
+    dot_of_group,
     pose_difference_into,
 )
 from drake_teleop.station.passivity.safe_state import (
-    MASTER_WATCH,
+    MASTER_MONITOR_SIZE,
     SILENCE_S,
-    SLAVE_WATCH,
-    STOP_TIME,
-    initial_master_watch,
-    initial_slave_watch,
+    SLAVE_MONITOR_SIZE,
+    STOP_TIME_S,
+    initial_master_monitor,
+    initial_slave_monitor,
     master_limits_into,
     slave_command_into,
 )
 
-_NETWORKS = ("custom", *PRESETS)
+_NETWORK_NAMES = ("custom", *PRESETS)
 _DIRECTIONS = (network.FORWARD, network.BACKWARD)
 #: Smallest default and largest timeout [s].
-SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 0.1, 1.0
+MIN_TIMEOUT_S, MAX_TIMEOUT_S = 0.1, 1.0
 _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 
 
@@ -56,7 +62,7 @@ class Channel(NetworkConfig):
     """Network between master and slave: a preset, or `custom` with the fields of this block."""
 
     network: str = choice(
-        "custom", _NETWORKS, "a preset, or custom for the network of these fields"
+        "custom", _NETWORK_NAMES, "a preset, or custom for the network of these fields"
     )
     backward: NetworkConfig | None = plain(
         None, "network from slave to master; null: as from master to slave"
@@ -65,12 +71,12 @@ class Channel(NetworkConfig):
         None,
         "s",
         1e-3,
-        LONGEST_TIMEOUT,
+        MAX_TIMEOUT_S,
         "silence after which an end enters its safe state; null: 1.5 times the longest silence in "
         "a minute of this network, at least 0.1 s",
     )
 
-    def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
+    def networks_of_directions(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
         """Return the networks of both directions: forward (master to slave) and backward."""
         names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
@@ -84,63 +90,72 @@ class Channel(NetworkConfig):
             )
         return PRESETS[self.network], PRESETS[self.network]
 
-    def silent_after(self, period: float) -> float:
+    def timeout_s(self, period: float) -> float:
         """Return the silence [s] that starts the safe state, for a packet every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         longest = [
             network.longest_silence(line, direction, period)
-            for line, direction in zip(self.lines(), _DIRECTIONS, strict=True)
+            for line, direction in zip(self.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
-        return min(max(_TIMEOUT_FACTOR * max(longest), SHORTEST_TIMEOUT), LONGEST_TIMEOUT)
+        return min(max(_TIMEOUT_FACTOR * max(longest), MIN_TIMEOUT_S), MAX_TIMEOUT_S)
 
 
 # State of both ends in one array.
-_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_WATCH + SLAVE_WATCH
-_places = Slots(_SIZE)
-_STEP = _places.number()  # number of the step
-_POSE_M = _places.vector(8)  # last finite command (7); 1 if the newest command is not finite
-_POSE_S = _places.vector(8)  # pose of the slave, likewise
-_WRENCH_M = _places.vector(6)  # wrench rendered since the last step
-_WRENCH_S = _places.vector(6)  # slave's wrench at the last step
-_VALID_TIME = _places.number()  # time with valid wrenches [s]
-_WATCH_M, _WATCH_S = _places.vector(MASTER_WATCH), _places.vector(SLAVE_WATCH)
-MEMORY_M, MEMORY_S = _places.vector(MEMORY_SIZE), _places.vector(MEMORY_SIZE)
+_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_MONITOR_SIZE
+_slots = SlotAllocator(_STATE_SIZE)
+_STEP_COUNT = _slots.number()  # number of the step
+_LAST_POSE_AT_MASTER = _slots.vector(
+    8
+)  # last finite command (7); 1 if the newest command is not finite
+_LAST_POSE_AT_SLAVE = _slots.vector(8)  # pose of the slave, likewise
+_RENDERED_WRENCH = _slots.vector(6)  # wrench rendered since the last step
+_VALID_WRENCH_AT_SLAVE = _slots.vector(6)  # slave's wrench at the last step
+_VALID_TIME = _slots.number()  # time with valid wrenches [s]
+_MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = (
+    _slots.vector(MASTER_MONITOR_SIZE),
+    _slots.vector(SLAVE_MONITOR_SIZE),
+)
+MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _slots.vector(MEMORY_SIZE), _slots.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world, one array.
-_places = Slots(11)
-_ROTATION = _places.vector(9)  # R_WB by rows
-_SCALES = _places.vector(2)  # of translation and rotation
+_slots = SlotAllocator(11)
+_ROTATION = _slots.vector(9)  # R_WB by rows
+_SCALES = _slots.vector(2)  # of translation and rotation
 # Recorded values, see `ports` of `TeleopChannel`.
-PORTS = 8
-_places = Slots(PORTS)
-_WORK_M, _WORK_S, _SILENCE = _places.vector(2), _places.vector(2), _places.vector(2)
-_WORK_C = _places.vector(2)
+NUM_PORT_SIGNALS = 8
+_slots = SlotAllocator(NUM_PORT_SIGNALS)
+_WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH, _SILENCE = (
+    _slots.vector(2),
+    _slots.vector(2),
+    _slots.vector(2),
+)
+_WORK_ALONG_COMMAND = _slots.vector(2)
 # Received values at the master.
-_places = Slots(7)
-_RENDERED, _CONTACT_FLAG = _places.vector(6), _places.number()
+_slots = SlotAllocator(7)
+_RENDERED, _CONTACT_FLAG = _slots.vector(6), _slots.number()
 
 # Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
 # takes its step before the slave.
 _MIN_DELAY = 1
-_NO_LOAD = np.zeros(6)
+_NO_LOAD_WRENCH = np.zeros(6)
 
 
-def initial_ends(
+def initial_state_of_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the state of both ends before their first step; `start` (7,) is the slave's X_WS."""
-    ends = np.zeros(_SIZE)
-    ends[_POSE_M][:7] = ends[_POSE_S][:7] = start
-    ends[_VALID_TIME] = STOP_TIME
-    ends[_WATCH_M] = initial_master_watch()
-    ends[_WATCH_S] = initial_slave_watch(start)
-    memory = methods.initial_memory(method, parameters, start)
-    ends[MEMORY_M] = ends[MEMORY_S] = memory
+    ends = np.zeros(_STATE_SIZE)
+    ends[_LAST_POSE_AT_MASTER][:7] = ends[_LAST_POSE_AT_SLAVE][:7] = start
+    ends[_VALID_TIME] = STOP_TIME_S
+    ends[_MASTER_SILENCE_MONITOR] = initial_master_monitor()
+    ends[_SLAVE_SILENCE_MONITOR] = initial_slave_monitor(start)
+    memory = methods.initial_method_memory(method, parameters, start)
+    ends[MASTER_METHOD_MEMORY] = ends[SLAVE_METHOD_MEMORY] = memory
     return ends
 
 
 @njit(cache=True)
-def channel_step(
+def step_channel(
     steps,
     pose_command,
     wrench_B,
@@ -175,42 +190,45 @@ def channel_step(
         ports: (PORTS,) port energies, updated; times without packets, written.
         wrench_received: (7,) written: F_E_B to render, and contact flag of the newest packet.
     """
-    k = int(ends[_STEP])
-    ends[_STEP] += 1.0
+    k = int(ends[_STEP_COUNT])
+    ends[_STEP_COUNT] += 1.0
     received, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
-    _, fresh = network.receive(backward_parameters, backward, k, received)
-    master_end(
+    _, fresh = network.receive_packet(backward_parameters, backward, k, received)
+    step_master_end(
         steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends,
-        ports[_WORK_M], packet, wrench_received,
+        ports[_WORK_OF_HAND], packet, wrench_received,
     )  # fmt: skip
-    network.send(forward_parameters, forward, k, packet)
-    _, fresh = network.receive(forward_parameters, forward, k + 1, received)
-    slave_end(
+    network.send_packet(forward_parameters, forward, k, packet)
+    _, fresh = network.receive_packet(forward_parameters, forward, k + 1, received)
+    step_slave_end(
         steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
-    network.send(backward_parameters, backward, k, packet)
-    ports[_SILENCE][0], ports[_SILENCE][1] = ends[_WATCH_M][SILENCE_S], ends[_WATCH_S][SILENCE_S]
+    network.send_packet(backward_parameters, backward, k, packet)
+    ports[_SILENCE][0], ports[_SILENCE][1] = (
+        ends[_MASTER_SILENCE_MONITOR][SILENCE_S],
+        ends[_SLAVE_SILENCE_MONITOR][SILENCE_S],
+    )
 
 
 @njit(cache=True)
-def master_end(
+def step_master_end(
     steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends, work, packet,
     wrench_received,
 ):  # fmt: skip
-    """Run one step of the master's end; arguments are those of `channel_step`.
+    """Run one step of the master's end; arguments are those of `step_channel`.
 
     `received` is the slave's newest packet, `fresh` is True if it is new. The energy input of the
     hand is added to `work` (2,) [J].
     """
-    before, held = ends[_POSE_M], ends[_WRENCH_M]
-    watch, memory = ends[_WATCH_M], ends[MEMORY_M]
+    before, held = ends[_LAST_POSE_AT_MASTER], ends[_RENDERED_WRENCH]
+    watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
     valid = _increment_into(pose_command, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        work[g] -= dot(held, dx, g)
+        work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
     if all_in_range(hand_B):
         _wrench_to_world(hand_B, frame, hand)
@@ -218,7 +236,7 @@ def master_end(
         valid = False
     healthy = fresh and received[INPUTS_FINITE] > 0.5
     fault = (fresh and not healthy) or not valid
-    master_limits_into(healthy, fault, T, timeout, parameters[LIMIT], held, watch, limits)
+    master_limits_into(healthy, fault, T, timeout, parameters[WRENCH_LIMIT], held, watch, limits)
     methods.master_step(
         steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
         packet,
@@ -230,20 +248,25 @@ def master_end(
 
 
 @njit(cache=True)
-def slave_end(
+def step_slave_end(
     steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
-    """Run one step of the slave's end; arguments are those of `channel_step` and `master_end`."""
-    before, held = ends[_POSE_S], ends[_WRENCH_S]
-    watch, memory, work = ends[_WATCH_S], ends[MEMORY_S], ports[_WORK_S]
+    """Run one step of the slave's end; arguments are those of `step_channel` and"
+    " `step_master_end`."""
+    before, held = ends[_LAST_POSE_AT_SLAVE], ends[_VALID_WRENCH_AT_SLAVE]
+    watch, memory, work = (
+        ends[_SLAVE_SILENCE_MONITOR],
+        ends[SLAVE_METHOD_MEMORY],
+        ports[_WORK_OF_SLAVE_WRENCH],
+    )
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
     command, left = np.empty(13), pose_received.copy()
     valid = _increment_into(slave_pose, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        work[g] += dot(held, dx, g)
+        work[g] += dot_of_group(held, dx, g)
     load = memory[LOAD_WRENCH]
     if not (all_in_range(wrench_B) and all_in_range(load_B)):
         valid = False
@@ -253,7 +276,7 @@ def slave_end(
     else:
         # Blend from the kept wrench to the measured one.
         _wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(STOP_TIME - ends[_VALID_TIME], T)
+        share = T / max(STOP_TIME_S - ends[_VALID_TIME], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _wrench_to_world(load_B, frame, wrench)
@@ -274,7 +297,7 @@ def slave_end(
     methods.record_command(steps, requested, pose_received, before[:7], twist, parameters, memory)
     pose_difference_into(pose_received, left, dx)
     for g in range(2):
-        ports[_WORK_C][g] += dot(held, dx, g)
+        ports[_WORK_ALONG_COMMAND][g] += dot_of_group(held, dx, g)
 
 
 @njit(cache=True)
@@ -360,16 +383,16 @@ class TeleopChannel(LeafSystem):
         # A motion scale of zero transfers no energy; any unit is valid.
         scales = np.where(scales > 0.0, scales, 1.0)
         lines = [
-            network.parameters(line, seed, direction, period, least=_MIN_DELAY)
-            for line, direction in zip(channel.lines(), _DIRECTIONS, strict=True)
+            network.network_parameters(line, seed, direction, period, least=_MIN_DELAY)
+            for line, direction in zip(channel.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
-        parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
+        parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
         self._steps = methods.steps_of(passivity.method)
         self._uses_load = methods.METHODS[passivity.method].needs_load_apart
         self._constants = (
             *(
                 period,
-                channel.silent_after(period),
+                channel.timeout_s(period),
                 np.concatenate([R_WB.ravel(), scales]),
                 parameters,
             ),
@@ -382,12 +405,12 @@ class TeleopChannel(LeafSystem):
         self._saturated = self.DeclareVectorInputPort("saturated", 1)
         self._contact = self.DeclareVectorInputPort("contact", 1)
         self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
-        ends = initial_ends(passivity.method, parameters, start)
+        ends = initial_state_of_ends(passivity.method, parameters, start)
         carried = np.zeros(PACKET_SIZE if self._uses_load else LOAD.start)
         receivers, in_transit = zip(
-            *(network.initial_state(p, carried) for p in lines), strict=True
+            *(network.initial_network_state(p, carried) for p in lines), strict=True
         )
-        state = [*receivers, ends, np.array(start), np.zeros(PORTS)]
+        state = [*receivers, ends, np.array(start), np.zeros(NUM_PORT_SIGNALS)]
         self._initial_arguments = (passivity.method, parameters)
         received = np.zeros(7)
         groups = [self.DeclareDiscreteState(part) for part in state]
@@ -430,8 +453,8 @@ class TeleopChannel(LeafSystem):
         `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
         time in which the slave of method `wave` keeps its command.
         """
-        ends = initial_ends(*self._initial_arguments, command)
-        ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills
+        ends = initial_state_of_ends(*self._initial_arguments, command)
+        ends[_LAST_POSE_AT_SLAVE][:7], ends[SLAVE_METHOD_MEMORY][FILL_TIME] = slave, fills
         context.SetDiscreteState(self._groups[2], ends)
         context.SetDiscreteState(self._groups[3], command)
 
@@ -442,10 +465,10 @@ class TeleopChannel(LeafSystem):
         # A repeated step with other inputs overwrites the same places.
         in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
         forward, backward = zip(state[:2], in_transit, strict=True)
-        load = _NO_LOAD
+        load = _NO_LOAD_WRENCH
         if self._uses_load and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
-        channel_step(
+        step_channel(
             self._steps,
             self._pose.Eval(context),
             self._wrench.Eval(context),

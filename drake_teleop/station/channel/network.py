@@ -22,20 +22,20 @@ from drake_teleop.station.passivity.packet import (
     VELOCITY,
     WRENCH,
     has_arrived,
-    moved_pose_into,
+    move_pose_into,
 )
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
-LONGEST_DELAY = 10.0  # [s], bounds the memory
-LONGEST_TRACE = 36000.0  # [s]
-LONGEST_EXTRAPOLATION = 0.1  # [s]; then the pose stands still
+MAX_DELAY_S = 10.0  # [s], bounds the memory
+MAX_TRACE_DURATION_S = 36000.0  # [s]
+MAX_EXTRAPOLATION_S = 0.1  # [s]; then the pose stands still
 
 # Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
 # of one packet in 1e7.
-_MAX_DEVIATION = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
-_SILENCE = ("hold", "zero", "extrapolate")
-_ZERO, _EXTRAPOLATE = 1, 2
-_TRACE_STEP = 1e-3  # [s], for mean and maximum of a trace
+_MAX_DELAY_DEVIATIONS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
+_SILENCE_POLICIES = ("hold", "zero", "extrapolate")
+_POLICY_ZERO, _POLICY_EXTRAPOLATE = 1, 2
+_TRACE_STEP_S = 1e-3  # [s], for mean and maximum of a trace
 _MINUTE_S, _SILENCE_SEED = 60.0, 20090101  # [s]; seed for the silence of a network
 
 
@@ -44,15 +44,15 @@ _MINUTE_S, _SILENCE_SEED = 60.0, 20090101  # [s]; seed for the silence of a netw
 class NetworkConfig:
     """One direction of a network; the default is ideal: packet k arrives at step k."""
 
-    delay: float = quantity(0.0, "s", 0.0, LONGEST_DELAY, "mean one-way delay")
+    delay: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "mean one-way delay")
     jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) standard deviations over the mean delay")
-    distribution: str = choice("uniform", tuple(_MAX_DEVIATION), "distribution of the delay")
+    distribution: str = choice("uniform", tuple(_MAX_DELAY_DEVIATIONS), "distribution of the delay")
     loss: float = quantity(0.0, "1", 0.0, 1.0, "share of the packets that is lost, mean")
     burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
     burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share that is lost in the bad state")
     duplicate: float = quantity(0.0, "1", 0.0, 1.0, "share of the arriving packets that come twice")
     rate_hz: float | None = quantity(None, "Hz", 1.0, 1e5, "packets per second at most; null: all")
-    playout: float = quantity(0.0, "s", 0.0, LONGEST_DELAY, "least age of a packet that is used")
+    playout: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "least age of a packet that is used")
     redundant: bool = plain(
         False, "each packet repeats the samples that the playout buffer may still wait for"
     )
@@ -64,7 +64,7 @@ class NetworkConfig:
     )
     silence: str = choice(
         "hold",
-        _SILENCE,
+        _SILENCE_POLICIES,
         "what the receiver reads at steps without a new packet: the newest one's values; no "
         "velocity and no wrench, the null packet of wave variables; or a pose that moves on with "
         "its velocity for 0.1 s. Cumulative parts stay as they are",
@@ -102,15 +102,25 @@ stations 600 ms. lunar: 384 400 km are 1.28 s; round trip with ground stations 2
 """
 
 # Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
-_KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST, _BAD_SHARE, _BAD_MEMORY = range(8)
-_BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _MIN_DELAY, _TRACE = range(
-    8, 17
+_RANDOM_KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST_DELAY, _BAD_SHARE, _BAD_MEMORY = (
+    range(8)
 )
+(
+    _BURST_LOSS,
+    _DUPLICATE,
+    _RATE,
+    _PLAYOUT_TIME,
+    _REDUNDANT,
+    _NUM_SLOTS,
+    _POLICY,
+    _MIN_DELAY,
+    _TRACE,
+) = range(8, 17)
 # State of a receiver: these, then its last packet. In transit: slots, then sent packets.
-_BAD, _NEWEST_ARRIVED, _NEWEST_READ, _SILENT_STEPS, _LAST_PACKET = range(5)
+_BAD_STATE, _NEWEST_ARRIVED, _NEWEST_READ, _SILENT_STEPS, _LAST_PACKET = range(5)
 
 
-def parameters(
+def network_parameters(
     config: NetworkConfig,
     seed: int,
     direction: int,
@@ -131,7 +141,9 @@ def parameters(
     trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)
     trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
-    longest = math.floor(mean * (1 + _MAX_DEVIATION[config.distribution] * config.jitter) + 0.5)
+    longest = math.floor(
+        mean * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter) + 0.5
+    )
     if trace.size:
         longest = max(int(trace.max()), 0)
     longest = max(longest, least)
@@ -139,17 +151,21 @@ def parameters(
     time_constant = config.burst * (1 - bad)  # time constant of the chain
     p = np.empty(_TRACE + trace.size)
     # 53 bits of a key are exact in a float.
-    p[_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
-    p[_PERIOD], p[_DELAY], p[_JITTER], p[_LONGEST] = period, mean, config.jitter, longest
-    p[_DISTRIBUTION] = list(_MAX_DEVIATION).index(config.distribution)
+    p[_RANDOM_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
+    p[_PERIOD], p[_DELAY], p[_JITTER], p[_LONGEST_DELAY] = period, mean, config.jitter, longest
+    p[_DISTRIBUTION] = list(_MAX_DELAY_DEVIATIONS).index(config.distribution)
     p[_BAD_SHARE], p[_BAD_MEMORY] = (
         bad,
         math.exp(-period / time_constant) if time_constant > 0 else 0.0,
     )
     p[_BURST_LOSS], p[_DUPLICATE] = config.burst_loss, config.duplicate
     p[_RATE] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
-    p[_PLAYOUT], p[_REDUNDANT], p[_SLOTS] = playout, config.redundant, max(longest, playout) + 1
-    p[_POLICY], p[_MIN_DELAY] = _SILENCE.index(config.silence), least
+    p[_PLAYOUT_TIME], p[_REDUNDANT], p[_NUM_SLOTS] = (
+        playout,
+        config.redundant,
+        max(longest, playout) + 1,
+    )
+    p[_POLICY], p[_MIN_DELAY] = _SILENCE_POLICIES.index(config.silence), least
     p[_TRACE:] = trace
     return p
 
@@ -158,16 +174,16 @@ def mean_delay(config: NetworkConfig) -> float:
     """Return the mean one-way delay of arriving packets, at least the playout time [s]."""
     if config.trace is None:
         return max(config.delay, config.playout)
-    delays = _read_trace(Path(config.trace), _TRACE_STEP) * _TRACE_STEP
+    delays = _read_trace(Path(config.trace), _TRACE_STEP_S) * _TRACE_STEP_S
     used = np.maximum(delays[delays >= 0], config.playout)
     return float(used.mean()) if used.size else config.playout
 
 
 def longest_delay(config: NetworkConfig) -> float:
     """Return the largest age of a packet when it is used [s]."""
-    longest = config.delay * (1 + _MAX_DEVIATION[config.distribution] * config.jitter)
+    longest = config.delay * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter)
     if config.trace is not None:
-        longest = float(_read_trace(Path(config.trace), _TRACE_STEP).max()) * _TRACE_STEP
+        longest = float(_read_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
     return max(longest, config.playout)
 
 
@@ -178,19 +194,23 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
     table = read_table(path)
     time = table.numbers(["time"], 1, str(path))[:, 0]
-    delay = table.single("delay", str(path))
+    delay = table.single_column("delay", str(path))
     if len(delay) != len(time):
         what = f"has {len(delay)} values, the column time has {len(time)}"
         raise DrakeTeleopError(what, where=f"{path}:delay", remedy="give one delay for each time")
     lost, age = np.isnan(delay), time - time[0]
     for column, bad, what in (
         ("time", np.diff(time, prepend=-np.inf) <= 0, "does not increase"),
-        ("time", age > LONGEST_TRACE, f"is more than {LONGEST_TRACE:g} s after the first"),
-        ("delay", (delay < 0) | (delay > LONGEST_DELAY), f"is not 0 to {LONGEST_DELAY:g} s"),
+        (
+            "time",
+            age > MAX_TRACE_DURATION_S,
+            f"is more than {MAX_TRACE_DURATION_S:g} s after the first",
+        ),
+        ("delay", (delay < 0) | (delay > MAX_DELAY_S), f"is not 0 to {MAX_DELAY_S:g} s"),
     ):
         if bad.any():
             raise DrakeTeleopError(
-                f"row {table.line(int(np.argmax(bad)))} {what}",
+                f"row {table.line_in_file(int(np.argmax(bad)))} {what}",
                 where=f"{path}:{column}",
                 remedy="give seconds, sorted by time; an empty delay is a lost packet",
             )
@@ -201,7 +221,7 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _random_uniform(p, k, draw):
-    return (float(random_bits(np.uint64(p[_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
+    return (float(random_bits(np.uint64(p[_RANDOM_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
 
 
 @njit(cache=True)
@@ -212,7 +232,7 @@ def _delay_steps(p, k, draw):
         return int(max(steps, p[_MIN_DELAY])) if steps >= 0.0 else -1
     mean, spread = p[_DELAY], p[_DELAY] * p[_JITTER]
     if spread == 0.0:
-        return int(p[_LONGEST])
+        return int(p[_LONGEST_DELAY])
     u = _random_uniform(p, k, draw)
     if p[_DISTRIBUTION] == 0:
         delay = mean + spread * (2.0 * u - 1.0)
@@ -222,7 +242,7 @@ def _delay_steps(p, k, draw):
     else:  # sum of three exponential waits
         u *= _random_uniform(p, k, draw + 1) * _random_uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
-    return int(min(max(delay + 0.5, p[_MIN_DELAY]), p[_LONGEST]))
+    return int(min(max(delay + 0.5, p[_MIN_DELAY]), p[_LONGEST_DELAY]))
 
 
 @njit(cache=True)
@@ -242,28 +262,28 @@ def _advance_chain(p, k, bad):
     return bad, first, second
 
 
-def initial_state(
+def initial_network_state(
     p: NDArray[np.float64], neutral: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
     `neutral` (N,) contains the values at the receiver before the first packet.
     """
-    slots = int(p[_SLOTS])
+    slots = int(p[_NUM_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
     return receiver, np.concatenate([np.full(slots, -1.0), np.zeros(slots * len(neutral))])
 
 
 @njit(cache=True)
-def send(p, state, k, packet):
+def send_packet(p, state, k, packet):
     """Send the packet of step `k` and update `state`; steps count from 0 without gaps."""
     receiver, in_transit = state
-    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
-    receiver[_BAD], first, second = _advance_chain(p, k, receiver[_BAD])
+    slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
+    receiver[_BAD_STATE], first, second = _advance_chain(p, k, receiver[_BAD_STATE])
     for travel in (first, second):
         if travel >= 0:
             if p[_REDUNDANT] == 0.0:
-                travel = max(travel, int(p[_PLAYOUT]))
+                travel = max(travel, int(p[_PLAYOUT_TIME]))
             # The previous content of the slot is older.
             in_transit[(k + travel) % slots] = k
     # A lost packet is written too, because a later redundant packet may contain it.
@@ -271,18 +291,18 @@ def send(p, state, k, packet):
 
 
 @njit(cache=True)
-def receive(p, state, k, packet):
+def receive_packet(p, state, k, packet):
     """Write the newest packet (N,) at step `k` into `packet`, after `send` of the same step.
 
     Return the step at which it was sent, or -1, and True if it is new.
     """
     receiver, in_transit = state
-    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
+    slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
     # An old entry of the slot is smaller and has no effect.
     receiver[_NEWEST_ARRIVED] = max(receiver[_NEWEST_ARRIVED], in_transit[k % slots])
     newest = receiver[_NEWEST_ARRIVED]
     if p[_REDUNDANT] != 0.0:
-        newest = min(newest, k - p[_PLAYOUT])
+        newest = min(newest, k - p[_PLAYOUT_TIME])
     fresh = newest > receiver[_NEWEST_READ]
     if fresh:
         receiver[_NEWEST_READ], receiver[_SILENT_STEPS] = newest, 0.0
@@ -298,12 +318,12 @@ def receive(p, state, k, packet):
 @njit(cache=True)
 def _fill_silence(policy, silent, packet):
     velocity, pose = packet[VELOCITY], packet[POSE]
-    if policy == _ZERO:
+    if policy == _POLICY_ZERO:
         velocity[:] = 0.0
         packet[WRENCH] = packet[LOAD] = 0.0
-    elif policy == _EXTRAPOLATE and has_arrived(packet):
-        moved_pose_into(pose, velocity * min(silent, LONGEST_EXTRAPOLATION), pose)
-        if silent > LONGEST_EXTRAPOLATION:
+    elif policy == _POLICY_EXTRAPOLATE and has_arrived(packet):
+        move_pose_into(pose, velocity * min(silent, MAX_EXTRAPOLATION_S), pose)
+        if silent > MAX_EXTRAPOLATION_S:
             velocity[:] = 0.0
 
 
@@ -311,7 +331,7 @@ def packet_delays(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
     """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive."""
-    return _compute_delays(parameters(config, seed, direction, period), steps)
+    return _compute_delays(network_parameters(config, seed, direction, period), steps)
 
 
 @njit(cache=True)
@@ -326,8 +346,8 @@ def newest_packets(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
     """Return the number of the newest received packet at each step, (steps,); -1 for none."""
-    p = parameters(config, seed, direction, period)
-    sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT])
+    p = network_parameters(config, seed, direction, period)
+    sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_TIME])
     for travel in _compute_delays(p, steps).T:
         used = travel if config.redundant else np.maximum(travel, playout)
         seen = (travel >= 0) & (sent + used < steps)

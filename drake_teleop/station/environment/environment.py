@@ -20,7 +20,7 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloatingJoint, RigidBody
 
 
-class Stand(NamedTuple):
+class FloorStand(NamedTuple):
     """Box on the floor that a 3D replay shows below an environment: sizes, position [m] in W."""
 
     along_x: float
@@ -74,11 +74,11 @@ class Environment(ABC):
         return None
 
     @property
-    def stand(self) -> Stand | None:
+    def stand(self) -> FloorStand | None:
         return None
 
 
-class Several(Environment):
+class SeveralObjects(Environment):
     """Environment of several objects."""
 
     def __init__(self, parts: Iterable[Environment]) -> None:

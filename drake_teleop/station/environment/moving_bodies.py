@@ -36,12 +36,20 @@ from drake_teleop.common.vectors import (
 
 Array = NDArray[np.float64]
 
-_FIXED, _REVOLUTE, _PRISMATIC, _FREE = range(4)
-_PARENT, _KIND, _Q, _V, _AXIS, _F, _M = 0, 1, 2, 3, 4, 7, 14
+_FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
+(
+    _PARENT_COLUMN,
+    _KIND_COLUMN,
+    _POSITION_INDEX_COLUMN,
+    _VELOCITY_INDEX_COLUMN,
+    _AXIS_COLUMN,
+    _X_PF_COLUMN,
+    _X_MB_COLUMN,
+) = 0, 1, 2, 3, 4, 7, 14
 #: Number of columns of the table of joints.
-JOINT_WIDTH = 21
+NUM_JOINT_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
-POSE_AND_TWIST = 13
+NUM_POSE_AND_TWIST = 13
 
 
 def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
@@ -72,7 +80,7 @@ def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Arra
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
         rows.append(_joint_row(plant, context, plant.get_joint(JointIndex(index)), row))
-    return np.array(rows).reshape(len(rows), JOINT_WIDTH), order
+    return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
 def _joint_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
@@ -81,28 +89,37 @@ def _joint_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) 
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
     kind, axis = _joint_kind(joint)
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
-    return np.array([row, kind, *places, *axis, *_pose_numbers(X_PF), *_pose_numbers(X_MB)])
+    return np.array(
+        [
+            row,
+            kind,
+            *places,
+            *axis,
+            *_pose_as_quaternion_and_position(X_PF),
+            *_pose_as_quaternion_and_position(X_MB),
+        ]
+    )
 
 
 def _joint_kind(joint: Joint) -> tuple[int, Array]:
     if isinstance(joint, RevoluteJoint):
-        return _REVOLUTE, joint.revolute_axis()
+        return _REVOLUTE_JOINT, joint.revolute_axis()
     if isinstance(joint, PrismaticJoint):
-        return _PRISMATIC, joint.translation_axis()
-    return _FREE if isinstance(joint, QuaternionFloatingJoint) else _FIXED, np.zeros(3)
+        return _PRISMATIC_JOINT, joint.translation_axis()
+    return _FREE_JOINT if isinstance(joint, QuaternionFloatingJoint) else _FIXED_JOINT, np.zeros(3)
 
 
-def _pose_numbers(X: RigidTransform) -> Array:
+def _pose_as_quaternion_and_position(X: RigidTransform) -> Array:
     return np.concatenate([X.rotation().ToQuaternion().wxyz(), X.translation()])
 
 
 @njit(cache=True)
-def _quaternion(x, i):
+def _quaternion_at(x, i):
     return x[i], x[i + 1], x[i + 2], x[i + 3]
 
 
 @njit(cache=True)
-def bodies_into(joints, state, out):
+def poses_and_twists_into(joints, state, out):
     """Write pose and twist of each body (m, 13) at the plant's state [q; v] into `out`.
 
     A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `joints` is a `JointTable`.
@@ -111,38 +128,43 @@ def bodies_into(joints, state, out):
     for k in range(joints.shape[0]):
         row = joints[k]
         turn, place, spin, speed = (1.0, 0.0, 0.0, 0.0), still, still, still
-        if row[_PARENT] >= 0.0:
-            above = out[int(row[_PARENT])]
-            turn, place = _quaternion(above, 0), vector_at(above, 4)
+        if row[_PARENT_COLUMN] >= 0.0:
+            above = out[int(row[_PARENT_COLUMN])]
+            turn, place = _quaternion_at(above, 0), vector_at(above, 4)
             spin, speed = vector_at(above, 7), vector_at(above, 10)
         # From parent to F.
-        lever = rotate_vector(turn, vector_at(row, _F + 4))
+        lever = rotate_vector(turn, vector_at(row, _X_PF_COLUMN + 4))
         place, speed = plus(place, lever), plus(speed, cross(spin, lever))
-        turn = quaternion_product(turn, _quaternion(row, _F))
+        turn = quaternion_product(turn, _quaternion_at(row, _X_PF_COLUMN))
         # From F to M.
-        q, v, kind, axis = int(row[_Q]), int(row[_V]), row[_KIND], vector_at(row, _AXIS)
-        if kind == _REVOLUTE:
+        q, v, kind, axis = (
+            int(row[_POSITION_INDEX_COLUMN]),
+            int(row[_VELOCITY_INDEX_COLUMN]),
+            row[_KIND_COLUMN],
+            vector_at(row, _AXIS_COLUMN),
+        )
+        if kind == _REVOLUTE_JOINT:
             spin = plus(spin, scale_vector(state[v], rotate_vector(turn, axis)))
             half = 0.5 * state[q]
             x, y, z = scale_vector(sin(half), axis)
             turn = quaternion_product(turn, (cos(half), x, y, z))
-        elif kind == _PRISMATIC:
+        elif kind == _PRISMATIC_JOINT:
             axis = rotate_vector(turn, axis)
             lever = scale_vector(state[q], axis)
             place = plus(place, lever)
             speed = plus(plus(speed, cross(spin, lever)), scale_vector(state[v], axis))
-        elif kind == _FREE:
+        elif kind == _FREE_JOINT:
             lever = rotate_vector(turn, vector_at(state, q + 4))
             place = plus(place, lever)
             speed = plus(
                 plus(speed, cross(spin, lever)), rotate_vector(turn, vector_at(state, v + 3))
             )
             spin = plus(spin, rotate_vector(turn, vector_at(state, v)))
-            turn = quaternion_product(turn, normalized_quaternion(_quaternion(state, q)))
+            turn = quaternion_product(turn, normalized_quaternion(_quaternion_at(state, q)))
         # From M to B.
-        lever = rotate_vector(turn, vector_at(row, _M + 4))
+        lever = rotate_vector(turn, vector_at(row, _X_MB_COLUMN + 4))
         place, speed = plus(place, lever), plus(speed, cross(spin, lever))
-        turn = quaternion_product(turn, _quaternion(row, _M))
+        turn = quaternion_product(turn, _quaternion_at(row, _X_MB_COLUMN))
         out[k, 0], out[k, 1], out[k, 2], out[k, 3] = turn
         out[k, 4], out[k, 5], out[k, 6] = place
         out[k, 7], out[k, 8], out[k, 9] = spin
@@ -163,21 +185,25 @@ def _quaternion_rate(spin, turn):
 
 
 @njit(cache=True)
-def interpolate_bodies(joints, h, u, start, end, out):
+def interpolate_joint_state(joints, h, u, start, end, out):
     """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`, by cubics.
 
     `start` and `end` are the plant's states at both ends of the step.
     """
     for k in range(joints.shape[0]):
-        q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]
-        if kind in (_REVOLUTE, _PRISMATIC):
+        q, v, kind = (
+            int(joints[k, _POSITION_INDEX_COLUMN]),
+            int(joints[k, _VELOCITY_INDEX_COLUMN]),
+            joints[k, _KIND_COLUMN],
+        )
+        if kind in (_REVOLUTE_JOINT, _PRISMATIC_JOINT):
             out[q], out[v] = _interpolate_hermite(h, u, start[q], start[v], end[q], end[v])
-        elif kind == _FREE:
+        elif kind == _FREE_JOINT:
             for i in range(3):
                 out[q + 4 + i], out[v + 3 + i] = _interpolate_hermite(
                     h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
                 )
-            a, b = _quaternion(start, q), _quaternion(end, q)
+            a, b = _quaternion_at(start, q), _quaternion_at(end, q)
             a_dot, b_dot = (
                 _quaternion_rate(vector_at(start, v), a),
                 _quaternion_rate(vector_at(end, v), b),

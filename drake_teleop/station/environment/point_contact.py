@@ -34,15 +34,15 @@ from drake_teleop.common.vectors import (
 
 Array = NDArray[np.float64]
 
-#: Columns of `Pairs.known`: stiffness; static and dynamic friction; row of the box's body.
-STIFFNESS, FRICTION, BODY = 22, slice(24, 26), 27
-#: Number of columns of `Pairs.known` and `Pairs.watched`.
-WIDTH, WATCHED_WIDTH = 28, 40
-_STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
+#: Columns of `ShapePairs.known`: stiffness; static and dynamic friction; row of the box's body.
+STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_COLUMN = 22, slice(24, 26), 27
+#: Number of columns of `ShapePairs.known` and `ShapePairs.watched`.
+NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
+_STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
 _MIN_SLIP_SPEED = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
-class Pairs(NamedTuple):
+class ShapePairs(NamedTuple):
     """Pairs of a shape of the tool and a shape of the environment that may touch.
 
     Attributes:
@@ -68,7 +68,7 @@ def ContactPairs(
     environment: Iterable[ModelInstanceIndex],
     slip: float,
     moving: Sequence[int] = (),
-) -> Pairs:
+) -> ShapePairs:
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
@@ -95,8 +95,10 @@ def ContactPairs(
                 X_Other = X_Body @ inspector.GetPoseInFrame(other)
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
-                    sphere, edges = _sphere_and_box(inspector, own, other)
-                    law = _contact_law(*map(inspector.GetProximityProperties, (own, other)))
+                    sphere, edges = _row_of_sphere_and_box(inspector, own, other)
+                    law = _combined_contact_law(
+                        *map(inspector.GetProximityProperties, (own, other))
+                    )
                     half = np.array(edges.size()) / 2
                     place = [X_SShape.translation(), [sphere.radius()]]
                     known.append(_pair_row(place, X_Other, half, [direction, law, [slip, row]]))
@@ -108,9 +110,9 @@ def ContactPairs(
                     turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
                     last = [direction, [0.0] * 4, [slip, row], *turned]
                     watched.append(_pair_row(place, X_Other, box.half_width(), last))
-    return Pairs(
-        np.array(known).reshape(len(known), WIDTH),
-        np.array(watched).reshape(len(watched), WATCHED_WIDTH),
+    return ShapePairs(
+        np.array(known).reshape(len(known), NUM_PAIR_COLUMNS),
+        np.array(watched).reshape(len(watched), NUM_MONITORED_COLUMNS),
         unknown,
     )
 
@@ -132,7 +134,7 @@ def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
     return box
 
 
-def _sphere_and_box(
+def _row_of_sphere_and_box(
     inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
 ) -> tuple[Sphere, Box]:
     sphere, edges = inspector.GetShape(ball), inspector.GetShape(box)
@@ -157,16 +159,21 @@ def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) 
     return direction
 
 
-def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
+def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
     for shape in (ball, box):
-        if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
+        if not all(
+            shape.HasProperty("material", name)
+            for name in (_STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY)
+        ):
             raise DrakeTeleopError(
                 "the contact material has no stiffness or no dissipation",
                 where="drake:proximity_properties",
                 remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
             )
-    k_1, k_2 = (float(shape.GetProperty("material", _STIFFNESS)) for shape in (ball, box))
-    d_1, d_2 = (float(shape.GetProperty("material", _DISSIPATION)) for shape in (ball, box))
+    k_1, k_2 = (float(shape.GetProperty("material", _STIFFNESS_PROPERTY)) for shape in (ball, box))
+    d_1, d_2 = (
+        float(shape.GetProperty("material", _DISSIPATION_PROPERTY)) for shape in (ball, box)
+    )
     both = CalcContactFrictionFromSurfaceProperties(
         *(shape.GetProperty("material", "coulomb_friction") for shape in (ball, box))
     )
@@ -175,11 +182,13 @@ def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[fl
 
 
 @njit(cache=True)
-def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal: Array) -> float:
+def depth_of_sphere_in_box(
+    pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal: Array
+) -> float:
     """Return the depth of a sphere in its box [m], below 0 if they are apart.
 
     Args:
-        pair: (28,) row of `Pairs.known`.
+        pair: (28,) row of `ShapePairs.known`.
         deflection: deflection of the sheet spring [m].
         normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
@@ -223,10 +232,12 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 
 
 @njit(cache=True)
-def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
+def min_distance_of_boxes(
+    pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float
+) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    `pair` (40,) is a row of `Pairs.watched`, for the tool's box; `box` (28,) is this row with the
+    `pair` (40,) is a row of `ShapePairs.watched`, for the tool's box; `box` (28,) is it with the
     present pose of the other box. The bound is the largest gap along an edge of either box.
     """
     R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
@@ -234,11 +245,11 @@ def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: fl
     between = minus(between, scale_vector(deflection, vector_at(box, 19)))
     edges, halves, largest = np.empty((6, 3)), np.empty(6), -np.inf
     for i in range(3):
-        k = WIDTH + i  # columns of R_SBox: directions of the edges
+        k = NUM_PAIR_COLUMNS + i  # columns of R_SBox: directions of the edges
         edge = apply_matrix(R, (pair[k], pair[k + 3], pair[k + 6]))
         edges[i, 0], edges[i, 1], edges[i, 2] = edge
         edges[3 + i, 0], edges[3 + i, 1], edges[3 + i, 2] = box[4 + i], box[7 + i], box[10 + i]
-        halves[i], halves[3 + i] = pair[WIDTH + 9 + i], box[16 + i]
+        halves[i], halves[3 + i] = pair[NUM_PAIR_COLUMNS + 9 + i], box[16 + i]
     for i in range(6):
         axis = vector_at(edges[i], 0)
         gap = abs(dot(between, axis))
@@ -262,7 +273,7 @@ def _friction_coefficient(static: float, dynamic: float, slip: float) -> float:
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
     """Write the contact force on a sphere in its box into `force` (3,) [N].
 
-    `pair` (28,) is a row of `Pairs.known`, `x` the depth [m], `normal` the direction out of the
+    `pair` (28,): row of `ShapePairs.known`, `x`: depth [m], `normal`: direction out of the
     box, `velocity` that of the sphere at the contact, relative to the box [m/s].
     """
     out = dot(velocity, normal)

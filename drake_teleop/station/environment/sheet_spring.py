@@ -16,7 +16,7 @@ from drake_teleop.station.environment.environment import (
     BodiesOfTool,
     Environment,
     ExcludeContact,
-    Stand,
+    FloorStand,
 )
 
 _BENCH_HEIGHT = 0.15  # from the lower face of the model's bench to the leaf [m]
@@ -67,9 +67,9 @@ class SheetSpring(Environment):
         return self.effective_mass, self.stiffness, self.damping
 
     @property
-    def stand(self) -> Stand:
+    def stand(self) -> FloorStand:
         x, y, z = self.position
-        return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
+        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; the joint "bending" is its end's deflection along z_W [m]."""

@@ -20,14 +20,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia
 
 from drake_teleop.common.config import quantity, settings
-from drake_teleop.station.environment.environment import ContactMaterial, Environment, Stand
+from drake_teleop.station.environment.environment import ContactMaterial, Environment, FloorStand
 
 #: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second
 #: (E) is as high as the nut above it permits in the deepest slot.
-PEG_RADIUS, TIP_BALL, UPPER_BALL = 0.012, 0.188, 0.158
+PEG_RADIUS, TIP_BALL_CENTRE_Z, UPPER_BALL_CENTRE_Z = 0.012, 0.188, 0.158
 #: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (E).
-LENGTH, _SIDE = 0.10, 0.04
-_FLOOR = 0.02
+SLOT_LENGTH, _SIDE_WIDTH = 0.10, 0.04
+_FLOOR_THICKNESS = 0.02
 _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
 _BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 
@@ -70,7 +70,7 @@ class Slot(Environment):
     @property
     def foot(self) -> float:
         """Height z_W of the floor's lower face [m]."""
-        return self.position[2] - self.depth - _FLOOR
+        return self.position[2] - self.depth - _FLOOR_THICKNESS
 
     @property
     def X_WM(self) -> RigidTransform:
@@ -78,19 +78,19 @@ class Slot(Environment):
         return RigidTransform(RollPitchYaw(0.0, 0.0, self.yaw), self.position)
 
     @property
-    def stand(self) -> Stand:
-        return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
+    def stand(self) -> FloorStand:
+        return FloorStand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
         if not plant.geometry_source_is_registered():
             return
-        tool, above = plant.GetBodyByName("tool"), RigidTransform([0.0, 0.0, UPPER_BALL])
-        ball, properties = Sphere(PEG_RADIUS), _material(self)
+        tool, above = plant.GetBodyByName("tool"), RigidTransform([0.0, 0.0, UPPER_BALL_CENTRE_Z])
+        ball, properties = Sphere(PEG_RADIUS), _contact_material(self)
         plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
         plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _BALL_COLOUR)
-        for name, (X_MBox, box) in _boxes(self).items():
+        for name, (X_MBox, box) in _boxes_of_slot(self).items():
             plant.RegisterCollisionGeometry(body, X_MBox, box, name, properties)
             plant.RegisterVisualGeometry(body, X_MBox, box, name, _BLOCK_COLOUR)
 
@@ -99,23 +99,23 @@ class Slot(Environment):
     ) -> None:
         source = plant.get_source_id()
         for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
-            scene_graph.AssignRole(source, ball, _material(self), RoleAssign.kReplace)
+            scene_graph.AssignRole(source, ball, _contact_material(self), RoleAssign.kReplace)
 
 
-def _material(slot: Slot) -> ProximityProperties:
+def _contact_material(slot: Slot) -> ProximityProperties:
     return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction)
 
 
-def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
+def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
     edge, c, depth = slot.width / 2, slot.chamfer, slot.depth
     boxes = {}
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
             """Return a box from `inner` outwards and from the height `top` down to the floor."""
-            across, height = edge + c + _SIDE - inner, depth + top
+            across, height = edge + c + _SIDE_WIDTH - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
-            return middle, Box(LENGTH, across, height)
+            return middle, Box(SLOT_LENGTH, across, height)
 
         # The upper face of this box is the chamfer; its thickness fills the gap of wall and top.
         tilt, thick = RotationMatrix.MakeXRotation(side * np.pi / 4), c / np.sqrt(2)
@@ -123,8 +123,8 @@ def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
         into = RigidTransform(tilt, face - tilt.matrix()[:, 2] * thick / 2)
         boxes[f"{name}_wall"] = block(edge, -c)
         boxes[f"{name}_top"] = block(edge + c, 0.0)
-        boxes[f"{name}_chamfer"] = into, Box(LENGTH, c * np.sqrt(2), thick)
-    across = slot.width + 2 * (c + _SIDE)
-    below = RigidTransform([0.0, 0.0, -depth - _FLOOR / 2])
-    boxes["floor"] = below, Box(LENGTH, across, _FLOOR)
+        boxes[f"{name}_chamfer"] = into, Box(SLOT_LENGTH, c * np.sqrt(2), thick)
+    across = slot.width + 2 * (c + _SIDE_WIDTH)
+    below = RigidTransform([0.0, 0.0, -depth - _FLOOR_THICKNESS / 2])
+    boxes["floor"] = below, Box(SLOT_LENGTH, across, _FLOOR_THICKNESS)
     return boxes

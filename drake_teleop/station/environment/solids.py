@@ -18,14 +18,14 @@ from drake_teleop.station.environment.environment import (
     ContactMaterial,
     Environment,
     ExcludeContact,
+    FloorStand,
     NewInstance,
-    Stand,
 )
 
 _BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
-_THICKNESS = 0.1  # m; deep enough that a tool leaves through the face
+_WALL_THICKNESS = 0.1  # m; deep enough that a tool leaves through the face
 _FOOT_RADIUS, _TABLE_THICKNESS = 0.002, 0.05  # m: radius of the balls, thickness of the table
-_NAME, _FOOT_NAME = "block", "foot_of_block_"
+_BLOCK_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
 _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 
 
@@ -124,8 +124,8 @@ class Wall(Surface):
     def AddTo(self, plant: MultibodyPlant) -> None:
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
-        behind = RigidTransform([0.0, 0.0, -_THICKNESS / 2])
-        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _THICKNESS], self)
+        behind = RigidTransform([0.0, 0.0, -_WALL_THICKNESS / 2])
+        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _WALL_THICKNESS], self)
 
 
 @settings
@@ -152,10 +152,10 @@ class Block(Surface):
             )
 
     @property
-    def stand(self) -> Stand | None:
+    def stand(self) -> FloorStand | None:
         x, y, top = self.position
         across = 0.6 * min(self.table)
-        return Stand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
+        return FloorStand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         if min(self.table) > 0.0:
@@ -164,7 +164,7 @@ class Block(Surface):
                 plant, "table", RigidTransform(below), [*self.table, _TABLE_THICKNESS], self
             )
         inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
-        body = plant.AddRigidBody(_NAME, NewInstance(plant, _NAME), inertia)
+        body = plant.AddRigidBody(_BLOCK_NAME, NewInstance(plant, _BLOCK_NAME), inertia)
         x, y, foot = self.position
         turned = RollPitchYaw(0.0, 0.0, self.yaw)
         X_WBlock = RigidTransform(turned, [x, y, foot + self.size[2] / 2])
@@ -172,22 +172,24 @@ class Block(Surface):
         if not plant.geometry_source_is_registered():
             return
         here, box = RigidTransform(), BoxShape(*self.size)
-        plant.RegisterCollisionGeometry(body, here, box, _NAME, self.material())
-        plant.RegisterVisualGeometry(body, here, box, _NAME, _BLOCK_COLOUR)
+        plant.RegisterCollisionGeometry(body, here, box, _BLOCK_NAME, self.material())
+        plant.RegisterVisualGeometry(body, here, box, _BLOCK_NAME, _BLOCK_COLOUR)
         for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
             place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS))
             ball = Sphere(_FOOT_RADIUS)
-            plant.RegisterCollisionGeometry(body, place, ball, f"{_FOOT_NAME}{k}", self.material())
+            plant.RegisterCollisionGeometry(
+                body, place, ball, f"{_FOOT_NAME_PREFIX}{k}", self.material()
+            )
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
         """Let the tool touch only the block's box, and all other bodies only its balls."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
-        blocks = [body for body in map(plant.get_body, bodies) if body.name() == _NAME]
+        blocks = [body for body in map(plant.get_body, bodies) if body.name() == _BLOCK_NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]
         name = scene_graph.model_inspector().GetName
-        feet = [shape for shape in shapes if _FOOT_NAME in name(shape)]
+        feet = [shape for shape in shapes if _FOOT_NAME_PREFIX in name(shape)]
         boxes = [shape for shape in shapes if shape not in feet]
         tool_bodies = BodiesOfTool(plant, tool)
         ExcludeContact(plant, scene_graph, feet, tool_bodies)

@@ -12,16 +12,16 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.numeric import Array
 from drake_teleop.load.compensation import scaled_wrench_into
-from drake_teleop.load.contact.detection import FLAG, ContactDetector, flag_update
-from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor
+from drake_teleop.load.contact.detection import FLAG_INDEX, ContactDetector, update_contact_flag
+from drake_teleop.load.contact.noise_floor import STATISTIC_NAMES, THRESHOLD_MARGIN, NoiseFloor
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    BEFORE_JOINTS,
-    SATURATED,
-    SPECIFIC_FORCE,
-    TIME,
-    WRENCH,
+    FIRST_JOINT_INDEX,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_TIME_INDEX,
+    SAMPLE_WRENCH,
+    SATURATION_FLAG_INDEX,
     sample_size,
 )
 from drake_teleop.station.slave.arm import ArmModel, acceleration_into
@@ -32,9 +32,13 @@ from drake_teleop.station.slave.arm import ArmModel, acceleration_into
 class ContactDetectionConfig:
     """Settings of the contact detector."""
 
-    statistic: str = choice("glr", STATISTICS, "statistic that is compared with the threshold")
+    statistic: str = choice("glr", STATISTIC_NAMES, "statistic that is compared with the threshold")
     margin: float = quantity(
-        MARGIN, "1", 1.0, 10.0, "threshold over the largest value in the identification's motion"
+        THRESHOLD_MARGIN,
+        "1",
+        1.0,
+        10.0,
+        "threshold over the largest value in the identification's motion",
     )
     hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
     drift_time: float = quantity(
@@ -46,9 +50,14 @@ class ContactDetectionConfig:
 
 
 @njit(cache=True)
-def _update_flag(memory, sample, estimate, arm, settings):
+def _update_flag_with_arm(memory, sample, estimate, arm, settings):
     acceleration = np.empty(3)
-    acceleration_into(arm, sample[BEFORE_JOINTS:TIME], sample[SPECIFIC_FORCE], acceleration)
+    acceleration_into(
+        arm,
+        sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX],
+        sample[SAMPLE_SPECIFIC_FORCE],
+        acceleration,
+    )
     return update_flag(memory, sample, estimate, acceleration, settings)
 
 
@@ -60,12 +69,16 @@ def update_flag(memory, sample, estimate, acceleration, settings):
     `ContactDetector`.
     """
     if not (all_in_range(sample) and all_in_range(estimate)):
-        return memory[FLAG] != 0.0
+        return memory[FLAG_INDEX] != 0.0
     contact = np.empty(6)
-    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
-    wrench, offset, phi = sample[WRENCH], estimate[:6], estimate[6:]
+    s, omega, alpha = (
+        sample[SAMPLE_SPECIFIC_FORCE],
+        sample[SAMPLE_ANGULAR_VELOCITY],
+        sample[SAMPLE_ANGULAR_ACCELERATION],
+    )
+    wrench, offset, phi = sample[SAMPLE_WRENCH], estimate[:6], estimate[6:]
     scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
-    return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
+    return update_contact_flag(memory, contact, s, omega, alpha, acceleration, *settings)
 
 
 class ContactDetection(LeafSystem):
@@ -111,12 +124,12 @@ class ContactDetection(LeafSystem):
         return self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
 
     def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
-        return bool(_update_flag(memory, sample, estimate, self._arm, self._settings))
+        return bool(_update_flag_with_arm(memory, sample, estimate, self._arm, self._settings))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
         blind = discrete_state.get_mutable_value(self._blind_samples)
-        if sample[SATURATED] > 0.5:
+        if sample[SATURATION_FLAG_INDEX] > 0.5:
             blind[0] = self._recovery
             return
         if blind[0] > 0.0:

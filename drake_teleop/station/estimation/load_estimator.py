@@ -11,20 +11,20 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.online.change import change_parameters
+from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.online.watched import (
-    LEARNING,
-    SETTLED,
-    SIZE,
-    watched_memory,
-    watched_state,
-    watched_update,
+    MEMORY_SIZE,
+    STATE_LEARNING,
+    STATE_SETTLED,
+    initial_monitor_memory,
+    monitor_load,
+    monitor_state,
 )
-from drake_teleop.load.regressor import SATURATED
+from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
 # Samples between two checks for settling.
-_CHECK_SAMPLES = 16
+_SAMPLES_PER_CHECK = 16
 
 
 @settings
@@ -77,7 +77,7 @@ class LoadEstimator(LeafSystem):
         - sample: the wrist sensor's sample
         output_ports:
         - load_estimate: (16,) Eq. (7), [offsets (6); phi (10)] in S about So
-        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATES`
+        - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATE_NAMES`
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
@@ -122,11 +122,11 @@ class LoadEstimator(LeafSystem):
             "load_state", 1, weak_callback(self._calc_state), {self.xd_ticket()}
         )
         if config.watch:
-            unknown = np.zeros(SIZE)
+            unknown = np.zeros(MEMORY_SIZE)
             self.DeclareDiscreteState(
-                unknown if covariance is None else watched_memory(start, covariance)
+                unknown if covariance is None else initial_monitor_memory(start, covariance)
             )
-            change = change_parameters(
+            change = change_detector_parameters(
                 noise_std, motion_std, period, model_error=config.model_error
             )
             self._watch_arguments = (
@@ -142,17 +142,17 @@ class LoadEstimator(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
-        if sample[SATURATED] > 0.0:  # the wrench contains more than the load's
+        if sample[SATURATION_FLAG_INDEX] > 0.0:  # the wrench contains more than the load's
             return
         estimate = discrete_state.get_mutable_value(0)
-        if self._state(discrete_state) == LEARNING:
-            self._learn(estimate, sample, discrete_state, context.get_time())
+        if self._load_state_index(discrete_state) == STATE_LEARNING:
+            self._update_estimate(estimate, sample, discrete_state, context.get_time())
         else:
-            watched_update(
+            monitor_load(
                 estimate, discrete_state.get_mutable_value(2), sample, *self._watch_arguments
             )
 
-    def _learn(
+    def _update_estimate(
         self,
         estimate: NDArray[np.float64],
         sample: NDArray[np.float64],
@@ -162,18 +162,18 @@ class LoadEstimator(LeafSystem):
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
         # The check for settling takes longer than the update.
-        due = self._watches and round(time / self._period) % _CHECK_SAMPLES == 0
-        if due and self._estimator.settled_at(estimate, memory):
+        due = self._watches and round(time / self._period) % _SAMPLES_PER_CHECK == 0
+        if due and self._estimator.is_settled_at(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
-            discrete_state.set_value(2, watched_memory(estimate, covariance))
+            discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
 
-    def _state(self, discrete_state: DiscreteValues) -> int:
-        return watched_state(discrete_state.value(2)) if self._watches else LEARNING
+    def _load_state_index(self, discrete_state: DiscreteValues) -> int:
+        return monitor_state(discrete_state.value(2)) if self._watches else STATE_LEARNING
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()
-        output[0] = self._state(state)
+        output[0] = self._load_state_index(state)
         if not self._watches:
             estimate, memory = state.value(0), state.value(1)
-            settled = self._estimator.settled_at(estimate, memory.reshape(self._shape))
-            output[0] = SETTLED if settled else LEARNING
+            settled = self._estimator.is_settled_at(estimate, memory.reshape(self._shape))
+            output[0] = STATE_SETTLED if settled else STATE_LEARNING

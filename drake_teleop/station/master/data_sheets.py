@@ -16,9 +16,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import Registry
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
-from drake_teleop.station.master.leader_model import JOINTS, Leader
+from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
 from drake_teleop.station.master.numbers import (
-    CENTRE,
+    CENTRE_OF_WORKSPACE,
     COULOMB,
     HALF_SIZE,
     HAND_INERTIA,
@@ -26,15 +26,15 @@ from drake_teleop.station.master.numbers import (
     IN_TASK_SPACE,
     INERTIA,
     MASS,
-    NUMBERS,
+    MAX_ROTATION,
+    NUM_DEVICE_PARAMETERS,
     PEAK_FORCE,
     PEAK_TORQUE,
-    TURN,
     VISCOUS,
 )
 from drake_teleop.station.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT
 
-PHANTOM, LEADER = "phantom_premium_15", "leader"
+PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
 
 
 @settings
@@ -92,8 +92,11 @@ class DeviceFigures:
 
 
 _FREE_ROTATION, _NO_ROTATION = DeviceFigures().turn, [0.0, 0.0, 0.0]
-_OMEGA_SIZE, _OMEGA_TURN = [0.11, 0.113, 0.113], np.radians([120.0, 70.0, 160.0]).tolist()
-_OMEGA_STEP = math.radians(0.09)
+_OMEGA_SIZE_M, _OMEGA_ANGLES_RAD = (
+    [0.11, 0.113, 0.113],
+    np.radians([120.0, 70.0, 160.0]).tolist(),
+)
+_OMEGA_STEP_RAD = math.radians(0.09)
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
 # position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
@@ -104,9 +107,9 @@ _OMEGA_STEP = math.radians(0.09)
 _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _FREE_ROTATION, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE, _NO_ROTATION, 1e-5, _OMEGA_STEP, 4000.0),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE, _OMEGA_TURN, 1e-5, _OMEGA_STEP, 4000.0),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE, _OMEGA_TURN, 1e-5, _OMEGA_STEP, 4000.0),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_ROTATION, 1e-5, _OMEGA_STEP_RAD, 4000.0),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_ROTATION, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _FREE_ROTATION, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _FREE_ROTATION, 2e-5, 2e-4, 1000.0),
@@ -134,8 +137,8 @@ class Master:
     """Haptic device and its start position."""
 
     model: str = choice(
-        PHANTOM,
-        (PHANTOM, "custom", LEADER),
+        PHANTOM_NAME,
+        (PHANTOM_NAME, "custom", LEADER_NAME),
         "device; custom: `figures` only; leader: arm from a file",
         FIGURES,
     )
@@ -150,56 +153,63 @@ class Master:
         """Return the device's dynamics with the hand's mass [kg] and inertia about E [kg m^2]."""
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
-        numbers = np.zeros(NUMBERS)
+        numbers = np.zeros(NUM_DEVICE_PARAMETERS)
         numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
-        if self.model == PHANTOM:
+        if self.model == PHANTOM_NAME:
             numbers[COULOMB], numbers[VISCOUS] = self.friction.coulomb, self.friction.viscous
             numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = FORCE_LIMIT, WRIST_TORQUE_LIMIT
             return HapticDevice(numbers, self.model)
-        figures = self._figures()
+        figures = self._data_sheet()
         numbers[IN_TASK_SPACE] = 1.0
         numbers[COULOMB] = np.repeat([figures.friction, figures.friction_torque], 3)
         numbers[VISCOUS] = np.repeat([figures.damping, figures.turning_damping], 3)
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = figures.peak_force, figures.peak_torque
         numbers[MASS], numbers[INERTIA] = figures.apparent_mass, figures.inertia
-        numbers[CENTRE], numbers[HALF_SIZE] = figures.centre, 0.5 * np.array(figures.size)
-        numbers[TURN] = figures.turn
+        numbers[CENTRE_OF_WORKSPACE], numbers[HALF_SIZE] = (
+            figures.centre,
+            0.5 * np.array(figures.size),
+        )
+        numbers[MAX_ROTATION] = figures.turn
         return HapticDevice(numbers, self.model)
 
     @property
-    def leads_joints(self) -> bool:
-        return self.leader is not None and self.leader.leads == JOINTS
+    def is_joint_leader(self) -> bool:
+        return self.leader is not None and self.leader.leads == JOINT_MODE
 
     def check_pose_mode(self, what: str) -> None:
         """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
-        if self.leads_joints:
+        if self.is_joint_leader:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",
                 where="master.leader.leads",
                 remedy="set it to pose: the rendered force is the same",
             )
 
-    def steps(self) -> NDArray[np.float64]:
+    def encoder_steps(self) -> NDArray[np.float64]:
         """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""
-        if self.model in (PHANTOM, LEADER):
+        if self.model in (PHANTOM_NAME, LEADER_NAME):
             return np.zeros(6)
-        figures = self._figures()
+        figures = self._data_sheet()
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
-    def own_period(self, hand_hz: float) -> float | None:
+    def sampling_period(self, hand_hz: float) -> float | None:
         """Return the sampling period [s] of a device slower than `hand_hz` [Hz], else None."""
-        rate = 0.0 if self.model in (PHANTOM, LEADER) else self._figures().rate_hz
+        rate = 0.0 if self.model in (PHANTOM_NAME, LEADER_NAME) else self._data_sheet().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction(self) -> "Master":
         """Return a copy without Coulomb friction and encoder steps."""
-        if self.model == PHANTOM:
+        if self.model == PHANTOM_NAME:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
         if self.leader is not None:
             return dataclasses.replace(self, leader=dataclasses.replace(self.leader, friction=[]))
         figures = dataclasses.replace(
-            self._figures(), friction=0.0, friction_torque=0.0, resolution=0.0, turn_resolution=0.0
+            self._data_sheet(),
+            friction=0.0,
+            friction_torque=0.0,
+            resolution=0.0,
+            turn_resolution=0.0,
         )
         return dataclasses.replace(self, figures=figures)
 
@@ -208,23 +218,23 @@ class Master:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))
 
-    def _figures(self) -> DeviceFigures:
+    def _data_sheet(self) -> DeviceFigures:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        if self.model == PHANTOM and self.figures is not None:
+        if self.model == PHANTOM_NAME and self.figures is not None:
             raise DrakeTeleopError(
                 "the model of the Phantom is fixed and has no data sheet",
                 where=f"{where}.figures",
                 remedy="leave them out, or choose another model, such as custom",
             )
-        if self.model != PHANTOM and self.friction != JointFriction():
+        if self.model != PHANTOM_NAME and self.friction != JointFriction():
             raise DrakeTeleopError(
                 f"only the Phantom has joint friction, not '{self.model}'",
                 where=f"{where}.friction",
                 remedy="leave it out, and set figures.friction and figures.damping",
             )
-        if (self.leader is None) == (self.model == LEADER):
+        if (self.leader is None) == (self.model == LEADER_NAME):
             raise DrakeTeleopError(
                 "a leader arm requires `model: leader`, and this model a leader arm",
                 where=f"{where}.leader",
@@ -250,5 +260,5 @@ class Master:
 _MAX_PITCH_RAD = 1.5  # rad
 
 
-def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
+def data_sheet_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

@@ -10,7 +10,7 @@ from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step, twist_into
+from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step_device, twist_into
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay
 from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
 
@@ -23,7 +23,7 @@ _MAX_FRICTION_STEP = 2.0
 def _advance_device(device, work, stages, state, pose, twist, display, hand_wrench, drive, period):
     copy_into(display, 6, drive, 6, drive.shape[0] - 6)
     if all_in_range(hand_wrench) and all_in_range(drive[:6]):
-        step(state, hand_wrench, drive[:6], device, period, work, stages)
+        step_device(state, hand_wrench, drive[:6], device, period, work, stages)
         pose_into(state[:6], device, pose)
         twist_into(state[:6], state[6:], device, work[0], twist)
     copy_into(display, 0, state, 0, 6)

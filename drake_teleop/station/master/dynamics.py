@@ -59,7 +59,7 @@ def twist_into(q, v, device, J, twist):
 
 
 @njit(cache=True)
-def step(state, hand_wrench, motor, device, period, work, stages):
+def step_device(state, hand_wrench, motor, device, period, work, stages):
     """Advance `state` (12,) [q; v] in place by one Runge-Kutta step of `period` [s].
 
     `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `motor` (6,) are the motor
@@ -119,7 +119,7 @@ class HapticDevice(DisplayDevice):
     def friction_field(self) -> str:
         return "master.friction" if self.is_phantom else "master.figures"
 
-    def display_coordinates(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def coordinates_for_display(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         return q
 
     @property
@@ -144,11 +144,11 @@ class HapticDevice(DisplayDevice):
         else:
             task_space.check_limits(q, self.numbers)
 
-    def at_an_end(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_at_end_stop(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return for each row of q (N, 6) whether an end stop is active."""
         if self.is_phantom:
-            return phantom.at_an_end(q)
-        return task_space.at_an_end(q, self.numbers)
+            return phantom.is_at_end_stop(q)
+        return task_space.is_at_end_stop(q, self.numbers)
 
     def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         J = np.empty((6, 6))

@@ -15,12 +15,12 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
-from drake_teleop.station.passivity.memory import Slots
-from drake_teleop.station.passivity.packet import limit
+from drake_teleop.station.passivity.memory import SlotAllocator
+from drake_teleop.station.passivity.packet import limit_group
 from drake_teleop.station.passivity.safe_state import (
-    MASTER_WATCH,
-    STOP_TIME,
-    initial_master_watch,
+    MASTER_MONITOR_SIZE,
+    STOP_TIME_S,
+    initial_master_monitor,
     master_limits_into,
 )
 
@@ -28,27 +28,27 @@ from drake_teleop.station.passivity.safe_state import (
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
-_slots = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
+_slots = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
 _POSITIONS, _LAST_POSITIONS, DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
-_FAULT, _CHANGED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
-_WATCH = _slots.vector(MASTER_WATCH)
+_FAULT, _IS_WRENCH_REDUCED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
+_SILENCE_MONITOR = _slots.vector(MASTER_MONITOR_SIZE)
 _DISPLAYED_AND_FAULT = slice(DISPLAYED.start, _FAULT + 1)
-_NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING = map(
+_NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
 )
 
 
 @njit(cache=True)
-def _peak_wrench(numbers):
+def _peak_wrench_of_device(numbers):
     return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
 
 
 def initial_display_state(
     q: NDArray[np.float64], numbers: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    display = np.zeros(_WATCH.stop)
+    display = np.zeros(_SILENCE_MONITOR.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
-    display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
+    display[_SILENCE_MONITOR] = initial_master_monitor(_peak_wrench_of_device(numbers))
     return display
 
 
@@ -89,7 +89,7 @@ def display_into(wrench, device, numbers, period, J, drive):
     `device` (27,) is the port `for_display` of `MasterDevice`; `drive` (27,) is written.
     """
     q, fault = device[_POSITIONS], _NO_FAULT
-    copy_into(drive, 6, device, 6, _WATCH.stop - 6)
+    copy_into(drive, 6, device, 6, _SILENCE_MONITOR.stop - 6)
     if all_in_range(q):
         copy_into(drive, _LAST_POSITIONS.start, q, 0, 6)
     else:
@@ -99,7 +99,7 @@ def display_into(wrench, device, numbers, period, J, drive):
     displayed, drive[_FAULT] = drive[DISPLAYED], fault
     jacobian_into(q, numbers, J)
     limit_wrench_into(wrench, numbers, J, displayed)
-    if fault != _NO_FAULT or device[_CHANGED] != 0.0:
+    if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED] != 0.0:
         _fade_after_fault(device, numbers, period, drive)
     motor_torque_into(displayed, q, numbers, J, drive[:6])
 
@@ -107,21 +107,21 @@ def display_into(wrench, device, numbers, period, J, drive):
 @njit(cache=True)
 def _fade_after_fault(device, numbers, period, drive):
     displayed, last = drive[DISPLAYED], device[DISPLAYED]
-    limits, full = np.empty(2), _peak_wrench(numbers)
+    limits, full = np.empty(2), _peak_wrench_of_device(numbers)
     fault = drive[_FAULT] != _NO_FAULT
     drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
-    # Complete within STOP_TIME, so that the direction does not jump either.
-    share = 0.0 if fault else period / max(STOP_TIME + period - drive[_TIME_SINCE_FAULT], period)
+    # Complete within STOP_TIME_S, so that the direction does not jump either.
+    share = 0.0 if fault else period / max(STOP_TIME_S + period - drive[_TIME_SINCE_FAULT], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
-    master_limits_into(not fault, fault, period, 0.0, full, last, drive[_WATCH], limits)
-    drive[_CHANGED] = 0.0
+    master_limits_into(not fault, fault, period, 0.0, full, last, drive[_SILENCE_MONITOR], limits)
+    drive[_IS_WRENCH_REDUCED] = 0.0
     for g in range(2):
-        limit(displayed, g, limits[g])
+        limit_group(displayed, g, limits[g])
         if limits[g] < full[g]:
-            drive[_CHANGED] = 1.0
+            drive[_IS_WRENCH_REDUCED] = 1.0
     if not fault:
-        drive[_FAULT] = _RESUMING
+        drive[_FAULT] = _RESUMING_FAULT
 
 
 class DeviceBlock(LeafSystem):
@@ -144,7 +144,7 @@ class DeviceBlock(LeafSystem):
         self._advance, self._constants, self._period = advance, constants, period
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
         # A separate port for the display's memory would cost a further call.
-        display = initial_display_state(device.display_coordinates(q_initial), device.numbers)
+        display = initial_display_state(device.coordinates_for_display(q_initial), device.numbers)
         self._drive = self.DeclareVectorInputPort("drive", len(display))
         # Pose and twist are states because they are read more often than they change.
         for name, start in (
@@ -196,10 +196,10 @@ class ForceDisplay(LeafSystem):
         self._numbers = device.numbers
         self._jacobian = np.zeros((6, 6))
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
-        self._device = self.DeclareVectorInputPort("for_display", _WATCH.stop)
+        self._device = self.DeclareVectorInputPort("for_display", _SILENCE_MONITOR.stop)
         inputs = {self.all_input_ports_ticket()}
         self._drive = self.DeclareVectorOutputPort(
-            "drive", _WATCH.stop, weak_callback(self._calc_drive), inputs
+            "drive", _SILENCE_MONITOR.stop, weak_callback(self._calc_drive), inputs
         )
         # The log samples with the device, so the drive is calculated once.
         for name, size, calc in (

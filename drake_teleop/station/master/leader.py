@@ -20,8 +20,8 @@ from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, display_into
 from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.slave.arm import (
-    DAMPING,
-    GRAVITY,
+    DAMPING_COLUMN,
+    GRAVITY_COLUMN,
     ArmModel,
     forward_dynamics,
     forward_kinematics,
@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 # Coulomb friction is proportional to tanh(speed / FRICTION_SPEED): a slower joint creeps.
 FRICTION_SPEED = 0.02  # rad/s or m/s, estimate
 # Natural frequency of the critically damped end stops with the joint's inertia, estimate.
-_STOP_HZ = 12.0
+_END_STOP_FREQUENCY_HZ = 12.0
 
 
 @njit(cache=True)
@@ -97,7 +97,7 @@ def _pose_and_twist(arm, q, v, pose, twist):
 
 
 @njit(cache=True)
-def motors_into(bare, arm, joints, q, F, torque):
+def motor_torques_into(bare, arm, joints, q, F, torque):
     """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
 
     F (6,) is the wrench at E; `bare` is the arm's table without the hand.
@@ -131,11 +131,11 @@ def step_leader(
             F[i], F[3 + i] = drive[i], drive[5 - i]
         copy_into(applied, 0, hand_wrench, 0, 6)
         # The arm's own gravity vector may have any direction.
-        g = arm[n, GRAVITY : GRAVITY + 3]
+        g = arm[n, GRAVITY_COLUMN : GRAVITY_COLUMN + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
             applied[i] -= hand_weight * g[i] / size if size > 0.0 else 0.0
-        motors_into(bare, arm, joints, state[:n], F, motor)
+        motor_torques_into(bare, arm, joints, state[:n], F, motor)
         stage, slope, total = np.empty(2 * n), np.empty(2 * n), np.zeros(2 * n)
         copy_into(stage, 0, state, 0, 2 * n)
         for i in range(4):
@@ -157,7 +157,7 @@ def step_leader(
 def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
-    motors_into(bare, arm, joints, q, np.zeros(6), weight)
+    motor_torques_into(bare, arm, joints, q, np.zeros(6), weight)
     jacobian(arm, q, J)
     for i in range(n):
         torque = 0.0
@@ -199,10 +199,10 @@ class LeaderDevice(DisplayDevice):
         return self.arm.num_joints
 
     @property
-    def constants(self) -> tuple[Array, Array, Array]:
+    def compiled_constants(self) -> tuple[Array, Array, Array]:
         return self.bare.table, self.arm.table, self.joints
 
-    def display_coordinates(self, q: Array) -> Array:
+    def coordinates_for_display(self, q: Array) -> Array:
         """Return the vector (6,) for the force display: position of E (3) [m], three zeros."""
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
@@ -234,7 +234,7 @@ class LeaderDevice(DisplayDevice):
                 remedy="start within the limits of its joints",
             )
 
-    def at_an_end(self, q: Array) -> NDArray[np.bool_]:
+    def is_at_end_stop(self, q: Array) -> NDArray[np.bool_]:
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
@@ -246,7 +246,7 @@ class LeaderDevice(DisplayDevice):
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
+        own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING_COLUMN]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 
 
@@ -258,7 +258,7 @@ def joint_parameters(
     `coulomb` and `limit` are friction and torque limit [N m], `viscous` the damping in addition to
     the model's [N m s/rad], each (n,); `carried` is the compensated share of the weight.
     """
-    inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
+    inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _END_STOP_FREQUENCY_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
     return np.array([*rows, np.full(len(home), carried)])
 
@@ -282,12 +282,12 @@ class LeaderArm(DeviceBlock):
     __slots__ = ()
 
     def __init__(self, period: float, device: LeaderDevice, q_initial: Array) -> None:
-        constants = (*device.constants, _operator_hand_weight(device))
+        constants = (*device.compiled_constants, _operator_hand_weight(device))
         super().__init__(period, device, q_initial, step_leader, constants)
 
 
 def _operator_hand_weight(device: LeaderDevice) -> float:
-    gravity = np.linalg.norm(device.arm.table[-1, GRAVITY : GRAVITY + 3])
+    gravity = np.linalg.norm(device.arm.table[-1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3])
     return float(device.numbers[HAND_MASS] * gravity)
 
 
@@ -313,7 +313,7 @@ class LeaderDisplay(ForceDisplay):
     def __init__(self, period: float, device: LeaderDevice) -> None:
         super().__init__(period, device)
         self._joints = self.DeclareVectorInputPort("state", 2 * device.num_joints)
-        self._constants, self._n = device.constants, device.num_joints
+        self._constants, self._n = device.compiled_constants, device.num_joints
         self._shortened = np.zeros(6)
 
     def _calc_drive(self, context: Context, output: BasicVector) -> None:

@@ -17,15 +17,15 @@ from drake_teleop.station.master.numbers import (
     HAND_INERTIA,
     HAND_MASS,
     IN_TASK_SPACE,
-    NUMBERS,
+    NUM_DEVICE_PARAMETERS,
     PEAK_FORCE,
     PEAK_TORQUE,
 )
 from drake_teleop.station.slave.arm import (
-    PHI,
-    ROTATION,
-    ROTOR,
-    TRANSLATION,
+    PHI_COLUMN,
+    ROTATION_COLUMN,
+    ROTOR_COLUMN,
+    TRANSLATION_COLUMN,
     ArmModel,
     forward_kinematics,
 )
@@ -34,7 +34,7 @@ from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
 Array = NDArray[np.float64]
-JOINTS = "joints"
+JOINT_MODE = "joints"
 
 
 @settings
@@ -69,7 +69,7 @@ class Leader:
     peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "largest displayed torque about each axis")
     leads: str = choice(
         "pose",
-        ("pose", JOINTS),
+        ("pose", JOINT_MODE),
         "pose: commands X_WS; joints: each joint commands that of a slave with equal kinematics",
     )
 
@@ -96,7 +96,9 @@ class Leader:
             package_paths=[str((folder / path).resolve()) for path in self.package_paths],
         )
 
-    def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
+    def add_to_plant(
+        self, plant: MultibodyPlant, X_Table: RigidTransform | None = None
+    ) -> ParsedModel:
         """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world."""
         X_BBase = RigidTransform(RollPitchYaw(self.base_rotation), np.zeros(3))
         X_WBase = X_BBase if X_Table is None else X_Table @ X_BBase
@@ -109,33 +111,35 @@ class Leader:
         At home the hand's point E is at `position` (3,) [m] in the base frame B.
         """
         plant = MultibodyPlant(0.0)
-        parsed = self.parse(plant)
+        parsed = self.add_to_plant(plant)
         with translate_drake_errors(Path(self.file)):
             plant.Finalize()
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
-        home = self._home(arm)
+        home = self._home_positions(arm)
         bare = _with_end_frame_E(arm, home, np.array(position))
         phi = bare.phi_load
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
         held = bare.with_load(phi)
-        coulomb, viscous = (self._per_joint(name, arm, 0.0) for name in ("friction", "damping"))
-        limit = self._per_joint("torque_limit", arm, arm.effort_limit)
+        coulomb, viscous = (
+            self._value_per_joint(name, arm, 0.0) for name in ("friction", "damping")
+        )
+        limit = self._value_per_joint("torque_limit", arm, arm.effort_limit)
         joints = joint_parameters(held, home, coulomb, viscous, limit, self.weight_carried)
-        numbers = np.zeros(NUMBERS)
+        numbers = np.zeros(NUM_DEVICE_PARAMETERS)
         numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = self.peak_force, self.peak_torque
         numbers[IN_TASK_SPACE] = 1.0
         return LeaderDevice(held, bare, joints, home, numbers)
 
-    def _home(self, arm: ArmModel) -> Array:
+    def _home_positions(self, arm: ArmModel) -> Array:
         if self.home:
-            return self._per_joint("home", arm, 0.0)
+            return self._value_per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
-        return np.where(within, 0.0, arm.middle)
+        return np.where(within, 0.0, arm.middle_positions)
 
-    def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
+    def _value_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(
@@ -151,11 +155,11 @@ def _with_end_frame_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
-    table[0, TRANSLATION:PHI] += p_BE - p
+    table[0, TRANSLATION_COLUMN:PHI_COLUMN] += p_BE - p
     # R rotates the hand's frame into B, so that E has B's axes at home.
-    R_LS = table[n, ROTATION:TRANSLATION].reshape(3, 3)
-    table[n, ROTATION:TRANSLATION] = (R_LS @ R.T).ravel()
-    phi, upper = table[n, PHI:ROTOR], np.triu_indices(3)
+    R_LS = table[n, ROTATION_COLUMN:TRANSLATION_COLUMN].reshape(3, 3)
+    table[n, ROTATION_COLUMN:TRANSLATION_COLUMN] = (R_LS @ R.T).ravel()
+    phi, upper = table[n, PHI_COLUMN:ROTOR_COLUMN], np.triu_indices(3)
     inertia = np.zeros((3, 3))
     inertia[upper] = phi[4:]
     inertia = inertia + np.triu(inertia, 1).T

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from drake_teleop.station.passivity.memory import Slots
+from drake_teleop.station.passivity.memory import SlotAllocator
 
-NUMBERS = 31  #: length of the vector
-_slots = Slots(NUMBERS)
+NUM_DEVICE_PARAMETERS = 31  #: length of the vector
+_slots = SlotAllocator(NUM_DEVICE_PARAMETERS)
 HAND_MASS = _slots.number()  #: mass of the hand on the grip [kg]
 HAND_INERTIA = _slots.number()  #: inertia of the hand about every axis through E [kg m^2]
 COULOMB = _slots.vector(6)  #: Coulomb friction of the device's axes [N or N m]
@@ -16,6 +16,6 @@ IN_TASK_SPACE = _slots.number()  #: 1 for a device of `task_space`, 0 for the Ph
 # Only for a device in task space:
 MASS = _slots.number()  #: apparent mass at the grip [kg]
 INERTIA = _slots.number()  #: apparent inertia at the grip about every axis [kg m^2]
-CENTRE = _slots.vector(3)  #: centre of the workspace, p_B [m]
+CENTRE_OF_WORKSPACE = _slots.vector(3)  #: centre of the workspace, p_B [m]
 HALF_SIZE = _slots.vector(3)  #: half edges of the workspace [m]
-TURN = _slots.vector(3)  #: largest yaw, pitch and roll [rad]
+MAX_ROTATION = _slots.vector(3)  #: largest yaw, pitch and roll [rad]

@@ -190,7 +190,7 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
 
 
 @njit(cache=True)
-def _stop_torque(angle, rate, lower, upper, stiffness, damping):
+def _end_stop_torque(angle, rate, lower, upper, stiffness, damping):
     if angle > upper:
         return min(0.0, -stiffness * (angle - upper) - damping * rate)
     if angle < lower:
@@ -204,8 +204,10 @@ def _add_friction_and_stops(q, v, coulomb, viscous, torque):
         torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED) + viscous[i] * v[i]
         stiffness = _STOP_STIFFNESS if i < 3 else _WRIST_STOP_STIFFNESS
         damping = _STOP_DAMPING if i < 3 else _WRIST_STOP_DAMPING
-        torque[i] += _stop_torque(q[i], v[i], JOINT_LOWER[i], JOINT_UPPER[i], stiffness, damping)
-    five_bar = _stop_torque(
+        torque[i] += _end_stop_torque(
+            q[i], v[i], JOINT_LOWER[i], JOINT_UPPER[i], stiffness, damping
+        )
+    five_bar = _end_stop_torque(
         q[1] - q[2],
         v[1] - v[2],
         FIVE_BAR_RANGE[0],
@@ -314,7 +316,7 @@ def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
     return serial
 
 
-def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_at_end_stop(q: NDArray[np.float64]) -> NDArray[np.bool_]:
     folded = q[:, 1] - q[:, 2]
     beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
     return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])

@@ -16,14 +16,14 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross, plus, scale_vector
 from drake_teleop.station.master.numbers import (
-    CENTRE,
+    CENTRE_OF_WORKSPACE,
     COULOMB,
     HALF_SIZE,
     HAND_INERTIA,
     HAND_MASS,
     INERTIA,
     MASS,
-    TURN,
+    MAX_ROTATION,
     VISCOUS,
 )
 
@@ -64,7 +64,7 @@ def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
 
 
 @njit(cache=True)
-def _stop_force(beyond, rate, stiffness, damping):
+def _end_stop_force(beyond, rate, stiffness, damping):
     if beyond > 0.0:
         return min(0.0, -stiffness * beyond - damping * rate)
     if beyond < 0.0:
@@ -73,7 +73,7 @@ def _stop_force(beyond, rate, stiffness, damping):
 
 
 @njit(cache=True)
-def _penetration(x, half):
+def _penetration_into_end_stop(x, half):
     return x - half if x > half else (x + half if x < -half else 0.0)
 
 
@@ -84,8 +84,10 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     mass = device[MASS] + device[HAND_MASS]
     drag = _friction_factor(v[:3], device[COULOMB.start], device[VISCOUS.start], FRICTION_SPEED)
     for i in range(3):
-        beyond = _penetration(q[i] - device[CENTRE][i], device[HALF_SIZE][i])
-        stop = _stop_force(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
+        beyond = _penetration_into_end_stop(
+            q[i] - device[CENTRE_OF_WORKSPACE][i], device[HALF_SIZE][i]
+        )
+        stop = _end_stop_force(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
     # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
@@ -101,8 +103,8 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     # Joint torques of motors and stops, then of moments about B's axes.
     torque = np.empty(3)
     for i in range(3):
-        beyond = _penetration(q[3 + i], device[TURN][i])
-        torque[i] = motor[3 + i] + _stop_force(
+        beyond = _penetration_into_end_stop(q[3 + i], device[MAX_ROTATION][i])
+        torque[i] = motor[3 + i] + _end_stop_force(
             beyond, v[3 + i], _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
         )
         for k in range(3):
@@ -153,21 +155,24 @@ def inverse_kinematics(
 def _outside_workspace(
     q: NDArray[np.float64], device: NDArray[np.float64], margin: float
 ) -> NDArray[np.bool_]:
-    centre = np.append(device[CENTRE], np.zeros(3))
-    return np.abs(q - centre) > np.append(device[HALF_SIZE], device[TURN]) + margin
+    centre = np.append(device[CENTRE_OF_WORKSPACE], np.zeros(3))
+    return np.abs(q - centre) > np.append(device[HALF_SIZE], device[MAX_ROTATION]) + margin
 
 
-def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return (_outside_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
-        axis=1
-    )
+def is_at_end_stop(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return (
+        _outside_workspace(q, device, 0.0) & np.append([True] * 3, device[MAX_ROTATION] > 0.0)
+    ).any(axis=1)
 
 
 def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
     if _outside_workspace(q, device, 1e-9).any():
-        low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
+        low, high = (
+            device[CENTRE_OF_WORKSPACE] - device[HALF_SIZE],
+            device[CENTRE_OF_WORKSPACE] + device[HALF_SIZE],
+        )
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
-        turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[TURN]))
+        turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[MAX_ROTATION]))
         raise DrakeTeleopError(
             f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, turned by "
             f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "

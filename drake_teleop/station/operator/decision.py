@@ -14,19 +14,23 @@ from numpy.typing import NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.noise import random_bits, random_normal
 from drake_teleop.station.operator.minimum_jerk import (
-    PLAN,
     PLAN_SIZE,
-    STOP,
+    PLAN_START,
+    STOP_DURATION_S,
     evaluate_plan,
     plan_move,
     plan_stop,
 )
-from drake_teleop.station.operator.perception import NOTICED, THRESHOLD, Perception
+from drake_teleop.station.operator.perception import (
+    CONTACT_NOTICED_INDEX,
+    THRESHOLD_INDEX,
+    Perception,
+)
 from drake_teleop.station.operator.task import (
-    INSERT,
-    KINDS,
-    PRESS,
-    REACH,
+    KIND_INSERT,
+    KIND_PRESS,
+    KIND_REACH,
+    TASK_CLASSES,
     Insert,
     Movement,
     Press,
@@ -36,22 +40,22 @@ from drake_teleop.station.operator.task import (
 
 Array = NDArray[np.float64]
 
-PERIOD = 0.005
+DECISION_PERIOD_S = 0.005
 """Period of perception and decision [s]; a submovement takes at least 40 periods by default."""
 
 # Indices of a packed task.
-_KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _TARGET_RADIUS, _DWELL = 0, 1, 2, 3, 6, 9, 10
-_STANDOFF, _FORCE, _TOLERANCE, _DEPTH, _TASK = 11, 12, 13, 14, 15
-_STREAM = 2  # random stream; the network's lines use others
+_TASK_KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _TARGET_RADIUS, _DWELL = 0, 1, 2, 3, 6, 9, 10
+_STANDOFF, _FORCE, _TOLERANCE, _DEPTH, _TASK_SIZE = 11, 12, 13, 14, 15
+_RANDOM_STREAM = 2  # random stream; the network's lines use others
 # Indices of a packed person: training, movement and perception.
-_SCALE, _FORCE_GAIN, _VISION_WAIT, _FORCE_WAIT, _KEY = 0, 1, 2, 3, 4
+_SCALE, _FORCE_GAIN, _VISION_WAIT, _FORCE_WAIT, _RANDOM_KEY = 0, 1, 2, 3, 4
 _ACCELERATION, _MIN_DURATION, _NOISE, _APPROACH_SPEED, _GENTLE_FORCE = range(5, 10)
 _VISION_NOISE, _DEPTH_ERROR = 10, 11
-_AIM_ERROR, _WEBER, _R_WB = 12, 13, 14
+_AIM_ERROR, _WEBER_FRACTION, _R_WB = 12, 13, 14
 
 
 @dataclass(frozen=True, eq=False)
-class Training:
+class OperatorTraining:
     """Station properties that the operator learns in training, before a task.
 
     Args:
@@ -69,10 +73,12 @@ class Training:
     seed: int
 
 
-def pack_person(training: Training, perception: Perception, movement: Movement) -> Array:
+def pack_operator_parameters(
+    training: OperatorTraining, perception: Perception, movement: Movement
+) -> Array:
     there_and_back = training.forward + training.backward + _EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
-    key = float(random_bits(np.uint64(training.seed % 2**64), _STREAM))
+    key = float(random_bits(np.uint64(training.seed % 2**64), _RANDOM_STREAM))
     return np.array(
         [
             *(training.translation_scale, training.force_gain),
@@ -86,9 +92,13 @@ def pack_person(training: Training, perception: Perception, movement: Movement) 
     )
 
 
-def pack_task(task: Task) -> Array:
-    packed = np.zeros(_TASK)
-    packed[[_KIND, _T_START, _TIMEOUT]] = KINDS.index(type(task)), task.t_start, task.timeout
+def pack_task_parameters(task: Task) -> Array:
+    packed = np.zeros(_TASK_SIZE)
+    packed[[_TASK_KIND, _T_START, _TIMEOUT]] = (
+        TASK_CLASSES.index(type(task)),
+        task.t_start,
+        task.timeout,
+    )
     packed[_GOAL : _GOAL + 3] = task.translation
     packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.distance
     if isinstance(task, Reach):
@@ -105,16 +115,25 @@ def pack_task(task: Task) -> Array:
 
 
 # Indices of `state` in `update_decision`.
-PHASE, DONE, FELT, LIMIT, TRUST, STATE = 0, 1, 2, 3, 4, 5
+PHASE_INDEX, OUTCOME_INDEX, CONTACT_PERCEIVED_INDEX = range(3)
+FORCE_LIMIT_INDEX, TRUST_INDEX, STATE_SIZE = range(3, 6)
 """Indices of the signal task_state, and its size."""
-WAITING, MOVING, FEELING, STOPPING, PRESSING, SEEKING, OVER = range(7)
+(
+    PHASE_WAITING,
+    PHASE_MOVING,
+    PHASE_APPROACHING,
+    PHASE_STOPPING,
+    PHASE_PRESSING,
+    PHASE_SEARCHING_SLOT,
+    PHASE_OVER,
+) = range(7)
 """Phases: before the start; move by vision; careful approach until contact; stop; force control;
 search for the slot; finished or given up."""
 # Memory: number of steps; earliest time of the next submovement; time at which the aim was met,
 # else -1; estimated contact stiffness; force and displacement of the last press; number of
 # searches; plan.
 _STEP, _NEXT_TIME, _MET_SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _SEARCHES = range(7)
-MEMORY = PLAN + PLAN_SIZE
+MEMORY_SIZE = PLAN_START + PLAN_SIZE
 
 _FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
 _EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, estimate
@@ -125,17 +144,17 @@ _MIN_TRUST = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_STIFFNESS, _MIN_STIFFNESS, _MAX_STIFFNESS = 2000.0, 200.0, 50000.0
 _MAX_PRESS_M = 0.003  # m, longest correction of the force, at the tool, estimate
-_STUCK_SHARE = 0.5  # share of the push force above which the peg is stuck, estimate
+_STUCK_FORCE_SHARE = 0.5  # share of the push force above which the peg is stuck, estimate
 # Compliance to lateral force [N/m], largest yield [m], estimates.
-_YIELD_STIFFNESS, _MAX_YIELD_M = 5000.0, 0.0015
+_LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M = 5000.0, 0.0015
 # Spiral of the search: radius [m] over sqrt(number of searches), estimate; golden angle [rad].
-_SPIRAL_M, _GOLDEN_ANGLE = 0.5e-3, 2.399963
-_FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floor, estimate
+_SEARCH_SPIRAL_PITCH_M, _GOLDEN_ANGLE = 0.5e-3, 2.399963
+_DEPTH_SHARE_AT_FLOOR = 0.8  # share of the depth beyond which contact counts as the floor, estimate
 
 
 def initial_memory() -> Array:
-    memory = np.zeros(MEMORY)
-    memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
+    memory = np.zeros(MEMORY_SIZE)
+    memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN_START + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
     return memory
 
 
@@ -149,7 +168,7 @@ def _convert_to_hand(person, vector_W, out):
 
 @njit(cache=True)
 def _random_number(person, step, draw):
-    return random_normal(np.uint64(person[_KEY]), 16 * step + draw)
+    return random_normal(np.uint64(person[_RANDOM_KEY]), 16 * step + draw)
 
 
 @njit(cache=True)
@@ -190,7 +209,7 @@ def _contact_force_along_axis(task, person, felt):
 
 
 @njit(cache=True)
-def _is_met(memory, time, good, still_good):
+def _is_criterion_met(memory, time, good, still_good):
     if memory[_MET_SINCE] < 0.0 and good:
         memory[_MET_SINCE] = time
     elif not still_good:
@@ -200,13 +219,13 @@ def _is_met(memory, time, good, still_good):
 
 @njit(cache=True)
 def _finish_task(state, memory, time, outcome):
-    state[PHASE], state[DONE] = OVER, outcome
+    state[PHASE_INDEX], state[OUTCOME_INDEX] = PHASE_OVER, outcome
     plan_stop(memory, time)
 
 
 @njit(cache=True)
 def _enter_phase(state, memory, phase, ready):
-    state[PHASE], memory[_NEXT_TIME], memory[_MET_SINCE] = phase, ready, -1.0
+    state[PHASE_INDEX], memory[_NEXT_TIME], memory[_MET_SINCE] = phase, ready, -1.0
 
 
 @njit(cache=True)
@@ -215,46 +234,56 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 
     Args:
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
-        felt: (5,) output of `perceive_into`, delayed by the reaction time.
+        felt: (5,) output of `update_perception_into`, delayed by the reaction time.
         state: (5,) phase; 1 done or -1 given up; 1 while contact is detected; detection threshold
             [N]; trust (0.1 to 1) in detecting contact; updated.
         memory: (MEMORY,) from `initial_memory`, updated.
     """
     step = int(memory[_STEP])
     memory[_STEP] += 1.0
-    state[FELT], state[LIMIT] = felt[NOTICED], felt[THRESHOLD]
+    state[CONTACT_PERCEIVED_INDEX], state[FORCE_LIMIT_INDEX] = (
+        felt[CONTACT_NOTICED_INDEX],
+        felt[THRESHOLD_INDEX],
+    )
     # Ratio of the smallest detectable to the largest harmless contact force at the tool.
     unnoticed = math.inf
     if person[_FORCE_GAIN] > 0.0:
-        unnoticed = felt[THRESHOLD] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
-    state[TRUST] = max(1.0 / (1.0 + unnoticed), _MIN_TRUST)
-    if state[PHASE] == WAITING and time >= task[_T_START]:
-        _enter_phase(state, memory, MOVING, time)
-    if state[PHASE] in (WAITING, OVER):
+        unnoticed = felt[THRESHOLD_INDEX] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
+    state[TRUST_INDEX] = max(1.0 / (1.0 + unnoticed), _MIN_TRUST)
+    if state[PHASE_INDEX] == PHASE_WAITING and time >= task[_T_START]:
+        _enter_phase(state, memory, PHASE_MOVING, time)
+    if state[PHASE_INDEX] in (PHASE_WAITING, PHASE_OVER):
         return
     if time - task[_T_START] > task[_TIMEOUT]:
         _finish_task(state, memory, time, -1.0)
-    elif state[PHASE] == MOVING:
+    elif state[PHASE_INDEX] == PHASE_MOVING:
         _move_by_vision(task, person, step, time, seen_W, state, memory)
-    elif state[PHASE] == FEELING:
-        _approach(task, person, time, seen_W, felt, state, memory)
-    elif state[PHASE] == STOPPING and time >= memory[_NEXT_TIME]:
-        if task[_KIND] == PRESS:
-            _enter_phase(state, memory, PRESSING, time)
-        elif _is_met(memory, time, True, True) and time - memory[_MET_SINCE] >= task[_DWELL]:
+    elif state[PHASE_INDEX] == PHASE_APPROACHING:
+        _approach_contact(task, person, time, seen_W, felt, state, memory)
+    elif state[PHASE_INDEX] == PHASE_STOPPING and time >= memory[_NEXT_TIME]:
+        if task[_TASK_KIND] == KIND_PRESS:
+            _enter_phase(state, memory, PHASE_PRESSING, time)
+        elif (
+            _is_criterion_met(memory, time, True, True)
+            and time - memory[_MET_SINCE] >= task[_DWELL]
+        ):
             _finish_task(state, memory, time, 1.0)
-    elif state[PHASE] == PRESSING:
+    elif state[PHASE_INDEX] == PHASE_PRESSING:
         _control_force(task, person, step, time, felt, state, memory)
-    elif state[PHASE] == SEEKING and time >= memory[_NEXT_TIME]:
+    elif state[PHASE_INDEX] == PHASE_SEARCHING_SLOT and time >= memory[_NEXT_TIME]:
         _search_slot(task, person, step, time, seen_W, felt, state, memory)
 
 
 @njit(cache=True)
 def _seen_target(task, person, out):
-    depth = 0.0 if task[_KIND] == REACH else person[_DEPTH_ERROR] * _random_number(person, 0, 15)
+    depth = (
+        0.0
+        if task[_TASK_KIND] == KIND_REACH
+        else person[_DEPTH_ERROR] * _random_number(person, 0, 15)
+    )
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
-        if task[_KIND] == INSERT and i < 2:
+        if task[_TASK_KIND] == KIND_INSERT and i < 2:
             out[i] += person[_AIM_ERROR] * _random_number(person, 0, 13 + i)
 
 
@@ -276,13 +305,15 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
         error[i] -= seen_W[i]
         off += error[i] * error[i]
     off = math.sqrt(off)
-    met = _is_met(memory, time, off <= 0.8 * task[_TARGET_RADIUS], off <= task[_TARGET_RADIUS])
-    if task[_KIND] == REACH:
+    met = _is_criterion_met(
+        memory, time, off <= 0.8 * task[_TARGET_RADIUS], off <= task[_TARGET_RADIUS]
+    )
+    if task[_TASK_KIND] == KIND_REACH:
         if met and time - memory[_MET_SINCE] >= task[_DWELL]:
             _finish_task(state, memory, time, 1.0)
             return
     elif met and time >= memory[_NEXT_TIME]:
-        _enter_phase(state, memory, FEELING, time)
+        _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
     if not met and time >= memory[_NEXT_TIME]:
         duration = _plan_submovement(person, memory, step, time, error)
@@ -290,24 +321,26 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
 
 
 @njit(cache=True)
-def _approach(task, person, time, seen_W, felt, state, memory):
-    if task[_KIND] == INSERT:
-        if state[FELT] > 0.0 and _is_stuck(task, person, felt):
+def _approach_contact(task, person, time, seen_W, felt, state, memory):
+    if task[_TASK_KIND] == KIND_INSERT:
+        if state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_stuck(task, person, felt):
             plan_stop(memory, time)
-            _enter_phase(state, memory, SEEKING, time + STOP + person[_FORCE_WAIT])
+            _enter_phase(
+                state, memory, PHASE_SEARCHING_SLOT, time + STOP_DURATION_S + person[_FORCE_WAIT]
+            )
             return
-    elif state[FELT] > 0.0:
+    elif state[CONTACT_PERCEIVED_INDEX] > 0.0:
         plan_stop(memory, time)
-        _enter_phase(state, memory, STOPPING, time + STOP + person[_FORCE_WAIT])
+        _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person[_FORCE_WAIT])
         return
     if _seen_depth(task, person, seen_W) > task[_DEPTH] + _MAX_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         for i in range(3):
-            velocity_W[i] = state[TRUST] * person[_APPROACH_SPEED] * task[_AXIS + i]
+            velocity_W[i] = state[TRUST_INDEX] * person[_APPROACH_SPEED] * task[_AXIS + i]
         _convert_to_hand(person, velocity_W, speed)
-        plan = memory[PLAN : PLAN + PLAN_SIZE]
+        plan = memory[PLAN_START : PLAN_START + PLAN_SIZE]
         for i in range(3):
             change[i] = 0.5 * _APPROACH_UPDATE_S * (evaluate_plan(plan, time, i)[1] + speed[i])
         plan_move(memory, time, _APPROACH_UPDATE_S, change, speed)
@@ -316,7 +349,9 @@ def _approach(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _perceived_force(task, person, felt, memory):
-    error = person[_WEBER] * _random_number(person, int(memory[_NEXT_TIME] / PERIOD), 3)
+    error = person[_WEBER_FRACTION] * _random_number(
+        person, int(memory[_NEXT_TIME] / DECISION_PERIOD_S), 3
+    )
     return (1.0 + error) * _contact_force_along_axis(task, person, felt)
 
 
@@ -337,7 +372,9 @@ def _press_displacement(task, memory, force):
 def _control_force(task, person, step, time, felt, state, memory):
     force = _perceived_force(task, person, felt, memory)
     error = abs(task[_FORCE] - force)
-    met = _is_met(memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE])
+    met = _is_criterion_met(
+        memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE]
+    )
     if met and time - memory[_MET_SINCE] >= task[_DWELL]:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_TIME]:
@@ -360,7 +397,7 @@ def _lateral_force_into(task, person, felt, out):
 
 @njit(cache=True)
 def _is_stuck(task, person, felt):
-    limit = _STUCK_SHARE * task[_FORCE]
+    limit = _STUCK_FORCE_SHARE * task[_FORCE]
     sideways = _lateral_force_into(task, person, felt, np.empty(3))
     return _contact_force_along_axis(task, person, felt) >= limit or sideways >= limit
 
@@ -368,25 +405,29 @@ def _is_stuck(task, person, felt):
 @njit(cache=True)
 def _search_slot(task, person, step, time, seen_W, felt, state, memory):
     force = _perceived_force(task, person, felt, memory)
-    if not (state[FELT] > 0.0 and _is_stuck(task, person, felt)):
-        _enter_phase(state, memory, FEELING, time)
+    if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_stuck(task, person, felt)):
+        _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _seen_depth(task, person, seen_W) >= _FLOOR_SHARE * task[_DEPTH]
-    if deep and abs(force - task[_FORCE]) <= _STUCK_SHARE * task[_FORCE]:
-        _enter_phase(state, memory, STOPPING, time)
+    deep = _seen_depth(task, person, seen_W) >= _DEPTH_SHARE_AT_FLOOR * task[_DEPTH]
+    if deep and abs(force - task[_FORCE]) <= _STUCK_FORCE_SHARE * task[_FORCE]:
+        _enter_phase(state, memory, PHASE_STOPPING, time)
         return
     move, push = np.empty(3), _press_displacement(task, memory, force)
     sideways = _lateral_force_into(task, person, felt, move)
-    if sideways >= state[LIMIT] / person[_FORCE_GAIN]:
-        share = min(1.0 / _YIELD_STIFFNESS, _MAX_YIELD_M / sideways)
+    if sideways >= state[FORCE_LIMIT_INDEX] / person[_FORCE_GAIN]:
+        share = min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)
         for i in range(3):
             move[i] *= share
     else:
         n = memory[_SEARCHES]
         memory[_SEARCHES] += 1.0
         for k in range(2):
-            before = _SPIRAL_M * math.sqrt(n) * math.cos(_GOLDEN_ANGLE * n - 0.5 * math.pi * k)
-            now = _SPIRAL_M * math.sqrt(n + 1)
+            before = (
+                _SEARCH_SPIRAL_PITCH_M
+                * math.sqrt(n)
+                * math.cos(_GOLDEN_ANGLE * n - 0.5 * math.pi * k)
+            )
+            now = _SEARCH_SPIRAL_PITCH_M * math.sqrt(n + 1)
             now *= math.cos(_GOLDEN_ANGLE * (n + 1) - 0.5 * math.pi * k)
             move[k] = now - before
         move[2] = 0.0

@@ -28,9 +28,9 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
-from drake_teleop.station.operator.decision import Training
+from drake_teleop.station.operator.decision import OperatorTraining
 from drake_teleop.station.operator.minimum_jerk import add_plan_into
-from drake_teleop.station.operator.perception import Perception, perceive_into
+from drake_teleop.station.operator.perception import Perception, update_perception_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
@@ -51,7 +51,7 @@ class HandImpedance:
 
 
 #: Hand impedance by grip.
-GRIPS = {
+GRIP_IMPEDANCES = {
     "light": HandImpedance(0.10, 2.0, 50.0, 0.9e-4, 0.015, 0.5),
     "medium": HandImpedance(0.25, 8.0, 250.0, 2.25e-4, 0.035, 1.5),
     "firm": HandImpedance(0.50, 20.0, 700.0, 4.5e-4, 0.060, 3.0),
@@ -95,7 +95,7 @@ class Sine:
 class OperatorConfig:
     """Grip, intended motion and task of the operator."""
 
-    grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
+    grip: str = choice("medium", tuple(GRIP_IMPEDANCES), "stiffness, damping and mass of the hand")
     intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
     task: Reach | Touch | Press | Insert | None = plain(
         None, "task with vision and force perception, in addition to the intent"
@@ -106,7 +106,7 @@ class OperatorConfig:
     @property
     def hand(self) -> HandImpedance:
         """Impedance of the hand for the configured grip."""
-        return GRIPS[self.grip]
+        return GRIP_IMPEDANCES[self.grip]
 
 
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
@@ -130,7 +130,7 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _ramp(time, length):
+def _minimum_jerk_ramp(time, length):
     u = time / length
     if u <= 0.0:
         return 0.0, 0.0
@@ -140,7 +140,7 @@ def _ramp(time, length):
 
 
 @njit(cache=True)
-def intent_into(packed, start, t, pose, twist):
+def intended_motion_into(packed, start, t, pose, twist):
     """Write the intended pose X_BE (7,) and twist [v; omega] (6,) of the hand at time t [s].
 
     `start` (7,) is X_BE before the first segment. Translations add; rotations apply in the order of
@@ -152,8 +152,8 @@ def intent_into(packed, start, t, pose, twist):
     twist[:3] = 0.0
     for n in range(packed.shape[0]):
         row = packed[n]
-        fade_in, fade_in_rate = _ramp(t - row[0], row[1])
-        fade_out, fade_out_rate = _ramp(t - row[2], row[3])
+        fade_in, fade_in_rate = _minimum_jerk_ramp(t - row[0], row[1])
+        fade_out, fade_out_rate = _minimum_jerk_ramp(t - row[2], row[3])
         angle = row[4] * (t - row[0]) + row[5]
         level = (fade_in - fade_out) * math.sin(angle)
         rate = (fade_in_rate - fade_out_rate) * math.sin(angle)
@@ -190,7 +190,7 @@ def unit_pose_into(pose, twist, out):
 
 
 @njit(cache=True)
-def _limit(vector, limit):
+def _limit_length(vector, limit):
     length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
     if length > limit:
         for k in range(3):
@@ -213,13 +213,13 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit(wrench[:3], _MAX_FORCE_N)
-    _limit(wrench[3:], _MAX_TORQUE_NM)
+    _limit_length(wrench[:3], _MAX_FORCE_N)
+    _limit_length(wrench[3:], _MAX_TORQUE_NM)
 
 
 @njit(cache=True)
-def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
-    intent_into(packed, start, time, pose, twist)
+def _intended_or_planned_motion_into(packed, start, moving, memory, time, pose, twist):
+    intended_motion_into(packed, start, time, pose, twist)
     for k in range(6):
         twist[k] += moving[k]
     if memory.shape[0] > 0:
@@ -230,7 +230,7 @@ def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
 def _hand_wrench_at(
     packed, start, moving, memory, time, impedance, intent_pose, intent_twist, pose, twist, wrench
 ):  # fmt: skip
-    _intended_motion_into(packed, start, moving, memory, time, intent_pose, intent_twist)
+    _intended_or_planned_motion_into(packed, start, moving, memory, time, intent_pose, intent_twist)
     hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench)
 
 
@@ -250,12 +250,12 @@ def _perceive_and_decide(
         person, step, displacement, seen_displacements[step % seen_displacements.shape[0]]
     )
     # Before contact is expected, only the expectation is updated.
-    attentive = task_state[decision.PHASE] > decision.MOVING
+    attentive = task_state[decision.PHASE_INDEX] > decision.PHASE_MOVING
     felt = perceived_forces[step % perceived_forces.shape[0]]
-    perceive_into(
+    update_perception_into(
         force_memory,
         senses,
-        decision.PERIOD,
+        decision.DECISION_PERIOD_S,
         hand_mass,
         hand_wrench[:3],
         twist[:3],
@@ -271,7 +271,7 @@ def _perceive_and_decide(
 
 
 def _make_ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.tile(start, (round(delay / decision.PERIOD) + 1, 1))
+    return np.tile(start, (round(delay / decision.DECISION_PERIOD_S) + 1, 1))
 
 
 class Operator(LeafSystem):
@@ -302,7 +302,7 @@ class Operator(LeafSystem):
         self,
         config: OperatorConfig,
         start: NDArray[np.float64],
-        training: Training | None = None,
+        training: OperatorTraining | None = None,
         arm: ArmModel | None = None,
         tip: NDArray[np.float64] | None = None,
     ) -> None:
@@ -319,7 +319,7 @@ class Operator(LeafSystem):
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
         self._twist = self.DeclareVectorInputPort("twist_master", 6)
-        moving = self._declare_intention() | {self.time_ticket()}
+        moving = self._declare_intended_motion() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
                 raise ValueError("a task needs training, arm and tip")
@@ -328,7 +328,7 @@ class Operator(LeafSystem):
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
-    def _declare_intention(self) -> set[DependencyTicket]:
+    def _declare_intended_motion(self) -> set[DependencyTicket]:
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
         twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
         return {pose.ticket(), twist.ticket()}
@@ -337,7 +337,7 @@ class Operator(LeafSystem):
         self,
         config: OperatorConfig,
         task: Task,
-        training: Training,
+        training: OperatorTraining,
         arm: ArmModel,
         tip: NDArray[np.float64],
     ) -> DependencyTicket:
@@ -348,9 +348,9 @@ class Operator(LeafSystem):
         )
         self._perceived_forces = _make_ring_buffer(senses.reaction_time, nothing_felt)
         self._task_parameters = (
-            decision.pack_task(task),
-            decision.pack_person(training, senses, config.movement),
-            senses.parameters(decision.PERIOD),
+            decision.pack_task_parameters(task),
+            decision.pack_operator_parameters(training, senses, config.movement),
+            senses.compiled_parameters(decision.DECISION_PERIOD_S),
             config.hand.mass,
             arm.table,
             np.array(tip, dtype=float),
@@ -358,7 +358,7 @@ class Operator(LeafSystem):
         self._joints = arm.num_joints
         self._slave = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         state = (
-            np.zeros(decision.STATE),
+            np.zeros(decision.STATE_SIZE),
             decision.initial_memory(),
             feeling.initial_memory(),
             self._seen_displacements.ravel(),
@@ -366,10 +366,14 @@ class Operator(LeafSystem):
         )
         self._groups = [self.DeclareDiscreteState(part) for part in state]
         self.DeclareStateOutputPort("task_state", self._groups[0])
-        self.DeclarePeriodicDiscreteUpdateEvent(decision.PERIOD, 0.0, self._decide)
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            decision.DECISION_PERIOD_S, 0.0, self._update_perception_and_decision
+        )
         return self.discrete_state_ticket(self._groups[1])
 
-    def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_perception_and_decision(
+        self, context: Context, discrete_state: DiscreteValues
+    ) -> None:
         state = [discrete_state.get_mutable_value(group) for group in self._groups]
         state[3] = state[3].reshape(self._seen_displacements.shape)
         state[4] = state[4].reshape(self._perceived_forces.shape)
@@ -382,12 +386,12 @@ class Operator(LeafSystem):
             *state,
         )
 
-    def _memory(self, context: Context) -> NDArray[np.float64]:
+    def _discrete_memory(self, context: Context) -> NDArray[np.float64]:
         if not self._has_task:
             return self._no_memory
         return context.get_discrete_state(self._groups[1]).value()
 
-    def _intention(self, context: Context) -> tuple[NDArray[np.float64], ...]:
+    def _evaluate_intended_motion(self, context: Context) -> tuple[NDArray[np.float64], ...]:
         if not self._intended_pose.HasValue(context):
             return self._intent
         pose = self._intended_pose.Eval(context)
@@ -403,8 +407,8 @@ class Operator(LeafSystem):
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _hand_wrench_at(
-            *self._intention(context),
-            self._memory(context),
+            *self._evaluate_intended_motion(context),
+            self._discrete_memory(context),
             context.get_time(),
             self._impedance,
             self._intent_pose,
@@ -415,5 +419,11 @@ class Operator(LeafSystem):
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        time, pose, memory = context.get_time(), output.get_mutable_value(), self._memory(context)
-        _intended_motion_into(*self._intention(context), memory, time, pose, self._intent_twist)
+        time, pose, memory = (
+            context.get_time(),
+            output.get_mutable_value(),
+            self._discrete_memory(context),
+        )
+        _intended_or_planned_motion_into(
+            *self._evaluate_intended_motion(context), memory, time, pose, self._intent_twist
+        )

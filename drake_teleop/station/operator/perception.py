@@ -18,7 +18,7 @@ from drake_teleop.common.numeric import broadcast_to_rows, finite_array
 Array = NDArray[np.float64]
 
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
-_WALK = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
+_PARAMETER_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
 _INITIAL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
 _NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
 _FRICTION_SPEED = 0.01  # m/s, v_0, about the value of the device's friction
@@ -26,13 +26,13 @@ _NUM_PARAMETERS = 6
 
 # Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
 # estimate [m, b, c, u_0 (3)], covariance of the estimate.
-_HELD, _COUNT, _THETA = 12, 13, 14
-_P = _THETA + _NUM_PARAMETERS
-MEMORY_SIZE = _P + _NUM_PARAMETERS**2
-"""Size of the memory of `perceive_into`."""
+_HELD_FORCE_INDEX, _COUNT, _PARAMETERS_START = 12, 13, 14
+_COVARIANCE_START = _PARAMETERS_START + _NUM_PARAMETERS
+MEMORY_SIZE = _COVARIANCE_START + _NUM_PARAMETERS**2
+"""Size of the memory of `update_perception_into`."""
 
-EXCESS, THRESHOLD, NOTICED, OUTPUT_SIZE = 0, 3, 4, 5
-"""Indices of the output of `perceive_into`, and its size."""
+EXCESS_FORCE_START, THRESHOLD_INDEX, CONTACT_NOTICED_INDEX, OUTPUT_SIZE = 0, 3, 4, 5
+"""Indices of the output of `update_perception_into`, and its size."""
 
 
 @settings
@@ -56,7 +56,7 @@ class Perception:
         1e-3, "m", 0.0, 0.1, "standard deviation of the perceived lateral position of a slot"
     )
 
-    def parameters(self, dt: float) -> Array:
+    def compiled_parameters(self, dt: float) -> Array:
         """Return (4,) Weber fraction, threshold [N], and decay and smoothing factors per step."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
@@ -65,12 +65,12 @@ class Perception:
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
+    memory[_COVARIANCE_START:] = np.diag(_INITIAL_STD**2).ravel()
     return memory
 
 
 @njit(cache=True)
-def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, attentive, out):
+def update_perception_into(memory, parameters, dt, hand_mass, hand_force, velocity, attentive, out):
     """Update the operator's force perception by one step of `dt` [s].
 
     Args:
@@ -86,7 +86,7 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
     for i in range(3):
         if first:
             memory[i], memory[3 + i] = -hand_force[i], velocity[i]
-            memory[_THETA + 3 + i] = -hand_force[i]
+            memory[_PARAMETERS_START + 3 + i] = -hand_force[i]
         memory[6 + i], memory[9 + i] = memory[i], memory[3 + i]
         memory[i] += smooth * (-hand_force[i] - memory[i])
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
@@ -96,7 +96,7 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)
-    theta, expected_square, excess_square = memory[_THETA:_P], 0.0, 0.0
+    theta, expected_square, excess_square = memory[_PARAMETERS_START:_COVARIANCE_START], 0.0, 0.0
     rows, excess = np.zeros((3, _NUM_PARAMETERS)), out[:3]
     for i in range(3):
         v = 0.5 * (memory[3 + i] + memory[9 + i])
@@ -109,13 +109,17 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
         excess[i] = felt - expected
         expected_square += expected * expected
         excess_square += excess[i] * excess[i]
-    memory[_HELD] = max(math.sqrt(expected_square), fade * memory[_HELD])
-    out[THRESHOLD] = max(absolute, weber * memory[_HELD])
-    noticed = attentive and math.sqrt(excess_square) >= out[THRESHOLD]
-    out[NOTICED] = 1.0 if noticed else 0.0
+    memory[_HELD_FORCE_INDEX] = max(math.sqrt(expected_square), fade * memory[_HELD_FORCE_INDEX])
+    out[THRESHOLD_INDEX] = max(absolute, weber * memory[_HELD_FORCE_INDEX])
+    noticed = attentive and math.sqrt(excess_square) >= out[THRESHOLD_INDEX]
+    out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
         _update_expectation(
-            theta, memory[_P:].reshape(_NUM_PARAMETERS, _NUM_PARAMETERS), rows, excess, dt
+            theta,
+            memory[_COVARIANCE_START:].reshape(_NUM_PARAMETERS, _NUM_PARAMETERS),
+            rows,
+            excess,
+            dt,
         )
 
 
@@ -123,7 +127,7 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
 def _update_expectation(theta, P, rows, excess, dt):
     gain = np.empty(_NUM_PARAMETERS)
     for j in range(_NUM_PARAMETERS):
-        P[j, j] += _WALK[j] * _WALK[j] * dt
+        P[j, j] += _PARAMETER_DRIFT_STD[j] * _PARAMETER_DRIFT_STD[j] * dt
     before = theta.copy()
     for i in range(3):
         residual, variance = excess[i], _NOISE_DENSITY * _NOISE_DENSITY / dt
@@ -140,13 +144,17 @@ def _update_expectation(theta, P, rows, excess, dt):
 
 
 @njit(cache=True)
-def _perceive_all(times, hand_force, velocity, parameters, dt, hand_mass, attentive, memory, out):
+def _perceive_recorded_motion(
+    times, hand_force, velocity, parameters, dt, hand_mass, attentive, memory, out
+):
     for k in range(times.shape[0]):
         awake = times[k] >= attentive
-        perceive_into(memory, parameters, dt, hand_mass, hand_force[k], velocity[k], awake, out[k])
+        update_perception_into(
+            memory, parameters, dt, hand_mass, hand_force[k], velocity[k], awake, out[k]
+        )
 
 
-def perceive(
+def perceive_contact(
     t: ArrayLike,
     hand_force: ArrayLike,
     velocity: ArrayLike,
@@ -175,6 +183,8 @@ def perceive(
             "is not increasing", where="t", remedy="give at least two samples in order of time"
         )
     dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
-    parameters = perception.parameters(dt)
-    _perceive_all(times, force, speed, parameters, dt, hand_mass, attentive, initial_memory(), out)
+    parameters = perception.compiled_parameters(dt)
+    _perceive_recorded_motion(
+        times, force, speed, parameters, dt, hand_mass, attentive, initial_memory(), out
+    )
     return out

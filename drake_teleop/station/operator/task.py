@@ -70,8 +70,8 @@ class Insert(_Task):
 
 
 Task: TypeAlias = Reach | Touch | Press | Insert
-REACH, TOUCH, PRESS, INSERT = range(4)
-KINDS = (Reach, Touch, Press, Insert)
+KIND_REACH, KIND_TOUCH, KIND_PRESS, KIND_INSERT = range(4)
+TASK_CLASSES = (Reach, Touch, Press, Insert)
 
 #: Names of the measures that `station.task_measures` defines.
 TASK_MEASURES = (

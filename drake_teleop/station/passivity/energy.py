@@ -9,13 +9,19 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.passivity.memory import LEDGER, LOST, MEMORY_SIZE, RECEIVED, SENT
-from drake_teleop.station.passivity.packet import dot, pose_difference_into
+from drake_teleop.station.passivity.memory import (
+    DISSIPATED_ENERGY,
+    MEMORY_SIZE,
+    RECEIVED_ENERGY,
+    SENT_ENERGY,
+    STORED_ENERGY,
+)
+from drake_teleop.station.passivity.packet import dot_of_group, pose_difference_into
 
 Array = NDArray[np.float64]
 
 #: Name of the pair -> weight of f_k; the weight of f_(k-1) is 1 minus it.
-PAIRS = {"held": 0.0, "backward": 1.0, "mean": 0.5}
+WEIGHT_OF_PRESENT_WRENCH = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 
 def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
@@ -29,9 +35,11 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     Raises:
         DrakeTeleopError: for an unknown pair or arrays of wrong shape.
     """
-    if pair not in PAIRS:
+    if pair not in WEIGHT_OF_PRESENT_WRENCH:
         raise DrakeTeleopError(
-            f"'{pair}' is unknown", where="pair", remedy=f"choose one of {', '.join(PAIRS)}"
+            f"'{pair}' is unknown",
+            where="pair",
+            remedy=f"choose one of {', '.join(WEIGHT_OF_PRESENT_WRENCH)}",
         )
     wrench, pose = np.ascontiguousarray(wrench, float), np.ascontiguousarray(pose, float)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or pose.shape != (len(wrench), 7):
@@ -41,7 +49,7 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
             remedy="give (N, 6) and (N, 7)",
         )
     work = np.zeros((len(wrench), 2))
-    _work_into(wrench, pose, PAIRS[pair], work)
+    _work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)
     return work
 
 
@@ -53,7 +61,7 @@ def _work_into(wrench, pose, share, work):
         for i in range(6):
             f[i] = wrench[k - 1, i] + share * (wrench[k, i] - wrench[k - 1, i])
         for g in range(2):
-            work[k, g] = work[k - 1, g] + dot(f, dx, g)
+            work[k, g] = work[k - 1, g] + dot_of_group(f, dx, g)
 
 
 def created_energy(energy: Array) -> Array:
@@ -90,7 +98,8 @@ def energy_balance(memory: Array) -> EnergyBalance:
             f"has the shape {memory.shape}", where="memory", remedy=f"give (..., {MEMORY_SIZE})"
         )
     stored, received, sent, lost = (
-        memory[..., places].copy() for places in (LEDGER, RECEIVED, SENT, LOST)
+        memory[..., places].copy()
+        for places in (STORED_ENERGY, RECEIVED_ENERGY, SENT_ENERGY, DISSIPATED_ENERGY)
     )
     return EnergyBalance(stored, received, sent, lost)
 

@@ -14,7 +14,7 @@ from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity import none
 from drake_teleop.station.passivity.memory import HELD_WRENCH, MOTION_SCALE, own_parameters
-from drake_teleop.station.passivity.packet import limit
+from drake_teleop.station.passivity.packet import limit_group
 
 _LOCAL_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
 
@@ -35,7 +35,7 @@ class ForceLimitConfig:
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
-        limit(wrench, g, p[_LOCAL_LIMIT][g])
+        limit_group(wrench, g, p[_LOCAL_LIMIT][g])
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
 
 

@@ -28,8 +28,8 @@ from drake_teleop.station.passivity.packet import (
     WRENCH,
     fill_packet,
     has_arrived,
-    limit,
-    moved_pose_into,
+    limit_group,
+    move_pose_into,
     pose_difference_into,
 )
 
@@ -90,7 +90,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             wrench[i] += p[_SPRING][g] * difference[i]
             wrench[i] += p[_DAMPER][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, hand, packet)
 
@@ -105,7 +105,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
                 i
             ]
             shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
-        moved_pose_into(received[POSE], shift, memory[COMMAND_POSE])
+        move_pose_into(received[POSE], shift, memory[COMMAND_POSE])
         copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     copy_into(command, 0, memory, COMMAND.start, 13)
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)

@@ -46,9 +46,9 @@ from drake_teleop.station.passivity.ledger_slave import (
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     HELD_WRENCH,
-    LEDGER,
     MOTION_SCALE,
-    SENT,
+    SENT_ENERGY,
+    STORED_ENERGY,
     own_memory,
 )
 from drake_teleop.station.passivity.packet import (
@@ -59,13 +59,13 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     VELOCITY,
     WRENCH,
-    dot,
+    dot_of_group,
     fill_packet,
     has_arrived,
-    length,
-    limit,
+    length_of_group,
+    limit_group,
     pose_difference_into,
-    scale,
+    scale_group,
 )
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
@@ -156,7 +156,7 @@ class LedgerConfig:
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
     """Write half of the initial energy, and the servo model's pose, into one end's memory."""
-    memory[LEDGER] = p[INITIAL] / 2.0
+    memory[STORED_ENERGY] = p[INITIAL] / 2.0
     memory[SERVO_MODEL] = memory[COMMAND_POSE]
 
 
@@ -190,17 +190,20 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     memory[_NEWEST_PACKET] = newest
     for g in range(2):
         _cross_fade(g, T, p, memory, wrench)
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
         _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
         level = p[MASTER_RESERVE][g]
         if memory[IN_CONTACT] > 0.0:
             level += SHARED_RESERVE * p[SLAVE_RESERVE][g]
-        surplus = max(memory[LEDGER][g] - level, 0.0)
-        memory[SENT][g] += surplus
-        memory[LEDGER][g] -= surplus
+        surplus = max(memory[STORED_ENERGY][g] - level, 0.0)
+        memory[SENT_ENERGY][g] += surplus
+        memory[STORED_ENERGY][g] -= surplus
         _add_drag_force(g, received, dx, T, p, memory, wrench)
-        limit(wrench, g, limits[g])
-        packet[ENERGY][g], packet[LEDGER_LEVEL][g] = memory[SENT][g], memory[LEDGER][g]
+        limit_group(wrench, g, limits[g])
+        packet[ENERGY][g], packet[LEDGER_LEVEL][g] = (
+            memory[SENT_ENERGY][g],
+            memory[STORED_ENERGY][g],
+        )
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, velocity, wrench, packet)
     packet[NEWEST_SLAVE_PACKET] = received[PACKET_NUMBER]
@@ -208,10 +211,10 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _update_hand_ledger(g, dx, in_contact, p, memory):
-    work, ledger = dot(memory[HELD_WRENCH], dx, g), memory[LEDGER]
+    work, ledger = dot_of_group(memory[HELD_WRENCH], dx, g), memory[STORED_ENERGY]
     memory[_WORK_ON_HAND][g] = max(memory[_WORK_ON_HAND][g] + work, 0.0)
     if work < 0.0 and in_contact and ledger[g] > _FORWARD_LEVEL * p[MASTER_RESERVE][g]:
-        memory[SENT][g] -= work
+        memory[SENT_ENERGY][g] -= work
     else:
         ledger[g] -= work
 
@@ -314,7 +317,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     for g in range(2):
         metric = max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_CONE / math.sqrt(metric)
-        cone[g] = max(cone[g] * (1.0 - decay), min(length(wrench, g) / size, largest))
+        cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
         lag = max(cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED), _FRICTION_LAG_S)
         if g == 1:
             lag = max(_TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS * received[ROUND_TRIP])
@@ -327,14 +330,14 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     for friction in (near, far, rest):
         _remove_normal_component(friction, p, memory)
     for g in range(2):
-        limit(far, g, cone[g] * size)
-        limit(near, g, cone[g] * force)
+        limit_group(far, g, cone[g] * size)
+        limit_group(near, g, cone[g] * force)
         for i in range(3 * g, 3 * g + 3):
             across = dx[i] - step * max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT) * normal[i]
             wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
     _remove_normal_component(wrench, p, memory)
     for g in range(2):
-        limit(wrench, g, cone[g] * force)
+        limit_group(wrench, g, cone[g] * force)
 
 
 @njit(cache=True)
@@ -357,9 +360,9 @@ def _cross_fade(g, T, p, memory, wrench):
     last, fading = memory[_LAST_WRENCH], memory[_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
-    size, most = length(wrench, g), MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
+    size, most = length_of_group(wrench, g), MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
     if fading[g] > 0.0 and size > most:
-        scale(wrench, g, most / size)
+        scale_group(wrench, g, most / size)
     else:
         fading[g] = 0.0
     for i in range(3 * g, 3 * g + 3):
@@ -369,14 +372,14 @@ def _cross_fade(g, T, p, memory, wrench):
 
 @njit(cache=True)
 def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
-    size, cost = length(wrench, g), 0.0
+    size, cost = length_of_group(wrench, g), 0.0
     if size > 0.0:
-        displacement = dot(wrench, memory[OWN_VELOCITY], g) / size * T
-        cost = size * max(dot(wrench, dx, g) / size, displacement, 0.0)
+        displacement = dot_of_group(wrench, memory[OWN_VELOCITY], g) / size * T
+        cost = size * max(dot_of_group(wrench, dx, g) / size, displacement, 0.0)
         if displacement >= 0.0:
             cost += size * _HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
     most = min(T * _DRAIN_RATE, 1.0) * max(
-        memory[LEDGER][g] - _MIN_LEVEL * p[MASTER_RESERVE][g], 0.0
+        memory[STORED_ENERGY][g] - _MIN_LEVEL * p[MASTER_RESERVE][g], 0.0
     )
     share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _RECOVERY_S)
     if share * cost > most:
@@ -384,25 +387,29 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
     memory[_WITHHELD_SHARE][g] = 1.0 - share
     if not cost > 0.0:
         share *= _permitted_opposing_share(g, dx, T, p, memory)
-    scale(wrench, g, share)
+    scale_group(wrench, g, share)
 
 
 @njit(cache=True)
 def _permitted_opposing_share(g, dx, T, p, memory):
-    """Return the share, 0 to 1, of a wrench against the motion that the master's energy permits."""
-    if memory[LEDGER][g] >= _MIN_LEVEL * p[MASTER_RESERVE][g]:
+    if memory[STORED_ENERGY][g] >= _MIN_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]
-    along, speed = dot(velocity, dx, g), length(velocity, g)
+    along, speed = dot_of_group(velocity, dx, g), length_of_group(velocity, g)
     return min(max(along, 0.0) / max(along, T * speed * speed, 1e-300), 1.0)
 
 
 @njit(cache=True)
 def _add_drag_force(g, received, dx, T, p, memory, wrench):
     velocity, drag, active = memory[OWN_VELOCITY], 0.0, memory[_DRAG_ACTIVE]
-    speed, master_level = length(velocity, g), memory[LEDGER][g] / p[MASTER_RESERVE][g]
+    speed, master_level = (
+        length_of_group(velocity, g),
+        memory[STORED_ENERGY][g] / p[MASTER_RESERVE][g],
+    )
     # Sent energy counts as arrived: its confirmation takes a round trip.
-    lowest = min(master_level, (received[LEDGER_LEVEL][g] + memory[SENT][g]) / p[SLAVE_RESERVE][g])
+    lowest = min(
+        master_level, (received[LEDGER_LEVEL][g] + memory[SENT_ENERGY][g]) / p[SLAVE_RESERVE][g]
+    )
     in_contact = memory[IN_CONTACT] > 0.0
     if (in_contact and master_level < _FULL_LEVEL) or (not in_contact and lowest < _LOW_LEVEL):
         active[g] = 1.0

@@ -17,15 +17,15 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
+    DISSIPATED_ENERGY,
     HELD_WRENCH,
-    LEDGER,
     LOAD_WRENCH,
-    LOST,
     MASS,
-    RECEIVED,
-    SENT,
-    STEPS,
+    RECEIVED_ENERGY,
+    SENT_ENERGY,
+    STEP_COUNT,
     STIFFNESS,
+    STORED_ENERGY,
     own_memory,
     own_parameters,
 )
@@ -38,14 +38,14 @@ from drake_teleop.station.passivity.packet import (
     VELOCITY,
     WRENCH,
     credit_new_energy,
-    dot,
+    dot_of_group,
     fill_packet,
     has_arrived,
-    length,
-    limit,
-    moved_pose_into,
+    length_of_group,
+    limit_group,
+    move_pose_into,
     pose_difference_into,
-    scale,
+    scale_group,
 )
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
@@ -121,19 +121,19 @@ def filter_velocity(twist, share, memory):
 @njit(cache=True)
 def is_in_contact(wrench, p):
     threshold = p[CONTACT_THRESHOLD]
-    return length(wrench, 0) > threshold[0] or length(wrench, 1) > threshold[1]
+    return length_of_group(wrench, 0) > threshold[0] or length_of_group(wrench, 1) > threshold[1]
 
 
 @njit(cache=True)
 def wrench_component_along(a, b, p):
     """Return the component of the wrench `a` (6,) along the unit wrench `b` (6,) [N]."""
-    return p[METRIC][0] * dot(a, b, 0) + p[METRIC][1] * dot(a, b, 1)
+    return p[METRIC][0] * dot_of_group(a, b, 0) + p[METRIC][1] * dot_of_group(a, b, 1)
 
 
 @njit(cache=True)
 def work_along(wrench, displacement):
     """Return the work of a wrench (6,) over a displacement (6,) [J]; for a unit wrench [m]."""
-    return dot(wrench, displacement, 0) + dot(wrench, displacement, 1)
+    return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 
 @njit(cache=True)
@@ -163,7 +163,7 @@ def update_contact_direction(wrench, round_trip, T, p, memory):
 def receive_energy(g, received, memory):
     """Add newly received energy to this end's balance for group `g`; return it [J]."""
     new = credit_new_energy(g, received, memory)
-    memory[LEDGER][g] += new
+    memory[STORED_ENERGY][g] += new
     return new
 
 
@@ -176,7 +176,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     silence = memory[_SILENCE] if connected else 0.0
     kept = 1.0 - T / _MAXIMUM_DECAY_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
-    trip = max((memory[STEPS] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
+    trip = max((memory[STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
     filter_velocity(twist, min(T / _FILTER_S, 1.0), memory)
     contact, load, filtered_load = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_LOAD]
@@ -184,7 +184,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         contact[i] = wrench[i] - load[i]
     in_contact = is_in_contact(contact, p)
     delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)
-    share = min(T / delay, 1.0) if memory[STEPS] > 0.0 else 1.0
+    share = min(T / delay, 1.0) if memory[STEP_COUNT] > 0.0 else 1.0
     for i in range(6):
         filtered_load[i] += share * (load[i] - filtered_load[i])
     for g in range(2):
@@ -198,7 +198,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     _generate_command(received, connected, T, p, memory, error)
     for i in range(6):
         error[i] = T * velocity[i]
-    moved_pose_into(now, error, now)
+    move_pose_into(now, error, now)
     _limit_motor_energy(now, pose, twist, p, memory)
     _step_servo_model(received, connected, T, p, memory, error)
     copy_into(command, 0, memory, COMMAND.start, 13)
@@ -210,10 +210,10 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     copy_into(packet, LOAD.start, filtered_load, 0, 6)
     k, compliance = memory[_CONTACT_STIFFNESS], 0.0
     for g in range(2):
-        size = length(memory[NORMAL], g)
+        size = length_of_group(memory[NORMAL], g)
         compliance += size * size / (_STIFFNESS_FACTOR * p[STIFFNESS][g])
-        packet[ENERGY][g] = memory[SENT][g]
-        packet[LEDGER_LEVEL][g] = memory[LEDGER][g] - memory[RECEIVED][g]
+        packet[ENERGY][g] = memory[SENT_ENERGY][g]
+        packet[LEDGER_LEVEL][g] = memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g]
     packet[CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
     packet[ROUND_TRIP] = memory[_LONGEST_ROUND_TRIP]
     packet[CONTACT_STIFFNESS] = memory[_DISPLAYED_SHARE] * k / (1.0 + k * compliance)
@@ -222,12 +222,16 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     # The wrench between two samples is unknown: the smaller of both works is credited.
-    work = min(dot(wrench, dx, g), dot(memory[HELD_WRENCH], dx, g))
+    work = min(dot_of_group(wrench, dx, g), dot_of_group(memory[HELD_WRENCH], dx, g))
     new = receive_energy(g, received, memory)
-    ledger, input_energy, reserve = memory[LEDGER], memory[_CONTACT_INPUT], p[SLAVE_RESERVE][g]
+    ledger, input_energy, reserve = (
+        memory[STORED_ENERGY],
+        memory[_CONTACT_INPUT],
+        p[SLAVE_RESERVE][g],
+    )
     ledger[g] += work
     input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
-    speed = length(twist, g)
+    speed = length_of_group(twist, g)
     kinetic = 0.5 * MASS_FACTOR * p[MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _SEND_RATE
@@ -240,8 +244,8 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
     returned = returned if connected else 0.0
     lost = max(ledger[g] - returned - _ENERGY_CAPACITY * reserve, 0.0)
-    memory[SENT][g] += returned
-    memory[LOST][g] += lost
+    memory[SENT_ENERGY][g] += returned
+    memory[DISSIPATED_ENERGY][g] += lost
     ledger[g] -= returned + lost
     memory[_BALANCE][g] = ledger[g] - kinetic
 
@@ -257,10 +261,13 @@ def _max_displayed_stiffness(received, T, p, memory):
     normal, fill_level = memory[NORMAL], 0.0
     depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
-        travel, reserve = ANGLE_PER_LENGTH[g] * length(normal, g) * depth, p[MASTER_RESERVE][g]
+        travel, reserve = (
+            ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth,
+            p[MASTER_RESERVE][g],
+        )
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
         level = min(max(received[LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
-        fill_level += p[METRIC][g] * dot(normal, normal, g) * level
+        fill_level += p[METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = max(
         _MAX_FEEDFORWARD_SILENCE_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
     )
@@ -302,7 +309,9 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     memory[_FILTER_LAG] += filtered_step - inward
     memory[_STRETCH_LENGTH] += filtered_step
     memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
-    fastest = math.hypot(length(velocity, 0), length(velocity, 1) / ANGLE_PER_LENGTH[1])
+    fastest = math.hypot(
+        length_of_group(velocity, 0), length_of_group(velocity, 1) / ANGLE_PER_LENGTH[1]
+    )
     slow, length_m = fastest < _FAST_SPEED, abs(memory[_STRETCH_LENGTH])
     if length_m > (_STRETCH_M if slow else _FAST_STRETCH_M):
         memory[_FIT_LENGTH] = min(memory[_FIT_LENGTH] + length_m, _MAX_FIT_M)
@@ -368,7 +377,7 @@ def _generate_command(received, connected, T, p, memory, error):
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             error[i] += compliance * beyond_wall * p[METRIC][g] * normal[i]
-        distance, acceleration = length(error, g), _MAX_ACCELERATION * ANGLE_PER_LENGTH[g]
+        distance, acceleration = length_of_group(error, g), _MAX_ACCELERATION * ANGLE_PER_LENGTH[g]
         rate = 1.0 / _COMMAND_FILTER_S
         if distance > 0.0:
             rate = min(rate, _BRAKING_FACTOR * math.sqrt(2.0 * acceleration / distance))
@@ -376,11 +385,11 @@ def _generate_command(received, connected, T, p, memory, error):
             error[i] *= rate
             if feeds_forward:
                 error[i] += feed[i] + compliance * inward_speed * p[METRIC][g] * normal[i]
-        available = max(memory[LEDGER][g] - RESERVE_MARGIN * p[SLAVE_RESERVE][g], 0.0)
-        limit(error, g, math.sqrt(2.0 * available / (MASS_FACTOR * p[MASS][g])))
+        available = max(memory[STORED_ENERGY][g] - RESERVE_MARGIN * p[SLAVE_RESERVE][g], 0.0)
+        limit_group(error, g, math.sqrt(2.0 * available / (MASS_FACTOR * p[MASS][g])))
         for i in range(3 * g, 3 * g + 3):
             error[i] -= velocity[i]
-        limit(error, g, acceleration * T)
+        limit_group(error, g, acceleration * T)
         for i in range(3 * g, 3 * g + 3):
             velocity[i] += error[i]
 
@@ -397,13 +406,16 @@ def _limit_motor_energy(command, pose, twist, p, memory):
         if _limit_motor_wrench(g, D, twist, p, memory):
             changed = True
             velocity = memory[COMMAND_TWIST]
-            if length(velocity, g) > length(twist, g) or dot(velocity, twist, g) < 0.0:
+            if (
+                length_of_group(velocity, g) > length_of_group(twist, g)
+                or dot_of_group(velocity, twist, g) < 0.0
+            ):
                 for i in range(3 * g, 3 * g + 3):
                     velocity[i] = twist[i]
         for i in range(3 * g, 3 * g + 3):
             motor_wrench[i] = (motor_wrench[i] + D * twist[i]) / K
     if changed:
-        moved_pose_into(pose, motor_wrench, command)
+        move_pose_into(pose, motor_wrench, command)
     return changed
 
 
@@ -411,12 +423,18 @@ def _limit_motor_energy(command, pose, twist, p, memory):
 def _limit_motor_wrench(g, damping, twist, p, memory):
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
-    size, speed, mass = length(motor_wrench, g), length(twist, g), MASS_FACTOR * p[MASS][g]
-    stands = length(velocity, g) < _STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
+    size, speed, mass = (
+        length_of_group(motor_wrench, g),
+        length_of_group(twist, g),
+        MASS_FACTOR * p[MASS][g],
+    )
+    stands = length_of_group(velocity, g) < _STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
     margin, balance, changed = RESERVE_MARGIN * p[SLAVE_RESERVE][g], memory[_BALANCE][g], False
-    pushes = dot(motor_wrench, twist, g) > 0.0 or dot(motor_wrench, velocity, g) > 0.0
-    pressed, available, permitted = length(contact, g), balance, 0.0
-    if is_in_contact(contact, p) and dot(motor_wrench, contact, g) < 0.0:
+    pushes = (
+        dot_of_group(motor_wrench, twist, g) > 0.0 or dot_of_group(motor_wrench, velocity, g) > 0.0
+    )
+    pressed, available, permitted = length_of_group(contact, g), balance, 0.0
+    if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
         free, k = (
             _FREE_FORCE_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
             memory[_CONTACT_STIFFNESS],
@@ -430,12 +448,12 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
         permitted += mass * speed / _STOP_HORIZON_S  # stops without a rebound
     reach = _STOP_HORIZON_S * (speed + memory[_PERIOD] * size / mass)
     if size * reach > max(available - margin, permitted * reach):
-        scale(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
+        scale_group(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True
     if balance < margin and not stands:
         strongest = mass * _DECELERATION * ANGLE_PER_LENGTH[g] * (1.0 - balance / margin)
         brake = min(damping * speed, strongest)
-        if -brake * speed < dot(motor_wrench, twist, g):
+        if -brake * speed < dot_of_group(motor_wrench, twist, g):
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = -brake * twist[i] / max(speed, 1e-12)
             changed = True
@@ -452,7 +470,7 @@ def _step_servo_model(received, connected, T, p, memory, error):
         stiff, damped = p[STIFFNESS][i // 3] / p[MASS][i // 3], p[DAMPING][i // 3] / p[MASS][i // 3]
         velocity[i] = (velocity[i] + T * stiff * error[i]) / (1.0 + T * damped + T * T * stiff)
         error[i] = T * velocity[i]
-    moved_pose_into(model, error, model)
+    move_pose_into(model, error, model)
 
 
 @njit(cache=True)

@@ -6,7 +6,7 @@ MEMORY_SIZE = 180  #: length of the memory vector of one end
 NUM_PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` fills
 
 
-class Slots:
+class SlotAllocator:
     """Allocator of consecutive places in a vector of `size` numbers, from index `first`."""
 
     def __init__(self, size: int, first: int = 0) -> None:
@@ -26,12 +26,12 @@ class Slots:
         return self.vector(self._size - self._next)
 
 
-_memory = Slots(MEMORY_SIZE)
-STEPS = _memory.number()  #: number of steps so far; also the number of the next packet
-LEDGER = _memory.vector(2)  #: energy that this end may still release, by group [J]
-RECEIVED = _memory.vector(2)  #: energy from the other end that is credited here [J]
-SENT = _memory.vector(2)  #: this end's counter of sent energy [J]
-LOST = _memory.vector(2)  #: energy that the method removed from the loop here [J]
+_memory = SlotAllocator(MEMORY_SIZE)
+STEP_COUNT = _memory.number()  #: number of steps so far; also the number of the next packet
+STORED_ENERGY = _memory.vector(2)  #: energy that this end may still release, by group [J]
+RECEIVED_ENERGY = _memory.vector(2)  #: energy from the other end that is credited here [J]
+SENT_ENERGY = _memory.vector(2)  #: this end's counter of sent energy [J]
+DISSIPATED_ENERGY = _memory.vector(2)  #: energy that the method removed from the loop here [J]
 HELD_WRENCH = _memory.vector(6)  #: wrench at this port since the last step
 LOAD_WRENCH = _memory.vector(6)  #: part of the slave's wrench from its load's weight and inertia
 COMMAND = _memory.vector(13)  #: slave's command since the last step: pose X_WS, twist
@@ -40,12 +40,12 @@ FILL_TIME = _memory.number()
 HAND_VELOCITY = _memory.vector(6)  #: filtered twist at the master, see `retreat`
 PACKET = _memory.vector(38)  #: last sent packet, see `packet`
 _METHOD_MEMORY = _memory.rest()
-_command = Slots(COMMAND.stop, COMMAND.start)
+_command = SlotAllocator(COMMAND.stop, COMMAND.start)
 COMMAND_POSE, COMMAND_TWIST = _command.vector(7), _command.rest()
 
-_parameters = Slots(NUM_PARAMETERS)
+_parameters = SlotAllocator(NUM_PARAMETERS)
 #: Largest force and torque at the hand, in the master's power units [N, N m].
-LIMIT = _parameters.vector(2)
+WRENCH_LIMIT = _parameters.vector(2)
 #: K of the slave's servo, in the master's power units [N/m, N m/rad].
 STIFFNESS = _parameters.vector(2)
 #: D of the slave's servo, in the master's power units [N s/m, N m s/rad].
@@ -60,10 +60,10 @@ MAX_RETREAT = _parameters.vector(2)
 _METHOD_PARAMETERS = _parameters.rest()
 
 
-def own_memory() -> Slots:
+def own_memory() -> SlotAllocator:
     """Return an allocator for a method's own part of the memory, which starts with zeros."""
-    return Slots(MEMORY_SIZE, _METHOD_MEMORY.start)
+    return SlotAllocator(MEMORY_SIZE, _METHOD_MEMORY.start)
 
 
-def own_parameters() -> Slots:
-    return Slots(NUM_PARAMETERS, _METHOD_PARAMETERS.start)
+def own_parameters() -> SlotAllocator:
+    return SlotAllocator(NUM_PARAMETERS, _METHOD_PARAMETERS.start)

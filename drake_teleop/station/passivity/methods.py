@@ -14,7 +14,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from drake_teleop.common.compiled import address_of, call_at, njit
+from drake_teleop.common.compiled import address_of, make_call_at_address, njit
 from drake_teleop.common.config import (
     check_name,
     check_ranges,
@@ -46,26 +46,26 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
-    LIMIT,
     MASS,
     MAX_RETREAT,
     MEMORY_SIZE,
     MOTION_SCALE,
     NUM_PARAMETERS,
     PACKET,
-    STEPS,
+    STEP_COUNT,
     STIFFNESS,
+    WRENCH_LIMIT,
 )
 from drake_teleop.station.passivity.packet import (
     INPUTS_FINITE,
     PACKET_NUMBER,
     PACKET_SIZE,
     POSE,
-    finite,
+    is_vector_finite,
 )
 from drake_teleop.station.passivity.pspm import PspmConfig
-from drake_teleop.station.passivity.safe_state import retreat
-from drake_teleop.station.passivity.tdpa import TdpaConfig, charged
+from drake_teleop.station.passivity.safe_state import limit_retreat_of_hand
+from drake_teleop.station.passivity.tdpa import TdpaConfig, charged_tdpa_config
 from drake_teleop.station.passivity.two_layer import TwoLayerConfig
 from drake_teleop.station.passivity.wave import WaveConfig
 
@@ -141,12 +141,12 @@ METHODS = Registry(
 
 @settings
 @dataclass
-class Methods:
+class MethodConfigs:
     """Parameters of the shipped passivity methods."""
 
     wave: WaveConfig = field(default_factory=WaveConfig)
     tdpa: TdpaConfig = field(default_factory=TdpaConfig)
-    charged_tdpa: TdpaConfig = field(default_factory=charged)
+    charged_tdpa: TdpaConfig = field(default_factory=charged_tdpa_config)
     two_layer: TwoLayerConfig = field(default_factory=TwoLayerConfig)
     pspm: PspmConfig = field(default_factory=PspmConfig)
     ledger: LedgerConfig = field(default_factory=LedgerConfig)
@@ -156,7 +156,9 @@ class Methods:
     )
 
 
-_FIELDS = {entry.metadata.get("method", entry.name): entry.name for entry in fields(Methods)}
+_FIELD_OF_METHOD = {
+    entry.metadata.get("method", entry.name): entry.name for entry in fields(MethodConfigs)
+}
 
 
 _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
@@ -199,7 +201,7 @@ class _CommonConfig:
 
 @settings
 @dataclass
-class PassivityConfig(Methods, _CommonConfig):
+class PassivityConfig(MethodConfigs, _CommonConfig):
     """Method that keeps the station passive, and the parameters of each method.
 
     The servo's force on the slave is K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
@@ -220,7 +222,11 @@ class PassivityConfig(Methods, _CommonConfig):
                     where=f"{where}.registered",
                     remedy="leave it out; a shipped method has its own block of parameters",
                 )
-            return getattr(self, _FIELDS[self.method]) if self.method in _FIELDS else None
+            return (
+                getattr(self, _FIELD_OF_METHOD[self.method])
+                if self.method in _FIELD_OF_METHOD
+                else None
+            )
         for name in self.registered:
             check_name(schema, name, f"{where}.registered.{name}")
         with unchecked_assignments():
@@ -229,7 +235,7 @@ class PassivityConfig(Methods, _CommonConfig):
         return config
 
 
-def parameters(
+def method_parameters(
     config: PassivityConfig,
     power_scale: Sequence[float] = (1.0, 1.0),
     motion_scale: Sequence[float] = (1.0, 1.0),
@@ -242,7 +248,7 @@ def parameters(
         motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
     """
     p = np.zeros(NUM_PARAMETERS)
-    p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
+    p[WRENCH_LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
     p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
     p[DAMPING] = np.multiply(config.servo_damping, power_scale)
     p[MASS] = np.multiply(config.slave_mass or _SLAVE_MASS, power_scale)
@@ -256,7 +262,7 @@ def parameters(
     return p
 
 
-def initial_memory(
+def initial_method_memory(
     method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the memory (MEMORY,) of one end of the channel before its first step.
@@ -272,12 +278,24 @@ def initial_memory(
     return memory
 
 
-_VECTOR = types.Array(types.float64, 1, "C")
-_MASTER_ARGUMENTS = (_VECTOR, types.boolean, *[_VECTOR] * 5, types.float64, *[_VECTOR] * 4)
-_SLAVE_ARGUMENTS = (_VECTOR, types.boolean, *[_VECTOR] * 4, types.float64, *[_VECTOR] * 4)
-_RECORD_ARGUMENTS = (_VECTOR,) * 6
+_VECTOR_TYPE = types.Array(types.float64, 1, "C")
+_MASTER_ARGUMENTS = (
+    _VECTOR_TYPE,
+    types.boolean,
+    *[_VECTOR_TYPE] * 5,
+    types.float64,
+    *[_VECTOR_TYPE] * 4,
+)
+_SLAVE_ARGUMENTS = (
+    _VECTOR_TYPE,
+    types.boolean,
+    *[_VECTOR_TYPE] * 4,
+    types.float64,
+    *[_VECTOR_TYPE] * 4,
+)
+_RECORD_ARGUMENTS = (_VECTOR_TYPE,) * 6
 _master_step, _slave_step, _record_command = map(
-    call_at, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS)
+    make_call_at_address, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS)
 )
 
 
@@ -295,15 +313,14 @@ def _addresses_of_functions(*steps: Any) -> tuple[int, int, int]:
 
 @njit(cache=True)
 def _write_packet_number(healthy, memory, packet):
-    """Write the packet's number; repeat the last good packet if the inputs are not finite."""
     if healthy:
         packet[INPUTS_FINITE] = 1.0
         copy_into(memory, PACKET.start, packet, 0, PACKET_SIZE)
     else:
         copy_into(packet, 0, memory, PACKET.start, PACKET_SIZE)
         packet[INPUTS_FINITE] = 0.0
-    packet[PACKET_NUMBER] = memory[STEPS]
-    memory[STEPS] += 1.0
+    packet[PACKET_NUMBER] = memory[STEP_COUNT]
+    memory[STEP_COUNT] += 1.0
 
 
 @njit(cache=True)
@@ -326,14 +343,20 @@ def master_step(
         packet: (PACKET_SIZE,) written: packet to send.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
-    healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
+    healthy = (
+        is_vector_finite(received)
+        and is_vector_finite(pose)
+        and is_vector_finite(twist)
+        and is_vector_finite(dx)
+        and is_vector_finite(hand)
+    )
     if not healthy:
         wrench[:] = 0.0
     else:
         _master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
-        retreat(twist, T, p, memory, wrench)
+        limit_retreat_of_hand(twist, T, p, memory, wrench)
     _write_packet_number(healthy, memory, packet)
 
 
@@ -350,7 +373,13 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
             finite, it is the last pose with zero twist.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
-    healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
+    healthy = (
+        is_vector_finite(received)
+        and is_vector_finite(pose)
+        and is_vector_finite(twist)
+        and is_vector_finite(dx)
+        and is_vector_finite(wrench)
+    )
     if not healthy:
         memory[COMMAND_TWIST] = 0.0
         copy_into(command, 0, memory, COMMAND.start, 13)

@@ -11,7 +11,7 @@ from drake_teleop.station.passivity.packet import (
     WRENCH,
     fill_packet,
     has_arrived,
-    limit,
+    limit_group,
 )
 
 
@@ -21,7 +21,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     for i in range(6):
         wrench[i] = requested[i]
     for g in range(2):
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 

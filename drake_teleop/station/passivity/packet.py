@@ -15,10 +15,10 @@ from drake_teleop.common.vectors import (
     quaternion_logarithm,
     quaternion_product,
 )
-from drake_teleop.station.passivity.memory import RECEIVED, Slots
+from drake_teleop.station.passivity.memory import RECEIVED_ENERGY, SlotAllocator
 
 PACKET_SIZE = 38
-_places = Slots(PACKET_SIZE)
+_places = SlotAllocator(PACKET_SIZE)
 #: Number of the packet, counted by its sender.
 PACKET_NUMBER = _places.number()
 #: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
@@ -55,8 +55,8 @@ def has_arrived(received):
 @njit(cache=True)
 def credit_new_energy(g, received, memory):
     """Return the energy of group `g` received since the last call [J]; credit it in `memory`."""
-    new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
-    memory[RECEIVED][g] += new
+    new = max(received[ENERGY][g] - memory[RECEIVED_ENERGY][g], 0.0)
+    memory[RECEIVED_ENERGY][g] += new
     return new
 
 
@@ -70,33 +70,33 @@ def fill_packet(pose, twist, wrench, packet):
 
 
 @njit(cache=True)
-def dot(a, b, g):
+def dot_of_group(a, b, g):
     i = 3 * g
     return a[i] * b[i] + a[i + 1] * b[i + 1] + a[i + 2] * b[i + 2]
 
 
 @njit(cache=True)
-def length(a, g):
+def length_of_group(a, g):
     i = 3 * g
     return math.hypot(math.hypot(a[i], a[i + 1]), a[i + 2])
 
 
 @njit(cache=True)
-def scale(a, g, s):
+def scale_group(a, g, s):
     for i in range(3 * g, 3 * g + 3):
         a[i] *= s
 
 
 @njit(cache=True)
-def limit(a, g, most):
+def limit_group(a, g, most):
     """Shorten group `g` of the vector `a` (6,) to at most the length `most`."""
-    size = length(a, g)
+    size = length_of_group(a, g)
     if size > most:
-        scale(a, g, most / size)
+        scale_group(a, g, most / size)
 
 
 @njit(cache=True)
-def finite(a):
+def is_vector_finite(a):
     rest = 0.0
     for x in a:
         rest += x - x  # NaN if any x is not finite
@@ -115,7 +115,7 @@ def pose_difference_into(a, b, e):
 
 
 @njit(cache=True)
-def moved_pose_into(pose, e, out):
+def move_pose_into(pose, e, out):
     """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,)."""
     turn = quaternion_exponential((e[3], e[4], e[5]))
     q = normalized_quaternion(quaternion_product(turn, (pose[0], pose[1], pose[2], pose[3])))

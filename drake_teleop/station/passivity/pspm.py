@@ -18,11 +18,11 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
+    DISSIPATED_ENERGY,
     HELD_WRENCH,
-    LEDGER,
-    LOST,
-    SENT,
+    SENT_ENERGY,
     STIFFNESS,
+    STORED_ENERGY,
     own_memory,
     own_parameters,
 )
@@ -32,11 +32,11 @@ from drake_teleop.station.passivity.packet import (
     VELOCITY,
     WRENCH,
     credit_new_energy,
-    dot,
+    dot_of_group,
     fill_packet,
     has_arrived,
-    limit,
-    moved_pose_into,
+    limit_group,
+    move_pose_into,
     pose_difference_into,
 )
 
@@ -76,30 +76,29 @@ class PspmConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    memory[LEDGER] = p[_INITIAL_ENERGY]
+    memory[STORED_ENERGY] = p[_INITIAL_ENERGY]
 
 
 @njit(cache=True)
 def _modulate_set_position(received, g, stiffness, dx, before, shuffle, p, memory, packet):
-    """Move the set position of group `g` as near to the requested one as the energy permits."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
-    stored, required = dot(offset, offset, g), dot(requested, requested, g)
-    damped = -dot(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
-    ledger = memory[LEDGER]
+    stored, required = dot_of_group(offset, offset, g), dot_of_group(requested, requested, g)
+    damped = -dot_of_group(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
+    ledger = memory[STORED_ENERGY]
     energy = ledger[g] + damped
     energy += credit_new_energy(g, received, memory)
     available = stored + 2.0 * energy / stiffness
     share = 1.0 if required <= max(available, 0.0) else math.sqrt(max(available, 0.0) / required)
     for i in range(3 * g, 3 * g + 3):
         offset[i] = share * requested[i]
-    energy -= 0.5 * stiffness * (dot(offset, offset, g) - stored)
+    energy -= 0.5 * stiffness * (dot_of_group(offset, offset, g) - stored)
     surplus = max(energy - p[_MAX_ENERGY][g], 0.0)
     if shuffle:
-        memory[SENT][g] += surplus
+        memory[SENT_ENERGY][g] += surplus
     else:
-        memory[LOST][g] += surplus
+        memory[DISSIPATED_ENERGY][g] += surplus
     ledger[g] = energy - surplus
-    packet[ENERGY][g] = memory[SENT][g]
+    packet[ENERGY][g] = memory[SENT_ENERGY][g]
 
 
 @njit(cache=True)
@@ -107,17 +106,17 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     offset, requested, received_wrench = memory[_OFFSET], memory[_REQUESTED], received[WRENCH]
     K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
-        before = dot(offset, offset, g)
+        before = dot_of_group(offset, offset, g)
         for i in range(3 * g, 3 * g + 3):
             offset[i] -= dx[i]
             wrench[i] = received_wrench[i]
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
         for i in range(3 * g, 3 * g + 3):
             requested[i] = wrench[i] / K[g]
         _modulate_set_position(received, g, K[g], dx, before, True, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
@@ -126,7 +125,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
-    before = dot(offset, offset, 0), dot(offset, offset, 1)
+    before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)
     copy_into(requested, 0, offset, 0, 6)
     if has_arrived(received):
@@ -136,7 +135,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         _modulate_set_position(received, g, K[g], dx, before[g], False, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             held[i] = K[g] * offset[i] - D[g] * twist[i]
-    moved_pose_into(pose, offset, now)
+    move_pose_into(pose, offset, now)
     copy_into(command, 0, memory, COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)
 
@@ -151,5 +150,5 @@ def record_command(requested, command, pose, twist, p, memory):
         held[i] = K[i // 3] * offset[i] - D[i // 3] * twist[i]
     copy_into(memory, COMMAND_POSE.start, command, 0, 7)
     for g in range(2):
-        increase = dot(offset, offset, g) - dot(other, other, g)
-        memory[LEDGER][g] -= 0.5 * K[g] * increase
+        increase = dot_of_group(offset, offset, g) - dot_of_group(other, other, g)
+        memory[STORED_ENERGY][g] -= 0.5 * K[g] * increase

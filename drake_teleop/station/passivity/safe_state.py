@@ -16,29 +16,29 @@ from drake_teleop.station.passivity.memory import (
     HELD_WRENCH,
     MASS,
     MAX_RETREAT,
-    Slots,
+    SlotAllocator,
 )
 from drake_teleop.station.passivity.packet import (
-    dot,
-    length,
-    moved_pose_into,
+    dot_of_group,
+    length_of_group,
+    move_pose_into,
     pose_difference_into,
-    scale,
+    scale_group,
 )
 
-STOP_TIME = 0.05  #: time in which a silent end comes to rest [s]
-RESUME_TIME = 0.5  #: time of the transition to normal operation [s]
+STOP_TIME_S = 0.05  #: time in which a silent end comes to rest [s]
+RESUME_TIME_S = 0.5  #: time of the transition to normal operation [s]
 
 _RETREAT_FILTER_S = 4e-3  # of the velocity: encoders have steps
-MASTER_WATCH, SLAVE_WATCH = 6, 30  #: lengths of the monitor states
+MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
-_places = Slots(MASTER_WATCH)
+_places = SlotAllocator(MASTER_MONITOR_SIZE)
 SILENCE_S = _places.number()  #: time without packets [s], also at the slave
 _PRESENT_LIMITS = _places.vector(2)  # present limits
 _LIMIT_FALL_RATE = _places.vector(2)  # their decrease per second
 _CONNECTED_TIME = _places.number()  # time since the last silence
 # Monitor state of the slave.
-_places = Slots(SLAVE_WATCH, SILENCE_S + 1)
+_places = SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_S + 1)
 _STOPPING_TIME = _places.number()  # time since it began to stop
 _RESUMING_TIME = _places.number()  # time since it began to resume
 _STOP_POSE = _places.vector(7)  # command when it began to stop
@@ -49,22 +49,22 @@ _LAST_COMMAND, _PREVIOUS_COMMAND = (
 )  # last command and the one before
 
 
-def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """Return the silence monitor (MASTER_WATCH,) of the master before the first packet.
+def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Return the silence monitor (MASTER_MONITOR_SIZE,) of the master before the first packet.
 
     With `full` (2,), the device's limits [N, N m], it is that of normal operation.
     """
-    watch = np.zeros(MASTER_WATCH)
+    watch = np.zeros(MASTER_MONITOR_SIZE)
     if full is None:
         watch[SILENCE_S] = np.inf
     else:
-        watch[_PRESENT_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME
+        watch[_PRESENT_LIMITS], watch[_CONNECTED_TIME] = full, RESUME_TIME_S
     return watch
 
 
-def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the silence monitor (SLAVE_WATCH,) of the slave; `pose` (7,) is its first command."""
-    watch = np.zeros(SLAVE_WATCH)
+def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the silence monitor (SLAVE_MONITOR_SIZE,) of the slave; `pose` (7,): first command."""
+    watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_S] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
         watch[part] = pose
@@ -90,18 +90,18 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
     """
     _update_silence(alive, fault, T, watch)
     connected = watch[SILENCE_S] <= timeout
-    watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME) if connected else 0.0
+    watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
     present, fall = watch[_PRESENT_LIMITS], watch[_LIMIT_FALL_RATE]
     for g in range(2):
-        size, limit = length(held, g), present[g]
+        size, limit = length_of_group(held, g), present[g]
         if connected:
             fall[g] = 0.0
-            start = size if watch[_CONNECTED_TIME] < RESUME_TIME else limit
-            limit = min(full[g], start + full[g] * T / RESUME_TIME)
+            start = size if watch[_CONNECTED_TIME] < RESUME_TIME_S else limit
+            limit = min(full[g], start + full[g] * T / RESUME_TIME_S)
         else:
             if fall[g] == 0.0:
                 limit = min(limit, size)
-                fall[g] = limit / STOP_TIME
+                fall[g] = limit / STOP_TIME_S
             limit = max(0.0, limit - fall[g] * T)
         present[g] = limits[g] = limit
 
@@ -118,35 +118,35 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     start, velocity = watch[_STOP_POSE], watch[_STOP_VELOCITY]
     step = np.empty(6)
     if watch[SILENCE_S] <= timeout:
-        watch[_RESUMING_TIME] = min(watch[_RESUMING_TIME] + T, RESUME_TIME)
+        watch[_RESUMING_TIME] = min(watch[_RESUMING_TIME] + T, RESUME_TIME_S)
     elif watch[_RESUMING_TIME] > 0.0:
         pose_difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         copy_into(start, 0, last, 0, 7)
         watch[_STOPPING_TIME] = watch[_RESUMING_TIME] = 0.0
-    if watch[_RESUMING_TIME] == RESUME_TIME:
+    if watch[_RESUMING_TIME] == RESUME_TIME_S:
         copy_into(command, 0, requested, 0, 7)
     else:
         # A blend from the stopping motion to the requested command keeps the velocity continuous
         # even if the end resumes before it has stopped.
         watch[_STOPPING_TIME] += T
-        u = min(watch[_STOPPING_TIME] / STOP_TIME, 1.0)
+        u = min(watch[_STOPPING_TIME] / STOP_TIME_S, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
-            step[i] = velocity[i] * STOP_TIME * u * (1.0 - u * u * (1.0 - 0.5 * u))
-        moved_pose_into(start, step, command)
-        u = watch[_RESUMING_TIME] / RESUME_TIME
+            step[i] = velocity[i] * STOP_TIME_S * u * (1.0 - u * u * (1.0 - 0.5 * u))
+        move_pose_into(start, step, command)
+        u = watch[_RESUMING_TIME] / RESUME_TIME_S
         if u > 0.0:
             pose_difference_into(requested, command, step)
             for i in range(6):
                 step[i] *= u * u * u * (10.0 + u * (6.0 * u - 15.0))
-            moved_pose_into(command, step, command)
+            move_pose_into(command, step, command)
     copy_into(before, 0, last, 0, 7)
     copy_into(last, 0, command, 0, 7)
 
 
 @njit(cache=True)
-def retreat(twist, T, p, memory, wrench):
+def limit_retreat_of_hand(twist, T, p, memory, wrench):
     """Reduce a wrench (6,) that pushes the hand, so that a released hand stays slow.
 
     It falls to 0 for hand speeds along the wrench between `MAX_RETREAT` and twice this.
@@ -155,10 +155,10 @@ def retreat(twist, T, p, memory, wrench):
     for i in range(6):
         velocity[i] += rate * (twist[i] - velocity[i])
     for g in range(2):
-        size = length(wrench, g)
+        size = length_of_group(wrench, g)
         if size > 0.0:
-            along = dot(wrench, velocity, g) / size
-            slowing = (along - dot(wrench, twist, g) / size) / _RETREAT_FILTER_S
+            along = dot_of_group(wrench, velocity, g) / size
+            slowing = (along - dot_of_group(wrench, twist, g) / size) / _RETREAT_FILTER_S
             share = max(2.0 - along / p[MAX_RETREAT][g], p[MASS][g] * slowing / size, 0.0)
-            scale(wrench, g, min(share, 1.0))
+            scale_group(wrench, g, min(share, 1.0))
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)

@@ -19,14 +19,14 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
+    DISSIPATED_ENERGY,
     HELD_WRENCH,
-    LEDGER,
-    LOST,
     MOTION_SCALE,
-    RECEIVED,
-    SENT,
-    STEPS,
+    RECEIVED_ENERGY,
+    SENT_ENERGY,
+    STEP_COUNT,
     STIFFNESS,
+    STORED_ENERGY,
     own_memory,
     own_parameters,
 )
@@ -39,14 +39,14 @@ from drake_teleop.station.passivity.packet import (
     POSE,
     WRENCH,
     credit_new_energy,
-    dot,
+    dot_of_group,
     fill_packet,
     has_arrived,
-    length,
-    limit,
-    moved_pose_into,
+    length_of_group,
+    limit_group,
+    move_pose_into,
     pose_difference_into,
-    scale,
+    scale_group,
 )
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
@@ -135,7 +135,7 @@ class TdpaConfig:
         p[_MAX_SPEED] = self.speed
 
 
-def charged() -> TdpaConfig:
+def charged_tdpa_config() -> TdpaConfig:
     """Return the parameters of `charged_tdpa`, for a medium grip."""
     return TdpaConfig(reserve=[0.06, 1e-3], drag=[0.28, 3e-3], hand_stiffness=[300.0, 1.5])
 
@@ -143,29 +143,33 @@ def charged() -> TdpaConfig:
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     for g in range(2):
-        memory[LEDGER][g] += credit_new_energy(g, received, memory)
+        memory[STORED_ENERGY][g] += credit_new_energy(g, received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
     requested = received[WRENCH]
     for i in range(6):
         wrench[i] = requested[i]
-    ledger, kept, withheld = memory[LEDGER], memory[_RESERVED_ENERGY], memory[_WITHHELD_SHARE]
+    ledger, kept, withheld = (
+        memory[STORED_ENERGY],
+        memory[_RESERVED_ENERGY],
+        memory[_WITHHELD_SHARE],
+    )
     for g in range(2):
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
         share = min(1.0, 1.0 - withheld[g] + release)
-        drained = dot(wrench, dx, g)
+        drained = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
             share = _permitted_share(
                 g, drained, drain, stored, share, T, p, memory[HELD_WRENCH], wrench
             )
         withheld[g] = 1.0 - share
-        memory[LOST][g] += (1.0 - share) * drained
-        scale(wrench, g, share)
+        memory[DISSIPATED_ENERGY][g] += (1.0 - share) * drained
+        scale_group(wrench, g, share)
         _add_drag_force(g, received[_SLAVE_LEDGER][g], dx, limits, T, p, memory, wrench)
-        _balance_hand_work(g, dot(wrench, dx, g), p, memory)
+        _balance_hand_work(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG][g] > 0.0:
             _send_surplus(g, p, memory)
-        packet[ENERGY][g] = memory[SENT][g]
+        packet[ENERGY][g] = memory[SENT_ENERGY][g]
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
     packet[_NEWEST_MASTER_PACKET] = received[PACKET_NUMBER]
@@ -173,62 +177,64 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
-    """Return the share of the wrench that may be rendered within the stored energy."""
-    least, size = length(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
+    least, size = (
+        length_of_group(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g],
+        length_of_group(wrench, g),
+    )
     share = min(share, max(drain * stored / drained, least / size))
     return min(share, stored / drained)
 
 
 @njit(cache=True)
 def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
-    drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_RESERVED_ENERGY][g]
+    drag, level = p[_DRAG][g], memory[STORED_ENERGY][g] + memory[_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
-        damping = drag / max(length(dx, g), _DRAG_SPEED[g] * T)
+        damping = drag / max(length_of_group(dx, g), _DRAG_SPEED[g] * T)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
-        limit(wrench, g, limits[g])
+        limit_group(wrench, g, limits[g])
 
 
 @njit(cache=True)
 def _send_surplus(g, p, memory):
-    ledger = memory[LEDGER]
+    ledger = memory[STORED_ENERGY]
     surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
     ledger[g] -= surplus
-    memory[SENT][g] += surplus
+    memory[SENT_ENERGY][g] += surplus
 
 
 @njit(cache=True)
 def _balance_hand_work(g, drained, p, memory):
-    ledger, kept = memory[LEDGER], memory[_RESERVED_ENERGY]
+    ledger, kept = memory[STORED_ENERGY], memory[_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
         ledger[g] = max(ledger[g] - drained, 0.0)
     else:
         more = min(-_RESERVED_INPUT_SHARE * drained, max(p[_RESERVE][g] - kept[g], 0.0))
-        memory[SENT][g] -= drained + more
+        memory[SENT_ENERGY][g] -= drained + more
     kept[g] = max(kept[g] + more, 0.0)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     for g in range(2):
-        memory[LEDGER][g] += credit_new_energy(g, received, memory)
+        memory[STORED_ENERGY][g] += credit_new_energy(g, received, memory)
     copy_into(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
-        work = dot(wrench, dx, g)
+        work = dot_of_group(wrench, dx, g)
         memory[_INPUT][g] += max(work, 0.0)
         memory[_OUTPUT][g] += max(-work, 0.0)
     if has_arrived(received):
         _advance_command(received, wrench, T, p, memory)
     for g in range(2):
-        available = _available_energy(memory, g)
+        available = _energy_available_to_slave(memory, g)
         credit = min(memory[_INPUT][g], memory[_COMMAND_INPUT][g]) + min(available, 0.0)
         # Output beyond the received energy is compensated before energy is sent.
-        memory[SENT][g] = max(memory[SENT][g], credit)
-        memory[LEDGER][g] = available
-        packet[ENERGY][g] = memory[SENT][g]
-        packet[_SLAVE_LEDGER][g] = memory[LEDGER][g]
+        memory[SENT_ENERGY][g] = max(memory[SENT_ENERGY][g], credit)
+        memory[STORED_ENERGY][g] = available
+        packet[ENERGY][g] = memory[SENT_ENERGY][g]
+        packet[_SLAVE_LEDGER][g] = memory[STORED_ENERGY][g]
         _filter_wrench(g, received, dx, wrench, T, p, memory)
     copy_into(command, 0, memory, COMMAND.start, 13)
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
@@ -242,9 +248,9 @@ def _filter_wrench(g, received, dx, wrench, T, p, memory):
     if hand > 0.0:
         gain = max(_estimate_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
         # The servo's lag counts as delay.
-        round_trip = max(memory[STEPS] - received[_NEWEST_MASTER_PACKET], 1.0) * T
+        round_trip = max(memory[STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
         lag = round_trip + p[DAMPING][g] / p[STIFFNESS][g]
-        size, filtered_size = length(wrench, g), length(filtered, g)
+        size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
         onset_rate = min(T / _ONSET_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
         if size < _END_SHARE * filtered_size:
@@ -252,7 +258,7 @@ def _filter_wrench(g, received, dx, wrench, T, p, memory):
         else:
             if filtered_size * (1.0 + gain) < _ONSET_COMPLETE * size:
                 onset = onset_rate
-                memory[_ONSET_PACKET][g] = memory[STEPS]
+                memory[_ONSET_PACKET][g] = memory[STEP_COUNT]
             if lag > _ONSET_S and received[_NEWEST_MASTER_PACKET] < memory[_ONSET_PACKET][g]:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
@@ -262,17 +268,17 @@ def _filter_wrench(g, received, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _estimate_contact_stiffness(g, dx, wrench, T, memory):
-    size, stiffness = length(dx, g), memory[_STIFFNESS_ESTIMATE]
+    size, stiffness = length_of_group(dx, g), memory[_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_TRAVEL[g] * T:
-        change = dot(wrench, dx, g) - dot(memory[HELD_WRENCH], dx, g)
+        change = dot_of_group(wrench, dx, g) - dot_of_group(memory[HELD_WRENCH], dx, g)
         forget = min(size / _STIFFNESS_TRAVEL[g], 1.0)
         stiffness[g] += forget * (-change / (size * size) - stiffness[g])
     return stiffness[g]
 
 
 @njit(cache=True)
-def _available_energy(memory, g):
-    return memory[RECEIVED][g] - max(memory[_OUTPUT][g], memory[_COMMAND_OUTPUT][g])
+def _energy_available_to_slave(memory, g):
+    return memory[RECEIVED_ENERGY][g] - max(memory[_OUTPUT][g], memory[_COMMAND_OUTPUT][g])
 
 
 @njit(cache=True)
@@ -284,15 +290,18 @@ def _advance_command(received, wrench, T, p, memory):
     for i in range(6):
         step[i] -= remaining_share * withheld[i]
     for g in range(2):
-        limit(step, g, p[_MAX_SPEED][g] * T)
-        pressing, available = -dot(wrench, step, g), max(_available_energy(memory, g), 0.0)
+        limit_group(step, g, p[_MAX_SPEED][g] * T)
+        pressing, available = (
+            -dot_of_group(wrench, step, g),
+            max(_energy_available_to_slave(memory, g), 0.0),
+        )
         if pressing > available:
-            scale(step, g, available / pressing)
-            memory[LOST][g] += pressing - available
+            scale_group(step, g, available / pressing)
+            memory[DISSIPATED_ENERGY][g] += pressing - available
             pressing = available
         memory[_COMMAND_OUTPUT][g] += max(pressing, 0.0)
         memory[_COMMAND_INPUT][g] += max(-pressing, 0.0)
-    moved_pose_into(now, step, now)
+    move_pose_into(now, step, now)
     pose_difference_into(received[POSE], now, withheld)
     for i in range(6):
         step[i] /= T
@@ -303,7 +312,7 @@ def _add_command_work(command, sign, memory):
     step = np.empty(6)
     pose_difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
-        work = sign * dot(memory[HELD_WRENCH], step, g)
+        work = sign * dot_of_group(memory[HELD_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0
         memory[_COMMAND_INPUT][g] += into
         memory[_COMMAND_OUTPUT][g] += into - work

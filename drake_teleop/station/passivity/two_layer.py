@@ -17,12 +17,12 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
+    DISSIPATED_ENERGY,
     HELD_WRENCH,
-    LEDGER,
-    LOST,
     MASS,
-    SENT,
+    SENT_ENERGY,
     STIFFNESS,
+    STORED_ENERGY,
     own_memory,
     own_parameters,
 )
@@ -32,14 +32,14 @@ from drake_teleop.station.passivity.packet import (
     VELOCITY,
     WRENCH,
     credit_new_energy,
-    dot,
+    dot_of_group,
     fill_packet,
     has_arrived,
-    length,
-    limit,
-    moved_pose_into,
+    length_of_group,
+    limit_group,
+    move_pose_into,
     pose_difference_into,
-    scale,
+    scale_group,
 )
 
 # Parameters; pairs are for translation and rotation.
@@ -88,21 +88,21 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    memory[LEDGER] = p[_INITIAL_ENERGY]
+    memory[STORED_ENERGY] = p[_INITIAL_ENERGY]
 
 
 @njit(cache=True)
 def _exchange_energy(received, dx, T, p, memory, packet):
-    ledger, sent_so_far = memory[LEDGER], memory[SENT]
+    ledger, sent_so_far = memory[STORED_ENERGY], memory[SENT_ENERGY]
     held, capacity = memory[HELD_WRENCH], p[_CAPACITY]
     for g in range(2):
-        level = ledger[g] - dot(held, dx, g)
+        level = ledger[g] - dot_of_group(held, dx, g)
         level += credit_new_energy(g, received, memory)
         sent = min(T * p[_SEND_RATE], 1.0) * max(level - _RESERVE_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
-        memory[LOST][g] += lost
+        memory[DISSIPATED_ENERGY][g] += lost
         ledger[g] = level - lost
         packet[ENERGY][g] = sent_so_far[g]
 
@@ -110,29 +110,29 @@ def _exchange_energy(received, dx, T, p, memory, packet):
 @njit(cache=True)
 def _max_energy_use(f, dx, g, acceleration, T):
     """Return the largest energy that the wrench `f` can use until the next step [J]."""
-    return dot(f, dx, g) + length(f, g) * acceleration * T * T
+    return dot_of_group(f, dx, g) + length_of_group(f, g) * acceleration * T * T
 
 
 @njit(cache=True)
 def _limit_to_tank(f, dx, g, acceleration, T, memory):
-    cost, level = _max_energy_use(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
+    cost, level = _max_energy_use(f, dx, g, acceleration, T), max(memory[STORED_ENERGY][g], 0.0)
     if cost > level:
-        scale(f, g, level / cost)
+        scale_group(f, g, level / cost)
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     _exchange_energy(received, dx, T, p, memory, packet)
-    ledger, requested = memory[LEDGER], received[WRENCH]
+    ledger, requested = memory[STORED_ENERGY], received[WRENCH]
     for g in range(2):
         damping = p[_DAMPER][g] * max(p[_FILL_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = requested[i] - damping * twist[i]
-        limit(wrench, g, limits[g])
-        drained = dot(wrench, dx, g)
+        limit_group(wrench, g, limits[g])
+        drained = dot_of_group(wrench, dx, g)
         drainable = min(T * p[_DRAIN_RATE], 1.0) * max(ledger[g], 0.0)
         if drained > drainable:
-            scale(wrench, g, drainable / drained)
+            scale_group(wrench, g, drainable / drained)
         _limit_to_tank(wrench, dx, g, p[MAX_ACCELERATION][g], T, memory)
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
@@ -153,21 +153,21 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             brake[i] = -D[g] * twist[i]
             motor_wrench[i] = spring[i] + brake[i]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
-        available = max(memory[LEDGER][g] - _RESERVE_SHARE * p[_CAPACITY][g], 0.0)
-        acceleration = p[MAX_ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
+        available = max(memory[STORED_ENERGY][g] - _RESERVE_SHARE * p[_CAPACITY][g], 0.0)
+        acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / p[MASS][g]
         if _max_energy_use(motor_wrench, dx, g, acceleration, T) > available:
-            acceleration = p[MAX_ACCELERATION][g] + length(brake, g) / p[MASS][g]
+            acceleration = p[MAX_ACCELERATION][g] + length_of_group(brake, g) / p[MASS][g]
             available -= _max_energy_use(brake, dx, g, acceleration, T)
-            acceleration = p[MAX_ACCELERATION][g] + length(spring, g) / p[MASS][g]
+            acceleration = p[MAX_ACCELERATION][g] + length_of_group(spring, g) / p[MASS][g]
             cost = _max_energy_use(spring, dx, g, acceleration, T)
             share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = share * spring[i] + brake[i]
-            acceleration = p[MAX_ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
+            acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / p[MASS][g]
             _limit_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
-    moved_pose_into(pose, spring, memory[COMMAND_POSE])
+    move_pose_into(pose, spring, memory[COMMAND_POSE])
     copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     copy_into(command, 0, memory, COMMAND.start, 13)
     fill_packet(pose, twist, wrench, packet)

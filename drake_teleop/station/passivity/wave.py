@@ -18,13 +18,13 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
+    DISSIPATED_ENERGY,
     FILL_TIME,
     HELD_WRENCH,
-    LEDGER,
-    LOST,
     MOTION_SCALE,
-    RECEIVED,
-    SENT,
+    RECEIVED_ENERGY,
+    SENT_ENERGY,
+    STORED_ENERGY,
     own_memory,
     own_parameters,
 )
@@ -35,11 +35,11 @@ from drake_teleop.station.passivity.packet import (
     PACKET_NUMBER,
     POSE,
     credit_new_energy,
-    dot,
+    dot_of_group,
     fill_packet,
     has_arrived,
-    limit,
-    moved_pose_into,
+    limit_group,
+    move_pose_into,
     pose_difference_into,
 )
 
@@ -93,20 +93,20 @@ class WaveConfig:
 @njit(cache=True)
 def _output_wave(received, T, p, memory, wave):
     """Write the wave (6,) of this step, the filtered rate of the received wave integral (T34)."""
-    ledger, played = memory[LEDGER], memory[_PLAYED_INTEGRAL]
+    ledger, played = memory[STORED_ENERGY], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
         ledger[g] += credit_new_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
             wave[i] = integral[i] - played[i]
-        left, store = dot(wave, wave, g), 2.0 * T * ledger[g]
+        left, store = dot_of_group(wave, wave, g), 2.0 * T * ledger[g]
         share = T / (T + p[_FILTER_TIME])
         if share * left > (2.0 - share) * store:
             share = 2.0 * store / (left + store)
         for i in range(3 * g, 3 * g + 3):
             played[i] += share * wave[i]
             wave[i] *= share / T
-        ledger[g] = max(ledger[g] - 0.5 * T * dot(wave, wave, g), 0.0)
+        ledger[g] = max(ledger[g] - 0.5 * T * dot_of_group(wave, wave, g), 0.0)
 
 
 @njit(cache=True)
@@ -124,17 +124,17 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             # The integral ignores the wrench limit, so that no momentum is missing on the line.
             integral[i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
             sent[i] = integral[i]
-        limit(wrench, g, limits[g])
-        energy = 0.5 * T * dot(wave, wave, g)
+        limit_group(wrench, g, limits[g])
+        energy = 0.5 * T * dot_of_group(wave, wave, g)
         if catching_up > 0.0:
             most = MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
             if _limit_wrench_change(g, energy, dx, most, memory[HELD_WRENCH], wrench):
                 memory[_CATCHING_UP] = 1.0
-            limit(wrench, g, limits[g])
+            limit_group(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
-        left = energy - dot(wrench, dx, g)
-        memory[SENT][g] += max(left, 0.0)
-        packet[ENERGY][g] = memory[SENT][g]
+        left = energy - dot_of_group(wrench, dx, g)
+        memory[SENT_ENERGY][g] += max(left, 0.0)
+        packet[ENERGY][g] = memory[SENT_ENERGY][g]
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
 
@@ -147,7 +147,7 @@ def _limit_wrench_change(g, energy, dx, most, held, wrench):
     if size <= most * most:
         return False
     share = most / math.sqrt(size)
-    now, last = energy - dot(wrench, dx, g), energy - dot(held, dx, g)
+    now, last = energy - dot_of_group(wrench, dx, g), energy - dot_of_group(held, dx, g)
     if (1.0 - share) * last + share * now < 0.0:
         share = last / (last - now) if now > 0.0 else 1.0
     for i in range(3 * g, 3 * g + 3):
@@ -167,14 +167,14 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         _reflect_wave(received, wrench, T, p, memory)
         if has_arrived(received):
             _correct_drift(received, wrench, T, p, memory)
-        moved_pose_into(now, step, now)
+        move_pose_into(now, step, now)
         for i in range(6):
             step[i] /= T
     else:
         step[:] = 0.0
         _output_wave_at_rest(wrench, T, p, memory)
     copy_into(packet, INTEGRAL.start, memory, _SENT_INTEGRAL.start, 6)
-    copy_into(packet, ENERGY.start, memory, SENT.start, 2)
+    copy_into(packet, ENERGY.start, memory, SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, COMMAND.start, 13)
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
@@ -189,23 +189,23 @@ def _reflect_wave(received, wrench, T, p, memory):
         for i in range(3 * g, 3 * g + 3):
             step[i] = T * (math.sqrt(2.0 * b) * wave[i] + wrench[i]) / (b + damper)
             integral[i] += T * wave[i] + math.sqrt(2.0 / b) * (T * wrench[i] - damper * step[i])
-        damped = damper * dot(step, step, g) / T
-        left = 0.5 * T * dot(wave, wave, g) + dot(wrench, step, g) - damped
-        memory[LOST][g] += damped
-        memory[SENT][g] += max(left, 0.0)
+        damped = damper * dot_of_group(step, step, g) / T
+        left = 0.5 * T * dot_of_group(wave, wave, g) + dot_of_group(wrench, step, g) - damped
+        memory[DISSIPATED_ENERGY][g] += damped
+        memory[SENT_ENERGY][g] += max(left, 0.0)
 
 
 @njit(cache=True)
 def _output_wave_at_rest(wrench, T, p, memory):
-    wave, ledger = memory[_WAVE], memory[LEDGER]
+    wave, ledger = memory[_WAVE], memory[STORED_ENERGY]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
-        energy = 0.5 * T * dot(wave, wave, g)
+        energy = 0.5 * T * dot_of_group(wave, wave, g)
         if energy <= ledger[g]:
             ledger[g] -= energy
-            memory[SENT][g] += energy
+            memory[SENT_ENERGY][g] += energy
             for i in range(3 * g, 3 * g + 3):
                 played[i] += T * wave[i]
                 integral[i] -= T * wave[i]
@@ -213,8 +213,7 @@ def _output_wave_at_rest(wrench, T, p, memory):
 
 @njit(cache=True)
 def _reflect_while_filling(received, wrench, T, p, memory):
-    """Reflect as a rigid wall while a new channel fills, and prepare the steady state."""
-    wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
+    wave, ledger, accounted = memory[_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
         accounted[g] = max(accounted[g], received[ENERGY][g])
@@ -222,8 +221,8 @@ def _reflect_while_filling(received, wrench, T, p, memory):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
             integral[i] -= T * wave[i]
             played[i] = received[INTEGRAL][i] - p[_FILTER_TIME] * wave[i]
-        memory[SENT][g] += 0.5 * T * dot(wave, wave, g)
-        ledger[g] = 0.5 * (T + p[_FILTER_TIME]) * dot(wave, wave, g)
+        memory[SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
+        ledger[g] = 0.5 * (T + p[_FILTER_TIME]) * dot_of_group(wave, wave, g)
 
 
 @njit(cache=True)
@@ -231,6 +230,6 @@ def _correct_drift(received, wrench, T, p, memory):
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
     pose_difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):
-        if dot(wrench, drift, g) >= 0.0:
+        if dot_of_group(wrench, drift, g) >= 0.0:
             for i in range(3 * g, 3 * g + 3):
                 step[i] += min(T * p[_DRIFT_RATE], 1.0) * drift[i]

@@ -26,27 +26,27 @@ from drake_teleop.load.compensation import (
     weight_and_inertia_scales,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    BEFORE_JOINTS,
-    LOST,
-    MOTION,
-    SATURATED,
-    SPECIFIC_FORCE,
-    TIME,
-    WRENCH,
+    FIRST_JOINT_INDEX,
+    LOST_SAMPLE_FLAG,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_MOTION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_TIME_INDEX,
+    SAMPLE_WRENCH,
+    SATURATION_FLAG_INDEX,
     non_contact_wrench_into,
     sample_size,
 )
 from drake_teleop.station.slave.arm import ArmModel, acceleration_into, forward_kinematics
 
-#: Scales of the contact wrench alone, Eq. (13); see `scales_at`.
-_ELIMINATION = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+#: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
+_SCALES_OF_ELIMINATION = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 _NUM_SCALES = 6
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
 MAX_SAMPLE_AGE = 0.05
-_NONE, _STALE, _READING, _JOINTS, _LOAD = map(
+_NO_FAULT, _STALE_FAULT, _READING_FAULT, _JOINTS_FAULT, _LOAD_FAULT = map(
     int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
 )
 
@@ -61,7 +61,7 @@ class Scales(NamedTuple):
     weight_object: float
 
     @property
-    def shares(self) -> tuple[float, float, float, float]:
+    def as_array(self) -> tuple[float, float, float, float]:
         return self.sigma_gripper, self.sigma_object, self.weight_gripper, self.weight_object
 
 
@@ -140,7 +140,7 @@ def wrench_to_master(
 
 
 @njit(cache=True)
-def scales_at(change, time, scales):
+def blend_scales_at(change, time, scales):
     """Write the six scales at `time` [s]: a minimum-jerk blend from old to new scales.
 
     `change` (14,) contains old scales (6), new scales (6), start of the change [s], duration [s].
@@ -153,19 +153,20 @@ def scales_at(change, time, scales):
 
 
 @njit(cache=True)
-def _scaled_into(sample, estimate, gripper, arm, scales, out):
+def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
     scaled_wrench_into(
-        sample[WRENCH], estimate[:6],
-        sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION],
+        sample[SAMPLE_WRENCH], estimate[:6],
+        sample[SAMPLE_SPECIFIC_FORCE], sample[SAMPLE_ANGULAR_VELOCITY],
+        sample[SAMPLE_ANGULAR_ACCELERATION],
         phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
     )  # fmt: skip
     excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
     if excess_gripper != 0.0 or excess_object != 0.0:
         gravity = np.empty(3)
-        acceleration_into(arm, sample[BEFORE_JOINTS:TIME], np.zeros(3), gravity)
+        acceleration_into(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], np.zeros(3), gravity)
         add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
@@ -175,42 +176,46 @@ def find_fault(sample, estimate, time, valid_range):
 
     `valid_range` (7,) contains the largest wrench [N, N m] and age [s].
     """
-    if not abs(time - sample[TIME]) <= valid_range[6]:
-        return _STALE
-    reading = sample[SATURATED] < LOST and all_in_range(sample[MOTION])
+    if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
+        return _STALE_FAULT
+    reading = sample[SATURATION_FLAG_INDEX] < LOST_SAMPLE_FLAG and all_in_range(
+        sample[SAMPLE_MOTION]
+    )
     for i in range(6):
         reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
-        return _READING
-    if not all_in_range(sample[BEFORE_JOINTS:TIME]):
-        return _JOINTS
-    return _NONE if all_in_range(estimate) else _LOAD
+        return _READING_FAULT
+    if not all_in_range(sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX]):
+        return _JOINTS_FAULT
+    return _NO_FAULT if all_in_range(estimate) else _LOAD_FAULT
 
 
 @njit(cache=True)
-def _scaled_now_into(sample, estimate, gripper, change, time, arm, out):
+def _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out):
     scales = np.empty(_NUM_SCALES)
-    scales_at(change, time, scales)
-    _scaled_into(sample, estimate, gripper, arm, scales, out)
+    blend_scales_at(change, time, scales)
+    _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
 
 
 @njit(cache=True, borrows=True)
 def _log_row_into(sample, estimate, gripper, change, time, arm, elimination, valid_range, out):
-    _scaled_now_into(sample, estimate, gripper, change, time, arm, out[:6])
-    _scaled_into(sample, estimate, gripper, arm, elimination, out[6:12])
+    _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out[:6])
+    _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out[6:12])
     out[12] = find_fault(sample, estimate, time, valid_range)
 
 
 @njit(cache=True)
-def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out):
-    if find_fault(sample, estimate, time, valid_range) != _NONE:
+def _rendered_wrench_into(
+    sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out
+):
+    if find_fault(sample, estimate, time, valid_range) != _NO_FAULT:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(3)
-    scales_at(change, time, scales)
+    blend_scales_at(change, time, scales)
     scales[2] *= contact
-    _scaled_into(sample, estimate, gripper, arm, scales, scaled_S)
-    forward_kinematics(arm, sample[BEFORE_JOINTS:TIME], R_WS, p_WS)
+    _scaled_wrench_into(sample, estimate, gripper, arm, scales, scaled_S)
+    forward_kinematics(arm, sample[FIRST_JOINT_INDEX:SAMPLE_TIME_INDEX], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
 
@@ -259,7 +264,7 @@ class ForceScaling(LeafSystem):
         if config.gripper_phi is not None:
             self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
-        # Old and new scales, start and length of the change; see `scales_at`.
+        # Old and new scales, start and length of the change; see `blend_scales_at`.
         found = config.scales()
         scales = [*found[:3], config.force_scale, *found[3:]]
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
@@ -307,31 +312,35 @@ class ForceScaling(LeafSystem):
             )
         parameter = context.get_mutable_numeric_parameter(self._change)
         now, start = np.empty(_NUM_SCALES), context.get_time()
-        scales_at(parameter.value(), start, now)
+        blend_scales_at(parameter.value(), start, now)
         parameter.SetFromVector(np.concatenate([now, requested[:-1], [start, requested[-1]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        _scaled_now_into(*self._inputs(context), self._arm, output.get_mutable_value())
+        _scaled_wrench_now_into(
+            *self._evaluate_inputs(context), self._arm, output.get_mutable_value()
+        )
 
     def _calc_log_row(self, context: Context, output: BasicVector) -> None:
-        inputs = self._inputs(context)
-        constants = self._arm, _ELIMINATION, self._valid_range
+        inputs = self._evaluate_inputs(context)
+        constants = self._arm, _SCALES_OF_ELIMINATION, self._valid_range
         _log_row_into(*inputs, *constants, output.get_mutable_value())
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        sample, estimate, _, _, time = self._inputs(context)
+        sample, estimate, _, _, time = self._evaluate_inputs(context)
         output[0] = find_fault(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        constants = self._arm, _ELIMINATION
-        _scaled_into(*self._inputs(context)[:3], *constants, output.get_mutable_value())
+        constants = self._arm, _SCALES_OF_ELIMINATION
+        _scaled_wrench_into(
+            *self._evaluate_inputs(context)[:3], *constants, output.get_mutable_value()
+        )
 
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]
         non_contact_wrench_into(
-            sample[SPECIFIC_FORCE],
-            sample[ANGULAR_VELOCITY],
-            sample[ANGULAR_ACCELERATION],
+            sample[SAMPLE_SPECIFIC_FORCE],
+            sample[SAMPLE_ANGULAR_VELOCITY],
+            sample[SAMPLE_ANGULAR_ACCELERATION],
             phi,
             output.get_mutable_value(),
         )
@@ -344,9 +353,11 @@ class ForceScaling(LeafSystem):
 
     def _calc_rendered(self, context: Context, contact: float, output: BasicVector) -> None:
         constants = self._arm, self._R_WB, self._valid_range, contact
-        _rendered_into(*self._inputs(context), *constants, output.get_mutable_value())
+        _rendered_wrench_into(
+            *self._evaluate_inputs(context), *constants, output.get_mutable_value()
+        )
 
-    def _inputs(self, context: Context) -> tuple[Any, ...]:
+    def _evaluate_inputs(self, context: Context) -> tuple[Any, ...]:
         estimate = self._estimate.Eval(context)
         return (
             self._sample.Eval(context),

@@ -27,26 +27,26 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    JOINT_POSITION,
-    MOTION,
-    SATURATED,
-    SPECIFIC_FORCE,
-    WRENCH,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_JOINT_POSITION,
+    SAMPLE_MOTION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH,
+    SATURATION_FLAG_INDEX,
 )
 from drake_teleop.station.sensor.sensor_chain import (
     READ_ANGLES,
     READ_SATURATED,
     WristSensorConfig,
     butterworth_sections,
-    low_pass,
+    low_pass_in_place,
     settle_low_pass,
     shift_delay_line,
 )
-from drake_teleop.station.slave.arm import MOTION_SIZE, sensor_motion
+from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, sensor_motion
 
-_SOURCES = ("encoders", "accelerometer", "fused")
+_MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
 #: gains depend on its square root at most.
 _RMS_LEVER_M = 0.4
@@ -55,23 +55,23 @@ _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 # Constants: period, whether the encoders are the only source, whether they correct the
 # accelerometer, waits of wrench, acceleration and angles (fractional) in samples.
-_PERIOD, _ENCODERS, _FUSED, _DELAYS = 0, 1, 2, 3
+_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _DELAYS = 0, 1, 2, 3
 _POSITION = 6  # (3,) position of the accelerometer
 _ORIENTATION = _POSITION + 3  # (3, 3)
 _LOW_PASSES = _ORIENTATION + 9  # (4, 5) low-passes of the angles: the sensor's and `encoders`'
-_SECTIONS = 4
-_ANGULAR_GAINS = _LOW_PASSES + 5 * _SECTIONS
+_NUM_FILTER_SECTIONS = 4
+_ANGULAR_GAINS = _LOW_PASSES + 5 * _NUM_FILTER_SECTIONS
 _LINEAR_GAINS = _ANGULAR_GAINS + 3
 # Memory: samples taken, samples for which the flag stays; state of `_update_filters` for angle and
 # displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
 _FLAG_SAMPLES = 1
-_ANGULAR = 2
+_ANGULAR_FILTER_START = 2
 _FILTER_SIZE = 24
-_LINEAR = _ANGULAR + _FILTER_SIZE
-_MOTION = _LINEAR + _FILTER_SIZE
-_JOINTS = _MOTION + MOTION_SIZE
-_PER_JOINT = 5 + 2 * _SECTIONS
+_LINEAR_FILTER_START = _ANGULAR_FILTER_START + _FILTER_SIZE
+_MOTION = _LINEAR_FILTER_START + _FILTER_SIZE
+_JOINTS = _MOTION + FRAME_STATE_SIZE
+_NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_FILTER_SECTIONS
 #: Index of the gravity vector in the last row of `ArmModel.table`.
 _GRAVITY = 22
 
@@ -81,7 +81,9 @@ _GRAVITY = 22
 class MotionEstimationConfig:
     """Source of the estimated motion of the sensor."""
 
-    source: str = choice("accelerometer", _SOURCES, "source of angular velocity and accelerations")
+    source: str = choice(
+        "accelerometer", _MOTION_SOURCES, "source of angular velocity and accelerations"
+    )
     encoder_bandwidth_hz: float = quantity(
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )
@@ -94,7 +96,7 @@ class MotionEstimationConfig:
 
 
 @dataclass(frozen=True)
-class Delays:
+class PathDelays:
     """Delays of the signal paths at low frequencies [s].
 
     `sample` is the delay of the slowest path in use, for which the others wait.
@@ -107,7 +109,7 @@ class Delays:
 
 
 @dataclass(frozen=True)
-class SteadyState:
+class SteadyStateFilter:
     """Steady-state Kalman filter of position, rate and error of a measured acceleration.
 
     Attributes:
@@ -122,9 +124,9 @@ class SteadyState:
     crossover_hz: float
 
 
-def steady_state(
+def steady_state_kalman_filter(
     position_std: float, acceleration_std: float, drift: float, period: float
-) -> SteadyState:
+) -> SteadyStateFilter:
     """Return the Kalman filter for a measured position x and acceleration a with a drifting error.
 
     Args:
@@ -147,7 +149,7 @@ def steady_state(
     d = -delta / z
     third = np.prod(delta).real
     second = third + keeps * (d[0] * d[1] + d[0] * d[2] + d[1] * d[2]).real
-    return SteadyState(
+    return SteadyStateFilter(
         gains=np.array([1.0 - keeps, second / period, third / period**2]),
         innovation_std=float(position_std / np.sqrt(keeps)),
         position_std=float(position_std * np.sqrt(1.0 - keeps)),
@@ -155,24 +157,28 @@ def steady_state(
     )
 
 
-def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, period: float) -> Delays:
+def path_delays(
+    config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
+) -> PathDelays:
     wrench, acceleration, encoders = sensor.delays(period)
-    encoders += _group_delay(_filters(config, sensor, period)) * period
+    encoders += _group_delay(_low_pass_filters_of_paths(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
-    return Delays(float(wrench), float(acceleration), float(encoders), float(sample))
+    return PathDelays(float(wrench), float(acceleration), float(encoders), float(sample))
 
 
-def motion_gains(
+def fusion_filters(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
-) -> tuple[SteadyState, SteadyState]:
+) -> tuple[SteadyStateFilter, SteadyStateFilter]:
     """Return the Kalman filters of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std, drift = _angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
-        steady_state(angle_std, alpha_std.mean(), drift, period),
-        steady_state(angle_std * _RMS_LEVER_M, s_std.mean(), config.acceleration_drift, period),
+        steady_state_kalman_filter(angle_std, alpha_std.mean(), drift, period),
+        steady_state_kalman_filter(
+            angle_std * _RMS_LEVER_M, s_std.mean(), config.acceleration_drift, period
+        ),
     )
 
 
@@ -186,7 +192,7 @@ def estimated_motion_std(
     shift = np.exp(-1j * np.pi * (np.arange(1 << 14) + 0.5) / (1 << 14))
     response = [
         np.polyval([b2, b1, b0], shift) / np.polyval([a2, a1, 1.0], shift)
-        for b0, b1, b2, a1, a2 in _filters(config, sensor, period)
+        for b0, b1, b2, a1, a2 in _low_pass_filters_of_paths(config, sensor, period)
     ]
     differenced = np.polyval([-1.0, 4.0, -5.0, 2.0], shift) / period**2
     power = np.mean(np.abs(np.prod(response, axis=0) * differenced) ** 2)
@@ -224,7 +230,7 @@ def motion_estimator(
     # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
     p_SoAo_S, R_SA = sensor.accelerometer()
-    angular, linear = motion_gains(config, sensor, num_joints, period)
+    angular, linear = fusion_filters(config, sensor, num_joints, period)
     constants = np.concatenate(
         [
             # An ideal accelerometer needs no correction.
@@ -232,19 +238,21 @@ def motion_estimator(
             waits,
             p_SoAo_S,
             R_SA.ravel(),
-            _filters(config, sensor, period).ravel(),
+            _low_pass_filters_of_paths(config, sensor, period).ravel(),
             angular.gains,
             linear.gains,
         ]
     )
     rows = int(np.ceil(waits.max())) + 1
-    return constants, np.zeros(_JOINTS + _PER_JOINT * num_joints + rows * (12 + num_joints))
+    return constants, np.zeros(
+        _JOINTS + _NUM_VALUES_PER_JOINT * num_joints + rows * (12 + num_joints)
+    )
 
 
-def _filters(
+def _low_pass_filters_of_paths(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> NDArray[np.float64]:
-    filters = np.zeros((_SECTIONS, 5))
+    filters = np.zeros((_NUM_FILTER_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
         filters[:2] = butterworth_sections(sensor.bandwidth_hz, 1 / period)
@@ -266,59 +274,59 @@ def _group_delay(sections: NDArray[np.float64]) -> float:
 
 
 @njit(cache=True)
-def estimate_into(constants, memory, arm, reading, sample):
+def estimate_sample_into(constants, memory, arm, reading, sample):
     """Convert one reading of the sensor, one per period, to a sample of a single instant.
 
     Args:
         constants, memory: results of `motion_estimator`; memory is updated.
-        reading: (13 + n,) output of `sensor_chain.read_into`.
+        reading: (13 + n,) output of `sensor_chain.read_sensor_into`.
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
-    motion, joints = memory[_MOTION:_JOINTS], memory[_JOINTS:][: _PER_JOINT * n]
-    angles = sample[JOINT_POSITION]
+    motion, joints = memory[_MOTION:_JOINTS], memory[_JOINTS:][: _NUM_VALUES_PER_JOINT * n]
+    angles = sample[SAMPLE_JOINT_POSITION]
     _align_paths(constants, memory, n, reading, sample)
     if memory[0] == 0.0:
         for i in range(3 * n):
             joints[2 * n + i] = angles[i % n]
-    _differentiate(constants, joints, angles)
+    _differentiate_joint_angles(constants, joints, angles)
     sensor_motion(arm, angles, joints[:n], joints[n:], motion)
-    if constants[_ENCODERS] != 0.0:
-        copy_into(sample, MOTION.start, motion, 0, 9)
+    if constants[_USE_ENCODERS_INDEX] != 0.0:
+        copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
     else:
         _convert_accelerometer(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
-def estimate_with_gyroscope_into(constants, memory, reading, sample):
+def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
     """Convert one reading to one sample without an arm's kinematics (source `accelerometer`).
 
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
-    n = sample.shape[0] - JOINT_POSITION.start
+    n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
     motion = memory[_MOTION:_JOINTS]
     _align_paths(constants, memory, n, reading, sample)
-    copy_into(motion, 3, sample, JOINT_POSITION.start, 3)
+    copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
     _convert_accelerometer(constants, memory, motion[:3], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
 def _align_paths(constants, memory, n, reading, sample):
-    sections, angles = constants[_LOW_PASSES:_ANGULAR_GAINS], sample[JOINT_POSITION]
-    filtered = memory[_JOINTS:][: _PER_JOINT * n][5 * n :]
+    sections, angles = constants[_LOW_PASSES:_ANGULAR_GAINS], sample[SAMPLE_JOINT_POSITION]
+    filtered = memory[_JOINTS:][: _NUM_VALUES_PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
-    low_pass(sections, filtered, angles)
+    low_pass_in_place(sections, filtered, angles)
     _delay_paths(constants, memory, n, reading, sample)
 
 
 @njit(cache=True)
 def _delay_paths(constants, memory, n, reading, sample):
-    angles, width = sample[JOINT_POSITION], 12 + n
-    line = memory[_JOINTS + _PER_JOINT * n :]
+    angles, width = sample[SAMPLE_JOINT_POSITION], 12 + n
+    line = memory[_JOINTS + _NUM_VALUES_PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)
     for i in range(12):
@@ -330,7 +338,7 @@ def _delay_paths(constants, memory, n, reading, sample):
             copy_into(line, k * width, line, 0, width)
     wrench = int(constants[_DELAYS]) * width
     acceleration = int(constants[_DELAYS + 1]) * width
-    waited, read = sample[WRENCH], sample[MOTION]
+    waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
@@ -342,31 +350,42 @@ def _delay_paths(constants, memory, n, reading, sample):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
     flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES] - 1.0
     memory[_FLAG_SAMPLES] = max(flagged, 0.0)
-    sample[SATURATED] = 1.0 if memory[_FLAG_SAMPLES] > 0.0 else 0.0
+    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAG_SAMPLES] > 0.0 else 0.0
 
 
 @njit(cache=True)
-def _differentiate(constants, joints, angles):
-    n, period = angles.shape[0], constants[_PERIOD]
+def _differentiate_joint_angles(constants, joints, angles):
+    n, period = angles.shape[0], constants[_PERIOD_INDEX]
     for i in range(n):
         q0, q1, q2, q3 = angles[i], joints[2 * n + i], joints[3 * n + i], joints[4 * n + i]
         joints[i] = (3.0 * q0 - 4.0 * q1 + q2) / (2.0 * period)
-        if constants[_ENCODERS] != 0.0:
+        if constants[_USE_ENCODERS_INDEX] != 0.0:
             joints[n + i] = (2.0 * q0 - 5.0 * q1 + 4.0 * q2 - q3) / (period * period)
         joints[2 * n + i], joints[3 * n + i], joints[4 * n + i] = q0, q1, q2
 
 
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
-    period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
-    s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
+    period, fused, starts = (
+        constants[_PERIOD_INDEX],
+        constants[_USE_FUSION_INDEX] != 0.0,
+        memory[0] == 0.0,
+    )
+    s, omega, alpha = (
+        sample[SAMPLE_SPECIFIC_FORCE],
+        sample[SAMPLE_ANGULAR_VELOCITY],
+        sample[SAMPLE_ANGULAR_ACCELERATION],
+    )
     R_SA, R = matrix_at(constants, _ORIENTATION), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
     for i in range(3):
         omega[i] = motion[3 + i]
 
-    angular, linear = memory[_ANGULAR:_LINEAR], memory[_LINEAR:_MOTION]
+    angular, linear = (
+        memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START],
+        memory[_LINEAR_FILTER_START:_MOTION],
+    )
     if fused:
         if starts:
             copy_into(angular, 3, omega, 0, 3)
@@ -414,7 +433,6 @@ def _rotation_vector_into(before, R, angle):
 
 @njit(cache=True)
 def _update_filters(gains, period, moved, acceleration, kept):
-    """Update the filters of `steady_state` for three axes, with Numerov's mean acceleration."""
     for i in range(3):
         mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0
         rate = kept[3 + i] + period * mean

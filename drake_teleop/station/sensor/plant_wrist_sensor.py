@@ -40,49 +40,56 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    JOINT_POSITION,
-    LOST,
-    SATURATED,
-    SPECIFIC_FORCE,
-    TIME,
-    WRENCH,
-    WRENCH_AND_MOTION,
-    sample_parts,
+    LOST_SAMPLE_FLAG,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_JOINT_POSITION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_TIME_INDEX,
+    SAMPLE_WRENCH,
+    SAMPLE_WRENCH_AND_MOTION,
+    SATURATION_FLAG_INDEX,
     sample_size,
+    signals_of_sample,
 )
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    estimate_with_gyroscope_into,
+    estimate_sample_with_gyroscope_into,
     motion_estimator,
 )
 from drake_teleop.station.sensor.sensor_chain import (
     LOST_FLAG_SAMPLES,
-    NOISE_BLOCK,
     NOISE_SIZE,
+    SAMPLES_PER_NOISE_BLOCK,
     TRUE_ANGLES,
     WristSensorConfig,
     is_plausible,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
 )
 
 Array = NDArray[np.float64]
 
-_WHERE = "AddWristSensor"
+_NAME_IN_ERRORS = "AddWristSensor"
 #: Default sampling period for continuous plants [s].
 _DEFAULT_PERIOD = 1e-3
 #: Tolerance of whole multiples of the plant's time step, in steps.
 _STEP_TOLERANCE = 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
 # of the reaction (on the joint's child) as a wrench on the load.
-_POSITION, _ORIENTATION, _JOINT_ORIENTATION, _JOINT_POSITION, _GRAVITY, _SIGN = 0, 3, 12, 21, 24, 27
+_POSITION, _ORIENTATION, _JOINT_ORIENTATION, _JOINT_POSITION, _GRAVITY, _WRENCH_SIGN = (
+    0,
+    3,
+    12,
+    21,
+    24,
+    27,
+)
 # Configuration: R_WB, angular velocity of B in W, joint positions.
 _POSE_SIZE = 12
 
 
-class _Weld(NamedTuple):
+class _SensorWeld(NamedTuple):
     reaction: int
     body: int
     geometry: Array
@@ -128,7 +135,9 @@ def AddWristSensor(
     }.items():
         builder.Connect(source, sensor.GetInputPort(port))
     if sensor.HasInputPort("noise"):
-        noise = RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * sensor.period)
+        noise = RandomSource(
+            RandomDistribution.kGaussian, NOISE_SIZE, SAMPLES_PER_NOISE_BLOCK * sensor.period
+        )
         builder.AddNamedSystem(f"{name}_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     return sensor
@@ -148,7 +157,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         - body_spatial_velocities
         - body_spatial_accelerations
         - reaction_forces
-        - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
+        - noise: (NOISE_SIZE,) standard normal numbers (not if the sensor is ideal)
         output_ports:
         - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So, Eq. (1) [N, N m]
         - specific_force_S: (3,) a - g of So [m/s^2]
@@ -176,14 +185,14 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         step = plant.time_step() or None
         self._step_s, self._steps_per_sample = _event_period_and_count(step, period)
         self._pairs_steps = step is not None and plant.has_sampled_output_ports()
-        config.check(_WHERE, 1 / self.period)
+        config.check(_NAME_IN_ERRORS, 1 / self.period)
 
         which = [] if model_instance is None else [model_instance]
         n = self._n = plant.num_positions(*which)
-        constants, chain = sensor_chain(config, 3 + n, self.period)
+        constants, chain = sensor_chain_constants(config, 3 + n, self.period)
         motion, estimator = motion_estimator(MotionEstimationConfig(), config, 3 + n, self.period)
         sample = np.zeros(sample_size(n) + 1)
-        sample[SATURATED] = LOST
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
         held = np.full(_POSE_SIZE + n, np.nan)
         ends = np.cumsum([len(held), len(sample), len(chain), len(estimator)]).tolist()
         self._held, self._sample = slice(0, ends[0]), slice(ends[0], ends[1])
@@ -208,7 +217,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         if self._pairs_steps:
             self.DeclareInitializationDiscreteUpdateEvent(self._hold_configuration)
         first = 0
-        for name, size in {**sample_parts(n), "sample_time": 1}.items():
+        for name, size in {**signals_of_sample(n), "sample_time": 1}.items():
             self._declare_output("status" if name == "saturated" else name, first, size)
             first += size
         self._declare_output("sample", 0, first)
@@ -221,10 +230,10 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
     def _declare_output(self, name: str, first: int, size: int) -> None:
         part = slice(self._sample.start + first, self._sample.start + first + size)
 
-        def calc(context: Context, output: BasicVector) -> None:
+        def calc_part_of_sample(context: Context, output: BasicVector) -> None:
             output.SetFromVector(context.get_discrete_state_vector().value()[part])
 
-        self.DeclareVectorOutputPort(name, size, calc, {self.xd_ticket()})
+        self.DeclareVectorOutputPort(name, size, calc_part_of_sample, {self.xd_ticket()})
 
     def _configuration(self, context: Context) -> Array:
         _, body, _ = self._weld
@@ -254,8 +263,8 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         truth = np.empty(TRUE_ANGLES.start + 3 + self._n)
         _true_values_into(geometry, configuration, acceleration, force, truth)
         sample = memory[self._sample]
-        _sample_into(self._sensor, truth, noise, memory[self._filters], sample[:TIME])
-        sample[TIME] = context.get_time()
+        _sample_into(self._sensor, truth, noise, memory[self._filters], sample[:SAMPLE_TIME_INDEX])
+        sample[SAMPLE_TIME_INDEX] = context.get_time()
 
 
 @njit(cache=True)
@@ -277,11 +286,11 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
     )
     tau = plus(tau, cross(vector_at(geometry, _JOINT_POSITION), f))
     for i in range(3):
-        truth[WRENCH.start + i] = geometry[_SIGN] * f[i]
-        truth[WRENCH.start + 3 + i] = geometry[_SIGN] * tau[i]
-        truth[SPECIFIC_FORCE.start + i] = s[i]
-        truth[ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
-        truth[ANGULAR_ACCELERATION.start + i] = alpha[i]
+        truth[SAMPLE_WRENCH.start + i] = geometry[_WRENCH_SIGN] * f[i]
+        truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_WRENCH_SIGN] * tau[i]
+        truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
+        truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
+        truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
     copy_into(
         truth, TRUE_ANGLES.start + 3, configuration, _POSE_SIZE, configuration.shape[0] - _POSE_SIZE
     )
@@ -289,49 +298,47 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
 
 @njit(cache=True)
 def _sample_into(sensor, truth, noise, memory, sample):
-    """Write the sample (16 + n,) for true values whose first three "angles" are omega."""
     constants, motion_constants, end, ideal = sensor
-    n = sample.shape[0] - JOINT_POSITION.start
+    n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
     if not is_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATED] = LOST + LOST_FLAG_SAMPLES
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
-    lost = sample[SATURATED] - 1.0
+    lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
-        copy_into(sample, 0, truth, 0, WRENCH_AND_MOTION.stop)
-        sample[SATURATED] = 0.0
-        copy_into(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
+        copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
+        sample[SATURATION_FLAG_INDEX] = 0.0
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
     else:
         reading, estimate = np.empty(truth.shape[0] - 2), np.empty(truth.shape[0] + 1)
-        read_into(constants, memory[:end], noise, truth, reading)
-        estimate_with_gyroscope_into(motion_constants, memory[end:], reading, estimate)
-        copy_into(sample, 0, estimate, 0, JOINT_POSITION.start)
-        copy_into(sample, JOINT_POSITION.start, estimate, JOINT_POSITION.start + 3, n)
-    if lost >= LOST:
-        sample[SATURATED] = lost
+        read_sensor_into(constants, memory[:end], noise, truth, reading)
+        estimate_sample_with_gyroscope_into(motion_constants, memory[end:], reading, estimate)
+        copy_into(sample, 0, estimate, 0, SAMPLE_JOINT_POSITION.start)
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, estimate, SAMPLE_JOINT_POSITION.start + 3, n)
+    if lost >= LOST_SAMPLE_FLAG:
+        sample[SATURATION_FLAG_INDEX] = lost
 
 
 def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
-    expect(MultibodyPlant, plant, f"{_WHERE}: plant")
+    expect(MultibodyPlant, plant, f"{_NAME_IN_ERRORS}: plant")
     if not plant.is_finalized():
         raise DrakeTeleopError(
             f"plant '{plant.get_name()}' is not finalized",
-            where=_WHERE,
+            where=_NAME_IN_ERRORS,
             remedy="call plant.Finalize() first",
         )
     if plant not in builder.GetSystems():
         raise DrakeTeleopError(
             f"plant '{plant.get_name()}' is not in this builder",
-            where=_WHERE,
+            where=_NAME_IN_ERRORS,
             remedy="add it by builder.AddSystem(plant) first",
         )
 
 
 def _event_period_and_count(step: float | None, period: float | None) -> tuple[float, int]:
-    """Return the period of events [s], and the number of events per sample."""
     if period is not None and not 0.0 < period < np.inf:
         raise DrakeTeleopError(
             f"{period} s is not positive and finite",
-            where=f"{_WHERE}: period",
+            where=f"{_NAME_IN_ERRORS}: period",
             remedy="give the time between samples [s]",
         )
     if step is None:
@@ -340,21 +347,21 @@ def _event_period_and_count(step: float | None, period: float | None) -> tuple[f
     if count < 1 - _STEP_TOLERANCE or abs(count - round(count)) > _STEP_TOLERANCE:
         raise DrakeTeleopError(
             f"{period:g} s is no multiple of the plant's time step {step:g} s",
-            where=f"{_WHERE}: period",
+            where=f"{_NAME_IN_ERRORS}: period",
             remedy=f"choose a multiple, such as {max(1, round(count)) * step:g} s",
         )
     return step, round(count)
 
 
 def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple[Frame, WeldJoint]:
-    expect((Joint, Frame), joint_or_frame, f"{_WHERE}: joint_or_frame")
+    expect((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         raise DrakeTeleopError(
             f"'{joint_or_frame.name()}' belongs to another plant",
-            where=f"{_WHERE}: joint_or_frame",
+            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
             remedy="pass a joint or frame of this plant",
         )
-    welds = [joint for joint in _all_joints(plant) if isinstance(joint, WeldJoint)]
+    welds = [joint for joint in _joints_of_model(plant) if isinstance(joint, WeldJoint)]
     if isinstance(joint_or_frame, Frame):
         S = joint_or_frame
         body = S.body().index()
@@ -364,14 +371,14 @@ def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple
             found = f"several welds beyond it: {names}" if beyond else "no weld beyond it"
             raise DrakeTeleopError(
                 f"the body '{S.body().name()}' of frame '{S.name()}' has {found}",
-                where=f"{_WHERE}: joint_or_frame",
+                where=f"{_NAME_IN_ERRORS}: joint_or_frame",
                 remedy="pass the WeldJoint between arm and tool",
             )
         return S, beyond[0]
     if not isinstance(joint_or_frame, WeldJoint):
         raise DrakeTeleopError(
             f"joint '{joint_or_frame.name()}' is {joint_or_frame.type_name()}, not a weld",
-            where=f"{_WHERE}: joint_or_frame",
+            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
             remedy="weld the tool to the arm and pass this WeldJoint",
         )
     parent = joint_or_frame.frame_on_parent()
@@ -380,14 +387,13 @@ def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple
     return parent if on_parent else joint_or_frame.frame_on_child(), joint_or_frame
 
 
-def _all_joints(plant: MultibodyPlant) -> list[Joint]:
+def _joints_of_model(plant: MultibodyPlant) -> list[Joint]:
     return [plant.get_joint(index) for index in plant.GetJointIndices()]
 
 
 def _arm_and_load(plant: MultibodyPlant, weld: WeldJoint) -> tuple[BodyIndex, set[BodyIndex]]:
-    """Return the arm's body at the weld, and all bodies on the other side, the load."""
     neighbours: dict[BodyIndex, list[BodyIndex]] = {}
-    for joint in _all_joints(plant):
+    for joint in _joints_of_model(plant):
         if joint.index() != weld.index():
             parent, child = joint.parent_body().index(), joint.child_body().index()
             neighbours.setdefault(parent, []).append(child)
@@ -410,12 +416,12 @@ def _connected_bodies(
     return found
 
 
-def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Weld:
+def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _SensorWeld:
     arm, load = _arm_and_load(plant, joint)
     if not sum(plant.get_body(body).default_mass() for body in load) > 0.0:
         raise DrakeTeleopError(
             f"the tool beyond joint '{joint.name()}' has no mass",
-            where=f"{_WHERE}: joint_or_frame",
+            where=f"{_NAME_IN_ERRORS}: joint_or_frame",
             remedy="give a body of the tool a SpatialInertia",
         )
     on_parent = joint.parent_body().index() == arm
@@ -436,4 +442,4 @@ def _weld_properties(plant: MultibodyPlant, S: Frame, joint: WeldJoint) -> _Weld
         ]
     )
     reaction = list(plant.GetJointIndices()).index(joint.index())
-    return _Weld(reaction, int(S.body().index()), geometry)
+    return _SensorWeld(reaction, int(S.body().index()), geometry)

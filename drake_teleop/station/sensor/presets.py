@@ -9,7 +9,7 @@ from typing import Any
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 # The IMU of the ATI record, with the low-pass before the noise.
-_ATI_IMU: dict[str, Any] = {
+_ATI_IMU_SETTINGS: dict[str, Any] = {
     "p_SoAo_S": [0.0, 0.0, 0.05],
     "low_pass": "before_noise",
     "bandwidth_hz": 300.0,
@@ -19,18 +19,20 @@ _ATI_IMU: dict[str, Any] = {
     "acceleration_range": 78.5,
     "acceleration_latency": 6e-3,
 }
-_BOTA: dict[str, Any] = {"acceleration_latency": 0.0}
+_BOTA_SETTINGS: dict[str, Any] = {"acceleration_latency": 0.0}
 
 # Ranges of fx and fy, fz, tx and ty, tz; noise of force and torque; resolution; other fields.
-_SENSORS: dict[str, tuple[float, float, float, float, float, float, float, dict[str, Any]]] = {
+_SETTINGS_OF_SENSOR: dict[
+    str, tuple[float, float, float, float, float, float, float, dict[str, Any]]
+] = {
     "ati_mini45": (290.0, 580.0, 10.0, 10.0, 0.06, 1.5e-3, 4.3e-4, {}),
     "bota_sensone": (
         *(500.0, 1200.0, 15.0, 12.0, 0.15, 3e-3, 1e-5),
-        _BOTA | {"p_SoAo_S": [0.0, 0.0, 0.018]},
+        _BOTA_SETTINGS | {"p_SoAo_S": [0.0, 0.0, 0.018]},
     ),
     "bota_rokubi": (
         *(500.0, 1000.0, 10.0, 10.0, 0.2, 4e-3, 1e-5),
-        _BOTA | {"p_SoAo_S": [0.0, 0.0, 0.015]},
+        _BOTA_SETTINGS | {"p_SoAo_S": [0.0, 0.0, 0.015]},
     ),
     "robotiq_ft300": (
         *(300.0, 300.0, 30.0, 30.0, 0.1, 5e-3, 1e-5),
@@ -55,7 +57,7 @@ PRESETS: dict[str, WristSensorConfig] = {
     "ideal": WristSensorConfig(ideal=True),
     "jr3_85m35a3": WristSensorConfig(),
     "ati_gamma_imu": WristSensorConfig(
-        **copy.deepcopy(_ATI_IMU),
+        **copy.deepcopy(_ATI_IMU_SETTINGS),
         R_SA=[0.0, -1.0, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0],
         force_noise=0.018,
         torque_noise=9e-4,
@@ -68,12 +70,21 @@ PRESETS: dict[str, WristSensorConfig] = {
     ),
     **{
         name: WristSensorConfig(
-            **copy.deepcopy(_ATI_IMU)
+            **copy.deepcopy(_ATI_IMU_SETTINGS)
             | {"force_range": [side, side, along], "torque_range": [bending, bending, twist]}
             | {"force_noise": force, "torque_noise": torque, "resolution": step}
             | others
         )
-        for name, (side, along, bending, twist, force, torque, step, others) in _SENSORS.items()
+        for name, (
+            side,
+            along,
+            bending,
+            twist,
+            force,
+            torque,
+            step,
+            others,
+        ) in _SETTINGS_OF_SENSOR.items()
     },
 }
 """Sensors by name, with the sources of their values.
@@ -102,7 +113,7 @@ accordingly.
 """
 
 
-def preset_of(block: Mapping[str, Any] | None) -> WristSensorConfig:
+def preset_of_block(block: Mapping[str, Any] | None) -> WristSensorConfig:
     """Return the default settings for a scenario's block `wrist_sensor`, from its `preset`."""
     name = (block or {}).get("preset")
     return copy.deepcopy(PRESETS.get(str(name), WristSensorConfig()))

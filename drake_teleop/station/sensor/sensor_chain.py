@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.blocks import LARGEST
+from drake_teleop.common.blocks import LARGEST_PORT_VALUE
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
@@ -32,17 +32,17 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    SPECIFIC_FORCE,
-    WRENCH,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH,
 )
 
 #: Samples per block of random numbers: one event of a noise source, one step of a walk.
-NOISE_BLOCK = 128
-_CHANNELS = 12
-#: Standard normal numbers for NOISE_BLOCK samples: 12 for each, then 12 for the random walks.
-NOISE_SIZE = _CHANNELS * (NOISE_BLOCK + 1)
+SAMPLES_PER_NOISE_BLOCK = 128
+_NUM_CHANNELS = 12
+#: Standard normal numbers of a block: 12 for each sample, then 12 for the random walks.
+NOISE_SIZE = _NUM_CHANNELS * (SAMPLES_PER_NOISE_BLOCK + 1)
 
 #: Samples for which a lost sample stays flagged, so that the log contains the flag.
 LOST_FLAG_SAMPLES = 40
@@ -53,7 +53,7 @@ PRESET_NAMES = (
     *("robotiq_ft300", "onrobot_hex_e", "ur5e_built_in", "franka_estimated"),
 )
 _LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
-_SECTIONS = 2  # second-order sections of the fourth-order low-pass
+_NUM_LOW_PASS_SECTIONS = 2  # second-order sections of the fourth-order low-pass
 _ROTATION_TOLERANCE = 1e-6
 # Overload limit in ranges.
 _OVERLOAD_FACTOR = 10.0
@@ -225,21 +225,21 @@ class WristSensorConfig:
             )
 
 
-_CALIBRATION = (
+_CALIBRATION_FIELDS = (
     *("gain_error", "cross_talk", "misalignment"),
     *("acceleration_gain_error", "acceleration_misalignment"),
 )
-_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
+_QUANTITY_NAMES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts of the sensor by name, with the field values that switch each part off.
 PARTS: dict[str, dict[str, Any]] = {
-    "calibration": dict.fromkeys(_CALIBRATION, 0.0),
+    "calibration": dict.fromkeys(_CALIBRATION_FIELDS, 0.0),
     "place": {
         "p_SoAo_S": [0.0] * 3,
         "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
     },
     "low_pass": {"low_pass": "none"},
-    "noise": {f"{name}_noise": 0.0 for name in _QUANTITIES},
-    "random_walk": {f"{name}_walk": 0.0 for name in _QUANTITIES},
+    "noise": {f"{name}_noise": 0.0 for name in _QUANTITY_NAMES},
+    "random_walk": {f"{name}_walk": 0.0 for name in _QUANTITY_NAMES},
     "offset": {"offset": [0.0] * 6, "acceleration_offset": [0.0] * 6},
     "drift": {"drift": [0.0] * 6},
     "quantisation": {"resolution": 0.0, "encoder_resolution": 0.0},
@@ -260,7 +260,7 @@ def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
     """Return the sections (2, 5) [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass."""
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
-    sections = np.empty((_SECTIONS, 5))
+    sections = np.empty((_NUM_LOW_PASS_SECTIONS, 5))
     for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
         damping = 2 * np.cos(angle) * warped
         a0 = 1 + damping + warped**2
@@ -301,43 +301,43 @@ def _rotation_matrix(axis: NDArray[np.float64], angle: float) -> NDArray[np.floa
 
 
 #: Constants: offset of force and torque, which may change during a run.
-OFFSET = slice(0, 6)
+OFFSET_CONSTANTS = slice(0, 6)
 # True values: as a sample (`drake_teleop.load.regressor`) without the flag.
 TRUE_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 # Constants: 12 offsets, 12 drifts per sample, then these.
-_DRIFT, _NOISE, _WALK, _QUANTA, _LIMITS = range(12, 72, 12)
+_DRIFT, _NOISE, _WALK, _QUANTUM_START, _RANGE_START = range(12, 72, 12)
 _WRENCH = 72  # (6, 6)
 _MOTION = _WRENCH + 36  # (2, 3, 3) from S into A, for s and alpha
 _POSITION = _MOTION + 18  # (3,)
 _FILTER = _POSITION + 3  # (2, 5)
-_LOW_PASS_STAGE = _FILTER + 5 * _SECTIONS
+_LOW_PASS_STAGE = _FILTER + 5 * _NUM_LOW_PASS_SECTIONS
 _LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
 _ENCODER = _LATENCIES + 3
-_IDEAL = _ENCODER + 1
-_OVERLOADS = _IDEAL + 1  # (6,)
+_IS_IDEAL = _ENCODER + 1
+_OVERLOADS = _IS_IDEAL + 1  # (6,)
 _BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
-_WALKS = 1
-FILTERED = _WALKS + _CHANNELS
-_LINE = FILTERED + 2 * _SECTIONS * _CHANNELS
-_ROW = _CHANNELS + 2
+_RANDOM_WALK_START = 1
+FILTER_MEMORY_START = _RANDOM_WALK_START + _NUM_CHANNELS
+_DELAY_LINE_START = FILTER_MEMORY_START + 2 * _NUM_LOW_PASS_SECTIONS * _NUM_CHANNELS
+_DELAY_LINE_ROW = _NUM_CHANNELS + 2
 
 
-def sensor_chain(
+def sensor_chain_constants(
     config: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return constants and initial memory of `read_into` for an arm with n joints.
+    """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
     `constants[OFFSET]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer()
-    limits = config.ranges() if config.saturates else np.full(_CHANNELS, np.inf)
-    sections = np.zeros((_SECTIONS, 5))
+    limits = config.ranges() if config.saturates else np.full(_NUM_CHANNELS, np.inf)
+    sections = np.zeros((_NUM_LOW_PASS_SECTIONS, 5))
     if config.low_pass != "none" and not config.ideal:
         sections = butterworth_sections(config.bandwidth_hz, 1 / period)
     latencies = config.latencies(period)
@@ -348,7 +348,7 @@ def sensor_chain(
             np.array(config.drift) * period,
             np.zeros(6),
             config.noise_std(),
-            config.random_walk() * np.sqrt(NOISE_BLOCK * period),
+            config.random_walk() * np.sqrt(SAMPLES_PER_NOISE_BLOCK * period),
             config.resolution * config.ranges(),
             limits,
             wrench.ravel(),
@@ -366,7 +366,7 @@ def sensor_chain(
         ]
     )
     rows = 0 if config.ideal else latencies.max() + 1
-    return constants, np.zeros(_LINE + rows * (_ROW + num_joints))
+    return constants, np.zeros(_DELAY_LINE_START + rows * (_DELAY_LINE_ROW + num_joints))
 
 
 @njit(cache=True)
@@ -376,78 +376,83 @@ def is_plausible(constants, truth):
     for i in range(6):
         good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOADS + i]
     for i in range(6, truth.shape[0]):
-        good = good and abs(truth[i]) <= LARGEST
+        good = good and abs(truth[i]) <= LARGEST_PORT_VALUE
     return good
 
 
 @njit(cache=True)
-def read_into(constants, memory, noise, truth, reading):
+def read_sensor_into(constants, memory, noise, truth, reading):
     """Convert true values to the sensor's reading at one instant, once per period.
 
     Args:
-        constants, memory: results of `sensor_chain`; memory is updated.
-        noise: (NOISE_SIZE,) standard normal numbers for this block of NOISE_BLOCK samples.
+        constants, memory: results of `sensor_chain_constants`; memory is updated.
+        noise: (NOISE_SIZE,) standard normal numbers for this block of samples.
         truth: (15 + n,) [wrench (6) of the sensor on the tool at So in S | specific force of So
             (3), angular velocity (3), angular acceleration (3) in S | joint angles (n)].
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
     angles = truth[TRUE_ANGLES]
-    if constants[_IDEAL] != 0.0:
-        copy_into(reading, READ_WRENCH.start, truth, WRENCH.start, 6)
-        copy_into(reading, READ_ACCELERATION.start, truth, SPECIFIC_FORCE.start, 3)
-        copy_into(reading, READ_ACCELERATION.start + 3, truth, ANGULAR_ACCELERATION.start, 3)
+    if constants[_IS_IDEAL] != 0.0:
+        copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
+        copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
+        copy_into(reading, READ_ACCELERATION.start + 3, truth, SAMPLE_ANGULAR_ACCELERATION.start, 3)
         reading[READ_SATURATED] = 0.0
         copy_into(reading, READ_ANGLES.start, angles, 0, angles.shape[0])
         return
     count = int(memory[0])
-    width = _ROW + angles.shape[0]
-    rows = (memory.shape[0] - _LINE) // width
-    shift_delay_line(memory[_LINE:], width)
-    row = memory[_LINE:][:width]
-    channels = row[:_CHANNELS]
-    walks, filtered = memory[_WALKS:FILTERED], memory[FILTERED:_LINE]
+    width = _DELAY_LINE_ROW + angles.shape[0]
+    rows = (memory.shape[0] - _DELAY_LINE_START) // width
+    shift_delay_line(memory[_DELAY_LINE_START:], width)
+    row = memory[_DELAY_LINE_START:][:width]
+    channels = row[:_NUM_CHANNELS]
+    walks, filtered = (
+        memory[_RANDOM_WALK_START:FILTER_MEMORY_START],
+        memory[FILTER_MEMORY_START:_DELAY_LINE_START],
+    )
     sections, place = constants[_FILTER:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
-    if count % NOISE_BLOCK == 0:
-        for i in range(_CHANNELS):
-            walks[i] += constants[_WALK + i] * noise[_CHANNELS * NOISE_BLOCK + i]
+    if count % SAMPLES_PER_NOISE_BLOCK == 0:
+        for i in range(_NUM_CHANNELS):
+            walks[i] += constants[_WALK + i] * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
 
     _apply_calibration_errors(constants, truth, channels)
     if place == _BEFORE_NOISE:
         if count == 0:
             settle_low_pass(sections, filtered, channels)
-        low_pass(sections, filtered, channels)
-    for i in range(_CHANNELS):
+        low_pass_in_place(sections, filtered, channels)
+    for i in range(_NUM_CHANNELS):
         channels[i] += constants[i] + count * constants[_DRIFT + i]
     if place == _AFTER_CONVERTER and count == 0:
         settle_low_pass(sections, filtered, channels)
-    first = _CHANNELS * (count % NOISE_BLOCK)
-    for i in range(_CHANNELS):
+    first = _NUM_CHANNELS * (count % SAMPLES_PER_NOISE_BLOCK)
+    for i in range(_NUM_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
-    row[_CHANNELS] = _quantize(constants, 0, 6, channels)
-    row[_CHANNELS + 1] = _quantize(constants, 6, 12, channels)
+    row[_NUM_CHANNELS] = _quantize(constants, 0, 6, channels)
+    row[_NUM_CHANNELS + 1] = _quantize(constants, 6, 12, channels)
     if place == _AFTER_CONVERTER:
-        low_pass(sections, filtered, channels)
+        low_pass_in_place(sections, filtered, channels)
     quantum = constants[_ENCODER]
-    for i in range(_ROW, width):
-        angle = angles[i - _ROW]
+    for i in range(_DELAY_LINE_ROW, width):
+        angle = angles[i - _DELAY_LINE_ROW]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
 
     if count == 0:
         for k in range(1, rows):
-            copy_into(memory, _LINE + k * width, row, 0, width)
+            copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
     memory[0] += 1.0
     late = constants[_LATENCIES:_ENCODER]
-    force = _LINE + int(late[0]) * width
-    acceleration = _LINE + int(late[1]) * width
-    encoders = _LINE + int(late[2]) * width
+    force = _DELAY_LINE_START + int(late[0]) * width
+    acceleration = _DELAY_LINE_START + int(late[1]) * width
+    encoders = _DELAY_LINE_START + int(late[2]) * width
     wrench, moved, turned = reading[READ_WRENCH], reading[READ_ACCELERATION], reading[READ_ANGLES]
     for i in range(6):
         wrench[i] = memory[force + i]
         moved[i] = memory[acceleration + 6 + i]
-    reading[READ_SATURATED] = max(memory[force + _CHANNELS], memory[acceleration + _CHANNELS + 1])
-    for i in range(_ROW, width):
-        turned[i - _ROW] = memory[encoders + i]
+    reading[READ_SATURATED] = max(
+        memory[force + _NUM_CHANNELS], memory[acceleration + _NUM_CHANNELS + 1]
+    )
+    for i in range(_DELAY_LINE_ROW, width):
+        turned[i - _DELAY_LINE_ROW] = memory[encoders + i]
 
 
 @njit(cache=True)
@@ -459,8 +464,8 @@ def shift_delay_line(line, width):
 
 @njit(cache=True)
 def _apply_calibration_errors(constants, truth, out):
-    wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
-    omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
+    wrench, s = truth[SAMPLE_WRENCH], truth[SAMPLE_SPECIFIC_FORCE]
+    omega, alpha = truth[SAMPLE_ANGULAR_VELOCITY], truth[SAMPLE_ANGULAR_ACCELERATION]
     for i in range(6):
         value = 0.0
         for j in range(6):
@@ -476,7 +481,11 @@ def _apply_calibration_errors(constants, truth, out):
 def _quantize(constants, first, end, channels):
     saturated = 0.0
     for i in range(first, end):
-        quantum, limit, value = constants[_QUANTA + i], constants[_LIMITS + i], channels[i]
+        quantum, limit, value = (
+            constants[_QUANTUM_START + i],
+            constants[_RANGE_START + i],
+            channels[i],
+        )
         if quantum > 0.0:
             value = quantum * np.rint(value / quantum)
         if abs(value) >= limit:
@@ -487,7 +496,7 @@ def _quantize(constants, first, end, channels):
 
 
 @njit(cache=True)
-def low_pass(sections, memory, values):
+def low_pass_in_place(sections, memory, values):
     """Apply the second-order `sections` (5 k,) in series to `values` (n,) in place."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):

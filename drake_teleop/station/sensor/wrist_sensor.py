@@ -3,7 +3,7 @@
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
 The state at each sampling instant is interpolated within an integration step. With contact outside
-the compiled law (`Contact.beyond`) each sample is an event at the end of a step.
+the compiled law (`ToolContactModel.beyond`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
@@ -37,40 +37,40 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.load.regressor import (
-    ANGULAR_ACCELERATION,
-    ANGULAR_VELOCITY,
-    BEFORE_JOINTS,
-    JOINT_POSITION,
-    LOST,
-    MOTION,
-    SATURATED,
-    SPECIFIC_FORCE,
-    WRENCH,
-    WRENCH_AND_MOTION,
+    FIRST_JOINT_INDEX,
+    LOST_SAMPLE_FLAG,
+    SAMPLE_ANGULAR_ACCELERATION,
+    SAMPLE_ANGULAR_VELOCITY,
+    SAMPLE_JOINT_POSITION,
+    SAMPLE_MOTION,
+    SAMPLE_SPECIFIC_FORCE,
+    SAMPLE_WRENCH,
+    SAMPLE_WRENCH_AND_MOTION,
+    SATURATION_FLAG_INDEX,
     non_contact_wrench_into,
-    sample_parts,
     sample_size,
+    signals_of_sample,
 )
-from drake_teleop.station.environment.moving_bodies import interpolate_bodies
+from drake_teleop.station.environment.moving_bodies import interpolate_joint_state
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    estimate_into,
+    estimate_sample_into,
     motion_estimator,
 )
 from drake_teleop.station.sensor.sensor_chain import (
-    FILTERED,
+    FILTER_MEMORY_START,
     LOST_FLAG_SAMPLES,
-    NOISE_BLOCK,
     NOISE_SIZE,
-    OFFSET,
+    OFFSET_CONSTANTS,
+    SAMPLES_PER_NOISE_BLOCK,
     TRUE_ANGLES,
     WristSensorConfig,
     is_plausible,
-    read_into,
-    sensor_chain,
+    read_sensor_into,
+    sensor_chain_constants,
 )
 from drake_teleop.station.slave.arm import (
-    MOTION_SIZE,
+    FRAME_STATE_SIZE,
     ArmModel,
     forward_kinematics,
     sensor_motion,
@@ -78,13 +78,13 @@ from drake_teleop.station.slave.arm import (
 from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import (
-    FAR,
-    TOUCHING,
-    WATCHED,
+    PROXIMITY_FAR,
+    PROXIMITY_NEAR_MONITORED,
+    PROXIMITY_TOUCHING,
     assemble_state,
     environment_wrench,
     plant_rates,
-    rates_under,
+    plant_rates_under_wrench,
     tool_proximity,
 )
 
@@ -96,22 +96,26 @@ _TIME_TOLERANCE = 1e-6
 _MAX_QUEUED_STEPS = 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
-_CHECK_PERIOD, _ACCELERATION_TOLERANCE = 0.1, 1e-6
-#: Value of `touching_W` in `sample_step` that selects the compiled contact law.
-_USE_CONTACT_LAW = np.zeros(0)
+_CHECK_PERIOD_S, _ACCELERATION_TOLERANCE = 0.1, 1e-6
+#: Value of `touching_W` in `take_due_samples` that selects the compiled contact law.
+_NO_GIVEN_WRENCH = np.zeros(0)
 
 
 @njit(cache=True)
-def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
+def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
     """Write the true wrench and motion [f, tau, s, omega, alpha] of S into `out` (15,).
 
     `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
     `phi` (10,) are the tool's inertial parameters.
     """
     sensor_motion(arm, q, v, vdot, motion)
-    copy_into(out, MOTION.start, motion, 0, 9)
-    s, omega, alpha = out[SPECIFIC_FORCE], out[ANGULAR_VELOCITY], out[ANGULAR_ACCELERATION]
-    wrench = out[WRENCH]
+    copy_into(out, SAMPLE_MOTION.start, motion, 0, 9)
+    s, omega, alpha = (
+        out[SAMPLE_SPECIFIC_FORCE],
+        out[SAMPLE_ANGULAR_VELOCITY],
+        out[SAMPLE_ANGULAR_ACCELERATION],
+    )
+    wrench = out[SAMPLE_WRENCH]
     non_contact_wrench_into(s, omega, alpha, phi, wrench)
     # The contact wrench is about the world's origin; about So its moment is tau - p_WS x f.
     f, p_WS, R_SW = vector_at(contact_W, 0), vector_at(motion, 9), transposed(matrix_at(motion, 12))
@@ -144,33 +148,37 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     n = half - 1
     truth = np.empty(15 + n)
     v, vdot = x[half : half + n], xdot[half : half + n]
-    rigid = truth[WRENCH_AND_MOTION]
-    true_sample(arm, phi, x[:n], v, vdot, wrench_W, np.empty(MOTION_SIZE), rigid)
+    rigid = truth[SAMPLE_WRENCH_AND_MOTION]
+    true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(FRAME_STATE_SIZE), rigid)
     copy_into(truth, TRUE_ANGLES.start, x, 0, n)
-    size = BEFORE_JOINTS + n
+    size = FIRST_JOINT_INDEX + n
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
     if not is_plausible(constants, truth):  # keeps it out of the filters
-        sample[SATURATED] = LOST + LOST_FLAG_SAMPLES
+        sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG + LOST_FLAG_SAMPLES
         return
-    lost = sample[SATURATED] - 1.0
+    lost = sample[SATURATION_FLAG_INDEX] - 1.0
     if ideal:
         copy_into(
-            sample, WRENCH_AND_MOTION.start, truth, WRENCH_AND_MOTION.start, WRENCH_AND_MOTION.stop
+            sample,
+            SAMPLE_WRENCH_AND_MOTION.start,
+            truth,
+            SAMPLE_WRENCH_AND_MOTION.start,
+            SAMPLE_WRENCH_AND_MOTION.stop,
         )
-        sample[SATURATED] = 0.0
-        copy_into(sample, JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
+        sample[SATURATION_FLAG_INDEX] = 0.0
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
     else:
         reading = np.empty(13 + n)
-        read_into(constants, memory[2 * size : middle], noise, truth, reading)
-        estimate_into(motion_constants, memory[middle:end], arm, reading, sample)
-    if lost >= LOST:
-        sample[SATURATED] = lost
+        read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
+        estimate_sample_into(motion_constants, memory[middle:end], arm, reading, sample)
+    if lost >= LOST_SAMPLE_FLAG:
+        sample[SATURATION_FLAG_INDEX] = lost
 
 
 @njit(cache=True)
-def queue_step(tail, time, state, around):
-    """Append time and state of a step's end to the queue `tail`, see `sample_step`."""
+def append_step_to_queue(tail, time, state, around):
+    """Append time and state of a step's end to the queue `tail`, see `take_due_samples`."""
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
@@ -182,12 +190,12 @@ def queue_step(tail, time, state, around):
 def _try_queue_step(memory, tail, longest, time, state, around):
     if memory[tail + 1] >= longest:
         return False
-    queue_step(memory[tail:], time, state, around)
+    append_step_to_queue(memory[tail:], time, state, around)
     return True
 
 
 @njit(cache=True)
-def _torque_at(held, after, torque):
+def _torque_after_into(held, after, torque):
     """Write the motor torque (n,) at the time now + `after` [s]."""
     copy_into(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
@@ -195,7 +203,7 @@ def _torque_at(held, after, torque):
 
 
 @njit(cache=True, borrows=True)
-def sample_step(
+def take_due_samples(
     physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
     touching_W, scratch, result,
 ):  # fmt: skip
@@ -218,7 +226,7 @@ def sample_step(
         result: written: [last sample before now (16 + n) | its time [s] | memory].
     """
     n = state.shape[0] // 2
-    size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
+    size, half, tau, joints = FIRST_JOINT_INDEX + n, n + 1, scratch[7, :n], physics[4]
     extra = around.shape[0] - 2
     full = 2 * half + extra
     width = 1 + full
@@ -232,14 +240,14 @@ def sample_step(
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     assemble_state(state, around, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
-    _torque_at(held, 0.0, tau)
+    _torque_after_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
         environment_wrench(
             physics[0], none, joints, applied_W, state[:n], state[n:], sheet, plant, now_wrench_W
         )
         now_wrench_W += touching_W
-        rates_under(physics, now, tau, applied_W, now_wrench_W, now_dot)
+        plant_rates_under_wrench(physics, now, tau, applied_W, now_wrench_W, now_dot)
     else:
         plant_rates(physics, now, tau, applied_W, now_wrench_W, now_dot)
     for k in range(queued):
@@ -250,10 +258,10 @@ def sample_step(
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
         if (count + _TIME_TOLERANCE) * period >= until:
             continue
-        _torque_at(held, start[0] - time, tau)
+        _torque_after_into(held, start[0] - time, tau)
         plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
         if k < queued - 1:
-            _torque_at(held, until - time, tau)
+            _torque_after_into(held, until - time, tau)
             plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
         while (count + _TIME_TOLERANCE) * period < until:
@@ -261,8 +269,8 @@ def sample_step(
             _interpolate(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
                 at_start, at_end = start[width - extra :], end[2 * half :]
-                interpolate_bodies(joints, h, u, at_start, at_end, between[2 * half :])
-            _torque_at(held, count * period - time, tau)
+                interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])
+            _torque_after_into(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
@@ -274,7 +282,7 @@ def sample_step(
         _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
-    queue_step(tail, time, state, around)
+    append_step_to_queue(tail, time, state, around)
 
 
 class WristSensor(LeafSystem):
@@ -291,7 +299,7 @@ class WristSensor(LeafSystem):
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         - contact_results: contact results of the plant (only with surroundings)
-        - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
+        - noise: (NOISE_SIZE,) standard normal numbers (not if the sensor is ideal)
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
@@ -317,13 +325,13 @@ class WristSensor(LeafSystem):
         super().__init__()
         arm = slave.arm
         n = self._n = arm.num_joints
-        constants, chain = sensor_chain(config, n, period)
+        constants, chain = sensor_chain_constants(config, n, period)
         motion_constants, estimator = motion_estimator(motion, config, n, period)
-        self._offset = constants[OFFSET]
-        self._physics, contact = slave.physics, slave.contact
+        self._offset = constants[OFFSET_CONSTANTS]
+        self._physics, contact = slave.physics_of_plant, slave.contact
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
-            first[WRENCH] += config.offset
+            first[SAMPLE_WRENCH] += config.offset
         # Contact needs many steps per torque sample, so queueing them saves time.
         self._beyond_contact_law = contact.beyond
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
@@ -341,7 +349,7 @@ class WristSensor(LeafSystem):
         self._twin: ContactTwin | None = None
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
-        self._event_periods = (held, NOISE_BLOCK * period)
+        self._event_periods = (held, SAMPLES_PER_NOISE_BLOCK * period)
         self._no_noise, self._zero_wrench = np.zeros(NOISE_SIZE), np.zeros(6)
         self._no_rate = np.zeros(0)
 
@@ -378,7 +386,7 @@ class WristSensor(LeafSystem):
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update)
-        self.DeclarePeriodicPublishEvent(_CHECK_PERIOD, 0.0, self._check)
+        self.DeclarePeriodicPublishEvent(_CHECK_PERIOD_S, 0.0, self._check_acceleration)
 
     @property
     def offset(self) -> Array:
@@ -395,29 +403,29 @@ class WristSensor(LeafSystem):
         return self._physics[2]
 
     @property
-    def beyond(self) -> str:
+    def reason_beyond_contact_law(self) -> str:
         """Reason why contact is outside the compiled contact law, or ""."""
         return self._beyond_contact_law
 
     @property
-    def moves(self) -> str:
+    def moving_bodies_sentence(self) -> str:
         """Sentence that names the moving bodies around the arm except a sheet spring, or ""."""
         names = ", ".join(self._moving)
         return f"{names} can move" if names else ""
 
     @property
-    def remembered(self) -> NDArray[np.intp]:
+    def motion_dependent_indices(self) -> NDArray[np.intp]:
         """Indices of the numbers in the discrete state that depend on the motion."""
         _, _, chain_end, end, _ = self._sensor
         size = sample_size(self._n)
-        before_and_walks = range(size, 2 * size + FILTERED)
-        others = [SATURATED, *before_and_walks, chain_end, chain_end + 1]
+        before_and_walks = range(size, 2 * size + FILTER_MEMORY_START)
+        others = [SATURATION_FLAG_INDEX, *before_and_walks, chain_end, chain_end + 1]
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
-        seen = self._states(context)
-        self._sample(
-            context, seen, self._contact_level(*seen), False, _USE_CONTACT_LAW, self._result
+        seen = self._arm_state_and_surroundings(context)
+        self._take_samples(
+            context, seen, self._contact_level(*seen), False, _NO_GIVEN_WRENCH, self._result
         )
         context.SetDiscreteState(self._result[self._memory_slice])
 
@@ -426,9 +434,9 @@ class WristSensor(LeafSystem):
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
         tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE), 0.0
-        queue_step(tail, time, *self._states(context))
+        append_step_to_queue(tail, time, *self._arm_state_and_surroundings(context))
 
-    def _states(self, context: Context) -> tuple[Array, Array]:
+    def _arm_state_and_surroundings(self, context: Context) -> tuple[Array, Array]:
         return self._state.Eval(context), self._surroundings(context)
 
     def _surroundings(self, context: Context) -> Array:
@@ -441,9 +449,9 @@ class WristSensor(LeafSystem):
 
     def _contact_level(self, state: Array, around: Array) -> int:
         if self._contacts is None:
-            return FAR
+            return PROXIMITY_FAR
         if self._beyond_contact_law:
-            return TOUCHING
+            return PROXIMITY_TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q = state[: self._n]
         return tool_proximity(arm, pairs, self._watched, joints, q, around[:2], around[2:])
@@ -459,7 +467,7 @@ class WristSensor(LeafSystem):
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
         return wrench_W
 
-    def _inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
+    def _evaluate_inputs(self, context: Context, seen: tuple[Array, Array]) -> tuple[object, ...]:
         return (
             self._physics,
             self._sensor,
@@ -476,17 +484,17 @@ class WristSensor(LeafSystem):
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        seen = self._states(context)
+        seen = self._arm_state_and_surroundings(context)
         near = self._contact_level(*seen)
-        if near == FAR:
+        if near == PROXIMITY_FAR:
             touching_W = self._zero_wrench
-        elif near == WATCHED or self._uses_plant_contact:
+        elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
             touching_W = self._plant_contact_W(context)
         else:
-            touching_W = _USE_CONTACT_LAW
-        self._sample(context, seen, near, True, touching_W, output.get_mutable_value())
+            touching_W = _NO_GIVEN_WRENCH
+        self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
 
-    def _sample(
+    def _take_samples(
         self,
         context: Context,
         seen: tuple[Array, Array],
@@ -495,10 +503,9 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        """Call `sample_step`; near monitored shapes, with Drake's contact at each instant."""
-        inputs = self._inputs(context, seen)
-        if near != WATCHED:
-            sample_step(*inputs, until_now, touching_W, self._scratch, result)
+        inputs = self._evaluate_inputs(context, seen)
+        if near != PROXIMITY_NEAR_MONITORED:
+            take_due_samples(*inputs, until_now, touching_W, self._scratch, result)
             return
         if self._twin is None:
             self._twin = ContactTwin(*self._twin_arguments)
@@ -509,38 +516,41 @@ class WristSensor(LeafSystem):
         # The state of each requested wrench depends on the previous wrenches.
         for k in range(self._max_twin_wrenches):
             told[0, :2] = k, 0.0
-            sample_step(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
+            take_due_samples(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
             if told[0, 1] <= k:
                 return
             asked = told[0, 2:]
             told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._max_queued_steps > 1 and not self._is_due(context.get_time()):
-            seen = self._states(context)
-            if not self._watched.size or self._contact_level(*seen) != WATCHED:
+        if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):
+            seen = self._arm_state_and_surroundings(context)
+            if not self._watched.size or self._contact_level(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
                 if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
                     return
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
-    def _is_due(self, time: float) -> bool:
+    def _are_samples_due(self, time: float) -> bool:
         # Inline for speed: called at every step in contact.
         margin, (held, block) = _TIME_TOLERANCE * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
             return True
         return abs(time - block * round(time / block)) < margin
 
-    def _check(self, context: Context) -> EventStatus:
+    def _check_acceleration(self, context: Context) -> EventStatus:
         n = self._n
-        state, around = self._states(context)
+        state, around = self._arm_state_and_surroundings(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
         assemble_state(state, around, x)
         if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         physics = self._physics
-        if self._beyond_contact_law or self._contact_level(state, around) == WATCHED:
+        if (
+            self._beyond_contact_law
+            or self._contact_level(state, around) == PROXIMITY_NEAR_MONITORED
+        ):
             applied = applied + self._plant_contact_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
@@ -559,9 +569,13 @@ class WristSensor(LeafSystem):
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
     """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
-    touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[WRENCH_AND_MOTION]
-    true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
-    sample[JOINT_POSITION] = q
+    touching, motion, truth = (
+        np.zeros(6),
+        np.zeros(FRAME_STATE_SIZE),
+        sample[SAMPLE_WRENCH_AND_MOTION],
+    )
+    true_sample_into(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
+    sample[SAMPLE_JOINT_POSITION] = q
     return sample
 
 
@@ -585,7 +599,9 @@ def AddCompiledWristSensor(
     if not config.ideal:
         noise = builder.AddNamedSystem(
             "wrist_sensor_noise",
-            RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * period),
+            RandomSource(
+                RandomDistribution.kGaussian, NOISE_SIZE, SAMPLES_PER_NOISE_BLOCK * period
+            ),
         )
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     if slave.sensed_sheet is not None:
@@ -599,7 +615,7 @@ def AddCompiledWristSensor(
         builder.Connect(
             slave.plant.get_contact_results_output_port(), sensor.GetInputPort("contact_results")
         )
-    parts = sample_parts(slave.arm.num_joints)
+    parts = signals_of_sample(slave.arm.num_joints)
     sizes = list(parts.values())
     step = sensor.GetOutputPort("step")
     rest = step.size() - sum(sizes)

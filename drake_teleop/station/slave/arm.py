@@ -34,12 +34,20 @@ from drake_teleop.station.slave.joint_friction import dry_friction
 Array = NDArray[np.float64]
 
 # Columns of ArmModel.table.
-ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, FRICTION, SLIDES = 0, 9, 12, 22, 23, 24, 25
-TABLE_COLUMNS = 26
+(
+    ROTATION_COLUMN,
+    TRANSLATION_COLUMN,
+    PHI_COLUMN,
+    ROTOR_COLUMN,
+    DAMPING_COLUMN,
+    FRICTION_COLUMN,
+    IS_PRISMATIC_COLUMN,
+) = 0, 9, 12, 22, 23, 24, 25
+NUM_TABLE_COLUMNS = 26
 # First of three columns with gravity, in the last row only.
-GRAVITY = 22
+GRAVITY_COLUMN = 22
 
-MOTION_SIZE = 21
+FRAME_STATE_SIZE = 21
 """Length of the vector that `sensor_motion` fills."""
 
 
@@ -78,7 +86,7 @@ class ArmModel:
         return len(self.joint_names)
 
     @property
-    def middle(self) -> Array:
+    def middle_positions(self) -> Array:
         """Middles (n,) of the joint ranges; without both limits the position nearest to 0."""
         bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
         with np.errstate(invalid="ignore"):  # inf - inf
@@ -93,11 +101,11 @@ class ArmModel:
     @property
     def load(self) -> Array:
         """Inertial parameters phi (10,) of the load about So, in S; a view of `table`."""
-        return self.table[-1, PHI:ROTOR]
+        return self.table[-1, PHI_COLUMN:ROTOR_COLUMN]
 
     def with_load(self, phi: Array) -> ArmModel:
         table = self.table.copy()
-        table[-1, PHI:ROTOR] = phi
+        table[-1, PHI_COLUMN:ROTOR_COLUMN] = phi
         return replace(self, table=table)
 
 
@@ -105,15 +113,15 @@ class ArmModel:
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
     """Replace the previous link's pose in the state x by that of link `row`; return p_PL_W [m]."""
     joint = table[row]
-    p_PL_P = vector_at(joint, TRANSLATION)
-    if joint[SLIDES] != 0.0:
+    p_PL_P = vector_at(joint, TRANSLATION_COLUMN)
+    if joint[IS_PRISMATIC_COLUMN] != 0.0:
         p_PL_P = plus(p_PL_P, scale_vector(q, (joint[2], joint[5], joint[8])))
         q = 0.0
     p_PL_W = apply_matrix(matrix_at(x, 12), p_PL_P)
     add_into(x, 9, p_PL_W)
     c = np.cos(q)
     s = np.sin(q)
-    R_JP = transposed(matrix_at(joint, ROTATION))
+    R_JP = transposed(matrix_at(joint, ROTATION_COLUMN))
     for i in range(12, 21, 3):
         u, v, w = apply_matrix(R_JP, vector_at(x, i))
         x[i], x[i + 1], x[i + 2] = c * u + s * v, c * v - s * u, w
@@ -122,11 +130,10 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 @njit(cache=True, inline="always")
 def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
-    """Replace the state of the previous link in x by that of link `row`."""
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
-    if table[row, SLIDES] != 0.0:
+    if table[row, IS_PRISMATIC_COLUMN] != 0.0:
         add_into(x, 0, plus(scale_vector(qdd, z), scale_vector(2.0 * qd, cross(omega, z))))
     else:
         add_into(x, 3, scale_vector(qd, z))
@@ -145,7 +152,7 @@ def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
 def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
-    g = table[table.shape[0] - 1, GRAVITY : GRAVITY + 3]
+    g = table[table.shape[0] - 1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3]
     for i in range(3):
         out[i] = s[i] + R_WS[0, i] * g[0] + R_WS[1, i] * g[1] + R_WS[2, i] * g[2]
 
@@ -154,7 +161,7 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
 def _set_world_at_rest(table: Array, x: Array) -> None:
     x[:] = 0.0
     for k in range(3):
-        x[k] = -table[table.shape[0] - 1, GRAVITY + k]
+        x[k] = -table[table.shape[0] - 1, GRAVITY_COLUMN + k]
         x[12 + 4 * k] = 1.0
 
 
@@ -195,7 +202,7 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
     for row in range(n):
         column = J_out[:, row]
         axis = vector_at(column, 3)
-        if table[row, SLIDES] != 0.0:
+        if table[row, IS_PRISMATIC_COLUMN] != 0.0:
             column[0], column[1], column[2] = axis
             column[3] = column[4] = column[5] = 0.0
         else:
@@ -231,7 +238,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 @njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
     """Write a link's z axis, origin, inertial force and moment about Wo, in W, to `link[row]`."""
-    phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], matrix_at(x, 12), vector_at(x, 9)
+    phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_at(phi, 4)
     s, omega, alpha = (
         apply_matrix(R_LW, vector_at(x, 0)),
@@ -259,7 +266,7 @@ def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
             link[row - 1, k] += link[row, k]
     for row in range(n):
         x = link[row]
-        if table[row, SLIDES] != 0.0:
+        if table[row, IS_PRISMATIC_COLUMN] != 0.0:
             tau[row] = dot(vector_at(x, 0), vector_at(x, 6))
         else:
             # Moment about the joint's origin.
@@ -287,7 +294,7 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
         _link_wrench(table, row, x, link)
     _project_on_joints(table, link, tau_out)
     for row in range(n):
-        tau_out[row] += table[row, ROTOR] * vdot[row] + table[row, DAMPING] * v[row]
+        tau_out[row] += table[row, ROTOR_COLUMN] * vdot[row] + table[row, DAMPING_COLUMN] * v[row]
 
 
 def holding_torque(arm: ArmModel, q: Array) -> Array:
@@ -299,7 +306,7 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Add a link's inertial parameters phi (10,) about Wo, in W, to `inertia`."""
-    phi, p = table[row, PHI:], vector_at(x, 9)
+    phi, p = table[row, PHI_COLUMN:], vector_at(x, 9)
     m, h, about_Lo = phi[0], apply_matrix(matrix_at(x, 12), vector_at(phi, 1)), symmetric_at(phi, 4)
     inertia[0] += m
     add_into(inertia, 1, plus(h, scale_vector(m, p)))
@@ -329,7 +336,7 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
         x = link[row]
         x[9], x[10], x[11] = vector_at(x, 0)
         x[6], x[7], x[8] = cross(vector_at(x, 3), vector_at(x, 9))
-        if table[row, SLIDES] != 0.0:
+        if table[row, IS_PRISMATIC_COLUMN] != 0.0:
             x[6], x[7], x[8] = vector_at(x, 9)
             x[9] = x[10] = x[11] = 0.0
     for row in range(n - 1, -1, -1):
@@ -341,15 +348,15 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
         # Momentum about Wo of all outboard links for unit speed of this joint.
         linear = add_cross_product(scale_vector(c[0], v), w, h)
         angular = add_cross_product(apply_matrix(symmetric_at(c, 4), w), h, v)
-        # `solve_spd` reads the lower half only.
+        # `solve_positive_definite` reads the lower half only.
         for i in range(row + 1):
             v, w = vector_at(link[i], 6), vector_at(link[i], 9)
             M[row, i] = dot(w, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
-        M[row, row] += table[row, ROTOR]
+        M[row, row] += table[row, ROTOR_COLUMN]
 
 
 @njit(cache=True)
-def solve_spd(M: Array, x: Array) -> None:
+def solve_positive_definite(M: Array, x: Array) -> None:
     """Replace x by M^-1 x (Cholesky); overwrite the lower half of M."""
     n = x.shape[0]
     for j in range(n):
@@ -393,11 +400,11 @@ def forward_dynamics(
         link[n, 6 + k] -= wrench_W[k]
     _project_on_joints(table, link, vdot_out)
     for row in range(n):
-        vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING] * v[row]
-        if table[row, FRICTION] != 0.0:
-            vdot_out[row] += dry_friction(table[row, FRICTION], v[row])
+        vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING_COLUMN] * v[row]
+        if table[row, FRICTION_COLUMN] != 0.0:
+            vdot_out[row] += dry_friction(table[row, FRICTION_COLUMN], v[row])
     _mass_matrix(table, link, inertia, M)
-    solve_spd(M, vdot_out)
+    solve_positive_definite(M, vdot_out)
 
 
 @njit(cache=True)

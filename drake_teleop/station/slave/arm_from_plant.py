@@ -23,14 +23,14 @@ from pydrake.multibody.tree import (
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import (
-    DAMPING,
-    GRAVITY,
-    PHI,
-    ROTATION,
-    ROTOR,
-    SLIDES,
-    TABLE_COLUMNS,
-    TRANSLATION,
+    DAMPING_COLUMN,
+    GRAVITY_COLUMN,
+    IS_PRISMATIC_COLUMN,
+    NUM_TABLE_COLUMNS,
+    PHI_COLUMN,
+    ROTATION_COLUMN,
+    ROTOR_COLUMN,
+    TRANSLATION_COLUMN,
     ArmModel,
     Array,
 )
@@ -40,7 +40,7 @@ _DEFAULT_SPEED_RAD_S, _DEFAULT_PRISMATIC = np.pi, (1.0, 1.0)
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
 # Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
-_MAX_LIMIT = 1e4
+_MAX_PLAUSIBLE_LIMIT = 1e4
 # Default time to full speed [s].
 _TIME_TO_FULL_SPEED_S = 0.4
 
@@ -67,17 +67,19 @@ def ArmModelFromPlant(
     }
     joints = _joint_chain(inboard_joints, frame_S)
     n = len(joints)
-    table = np.zeros((n + 1, TABLE_COLUMNS))
+    table = np.zeros((n + 1, NUM_TABLE_COLUMNS))
     for row, joint in enumerate(joints):
-        table[row, ROTOR] = _reflected_inertia(plant, joint)
-        table[row, DAMPING] = joint.default_damping()
-        table[row, SLIDES] = isinstance(joint, PrismaticJoint)
+        table[row, ROTOR_COLUMN] = _reflected_inertia(plant, joint)
+        table[row, DAMPING_COLUMN] = joint.default_damping()
+        table[row, IS_PRISMATIC_COLUMN] = isinstance(joint, PrismaticJoint)
     gravity = plant.gravity_field()
-    table[n, GRAVITY:SLIDES] = gravity.gravity_vector() * gravity.is_enabled(model_instance)
+    table[n, GRAVITY_COLUMN:IS_PRISMATIC_COLUMN] = gravity.gravity_vector() * gravity.is_enabled(
+        model_instance
+    )
 
     context = plant.CreateDefaultContext()
     # C rotates the joint's axis to z.
-    C = [RigidTransform(RotationMatrix.MakeFromOneVector(_axis(j), 2)) for j in joints]
+    C = [RigidTransform(RotationMatrix.MakeFromOneVector(_joint_axis(j), 2)) for j in joints]
     X_WS = frame_S.CalcPoseInWorld(context)
     X_WJ = [
         j.frame_on_parent().CalcPoseInWorld(context) @ X for j, X in zip(joints, C, strict=True)
@@ -87,8 +89,8 @@ def ArmModelFromPlant(
     X_WL.append(X_WS)
     for row, X_WP in enumerate([RigidTransform(), *X_WL[:-1]]):
         X_PJ = X_WP.InvertAndCompose(X_WJ[row])
-        table[row, ROTATION:TRANSLATION] = X_PJ.rotation().matrix().ravel()
-        table[row, TRANSLATION:PHI] = X_PJ.translation()
+        table[row, ROTATION_COLUMN:TRANSLATION_COLUMN] = X_PJ.rotation().matrix().ravel()
+        table[row, TRANSLATION_COLUMN:PHI_COLUMN] = X_PJ.translation()
     rows = {joint.child_body().index(): row for row, joint in enumerate(joints)}
     for index in inboard_joints:
         body = plant.get_body(index)
@@ -96,22 +98,22 @@ def ArmModelFromPlant(
         if body_row is not None:
             X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
-            table[body_row, PHI:ROTOR] += _phi_of_body(M_B, X_LB)
+            table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_of_body(M_B, X_LB)
     lower, upper = np.array([_joint_limits(j) for j in joints]).T.copy()
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
         lower=lower,
         upper=upper,
-        velocity_limit=_per_joint([j.velocity_upper_limits()[0] for j in joints]),
-        acceleration_limit=_per_joint([j.acceleration_upper_limits()[0] for j in joints]),
-        effort_limit=_per_joint([_effort_limit(plant, j) for j in joints]),
+        velocity_limit=_array_per_joint([j.velocity_upper_limits()[0] for j in joints]),
+        acceleration_limit=_array_per_joint([j.acceleration_upper_limits()[0] for j in joints]),
+        effort_limit=_array_per_joint([_effort_limit(plant, j) for j in joints]),
         position_index=np.array([j.position_start() for j in joints], dtype=np.intp),
         velocity_index=np.array([j.velocity_start() for j in joints], dtype=np.intp),
     )
 
 
-def _per_joint(values: list[float]) -> Array:
+def _array_per_joint(values: list[float]) -> Array:
     return np.array(values, dtype=np.float64)
 
 
@@ -120,10 +122,13 @@ def _joint_limits(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
     # Exporters write 0 to 0 for unknown limits.
     if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
         return -np.inf, np.inf
-    return -np.inf if lower < -_MAX_LIMIT else lower, np.inf if upper > _MAX_LIMIT else upper
+    return (
+        -np.inf if lower < -_MAX_PLAUSIBLE_LIMIT else lower,
+        np.inf if upper > _MAX_PLAUSIBLE_LIMIT else upper,
+    )
 
 
-def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
+def _joint_axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
     slides = isinstance(joint, PrismaticJoint)
     axis: Array = joint.translation_axis() if slides else joint.revolute_axis()
     return axis
@@ -211,7 +216,7 @@ def with_all_limits(
     about accelerations.
     """
     n, assumptions = arm.num_joints, []
-    slides = arm.table[:-1, SLIDES] != 0.0
+    slides = arm.table[:-1, IS_PRISMATIC_COLUMN] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
     unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_range`
     immovable = ~unlimited & (arm.lower == arm.upper)
@@ -288,12 +293,12 @@ _MIN_LENGTH_M, _MAX_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
 
 def check_size(arm: ArmModel, where: str) -> None:
     """Raise DrakeTeleopError for an implausible arm length, or a mass far from its joint."""
-    length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
+    length = float(np.linalg.norm(arm.table[1:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
     if 0.0 < length < _MIN_LENGTH_M or length > _MAX_LENGTH_M:
         what = f"from its first joint to the sensor the arm is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
-    for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI:], strict=True):
+    for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI_COLUMN:], strict=True):
         # Root mean square distance of the mass from the joint's origin.
         distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
         if distance > _MAX_LENGTH_M:

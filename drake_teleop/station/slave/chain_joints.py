@@ -30,7 +30,7 @@ _ROTOR_MASS_KG = 0.14
 _SLIDING_MOTOR_KG = 5.0  # mass that moves with a prismatic joint instead
 
 
-def moves(plant: MultibodyPlant, index: JointIndex) -> bool:
+def is_joint_moving(plant: MultibodyPlant, index: JointIndex) -> bool:
     return plant.get_joint(index).num_velocities() > 0
 
 
@@ -119,11 +119,13 @@ def check_chain(
             )
 
 
-def weld_at(
+def weld_joints_at(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
     """Weld joints, by name, at the positions `hold` [rad, m]; return notes for the user."""
-    known = {plant.get_joint(k).name(): plant.get_joint(k) for k in joints if moves(plant, k)}
+    known = {
+        plant.get_joint(k).name(): plant.get_joint(k) for k in joints if is_joint_moving(plant, k)
+    }
     for name, position in hold.items():
         joint = known.get(name)
         if joint is None:
@@ -140,7 +142,7 @@ def weld_at(
             what = f"{name} at {position:g} is outside {lower:g} to {upper:g}"
             raise DrakeTeleopError(what, where="slave.hold", remedy="check the value and its unit")
         joint.set_default_positions(np.array([position]))
-        _weld(plant, joint)
+        _replace_joint_by_weld(plant, joint)
     return [f"held at {position:g}: {name}" for name, position in hold.items()]
 
 
@@ -151,14 +153,14 @@ def weld_other_joints(
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     added = set(plant.GetJointIndices()) - before - set(chain)
-    joints = [plant.get_joint(index) for index in added if moves(plant, index)]
+    joints = [plant.get_joint(index) for index in added if is_joint_moving(plant, index)]
     names = sorted(joint.name() for joint in joints)
     for joint in joints:
-        _weld(plant, joint)
+        _replace_joint_by_weld(plant, joint)
     return [f"held: {join_names(names)}"] if names else []
 
 
-def _weld(plant: MultibodyPlant, joint: Joint) -> None:
+def _replace_joint_by_weld(plant: MultibodyPlant, joint: Joint) -> None:
     name, ends = joint.name(), (joint.frame_on_parent(), joint.frame_on_child())
     X_FM = _default_pose(joint)
     for k in plant.GetJointActuatorIndices():
@@ -178,14 +180,14 @@ def _default_pose(joint: Joint) -> RigidTransform:
     return joint.GetDefaultPose() if np.any(q) else RigidTransform()
 
 
-def actuate(
+def add_actuators(
     plant: MultibodyPlant, chain: list[JointIndex], limits: dict[str, float] | None
 ) -> None:
     """Give each moving joint of the chain one actuator, in the order of the chain.
 
     `limits`: effort limits by joint, without an entry unlimited; None keeps Drake's.
     """
-    moving = [index for index in chain if moves(plant, index)]
+    moving = [index for index in chain if is_joint_moving(plant, index)]
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     own = {each.joint().index(): each for each in actuators if each.joint().index() in moving}
     data = {
@@ -228,7 +230,7 @@ def assume_rotor_inertias(
     The links of a joint at an `auxiliary` body include those of the next joint.
     """
     joints = [plant.get_joint(index) for index in chain]
-    inertia = _ROTOR_MASS_KG * _length(joints, frame) ** 2
+    inertia = _ROTOR_MASS_KG * _chain_length(joints, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
@@ -264,7 +266,7 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str])
     return False
 
 
-def _length(chain: list[Joint], frame: Frame) -> float:
+def _chain_length(chain: list[Joint], frame: Frame) -> float:
     """Return the length [m] of the chain from its first moving joint to `frame`."""
     while chain and chain[0].num_velocities() == 0:
         chain = chain[1:]

@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.plant_dynamics import add_force
+from drake_teleop.station.slave.plant_dynamics import add_force_to_wrench
 from drake_teleop.station.slave.slave_config import Slave
 
 
@@ -28,16 +28,16 @@ def contact_wrench_W(
     for k in range(results.num_point_pair_contacts()):
         contact = results.point_pair_contact_info(k)
         if int(contact.bodyB_index()) in bodies:  # the contact force acts on B
-            add_force(wrench_W, contact.contact_point(), contact.contact_force())
+            add_force_to_wrench(wrench_W, contact.contact_point(), contact.contact_force())
         elif int(contact.bodyA_index()) in bodies:
-            add_force(wrench_W, contact.contact_point(), -contact.contact_force())
+            add_force_to_wrench(wrench_W, contact.contact_point(), -contact.contact_force())
     for k in range(results.num_hydroelastic_contacts()):
         area = results.hydroelastic_contact_info(k)
         surface, F_Ac_W = area.contact_surface(), area.F_Ac_W()  # acts on the body of M
         first, second = surface.id_M().get_value(), surface.id_N().get_value()
         sign = float(first in shapes) - float(second in shapes)
         if sign != 0.0:
-            add_force(wrench_W, surface.centroid(), sign * F_Ac_W.translational())
+            add_force_to_wrench(wrench_W, surface.centroid(), sign * F_Ac_W.translational())
             wrench_W[3:] += sign * F_Ac_W.rotational()
     return wrench_W
 

@@ -13,18 +13,18 @@ from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError, silent_st
 
 #: Expected kind of file, and the remedy for missing packages.
 Description: TypeAlias = tuple[str, str]
-ROBOT: Description = ("robot", "with --package-path for package://")
-SCENE: Description = ("scene", "its package:// addresses in folders around it")
+ROBOT_DESCRIPTION: Description = ("robot", "with --package-path for package://")
+SCENE_DESCRIPTION: Description = ("scene", "its package:// addresses in folders around it")
 # Places in Drake's source and in repaired texts, which the user does not have.
-_FAILURE = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
+_FAILURE_PREFIX = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
 _REPAIRED_TEXT = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
-_COPY = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
+_REPAIRED_COPY_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
 _NUM_CHARS_OF_PLACE = 30  # " ... " and separators of the error line
 
 
 @contextmanager
 def translate_drake_errors(
-    path: Path, expected: Description = ROBOT, folder: str = ""
+    path: Path, expected: Description = ROBOT_DESCRIPTION, folder: str = ""
 ) -> Iterator[None]:
     """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
 
@@ -36,9 +36,9 @@ def translate_drake_errors(
         raise
     # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
-        reason = _REPAIRED_TEXT.sub("", _FAILURE.sub("", " ".join(str(error).split())))
+        reason = _REPAIRED_TEXT.sub("", _FAILURE_PREFIX.sub("", " ".join(str(error).split())))
         if folder:
-            reason = re.sub(_COPY.format(folder=re.escape(folder)), r"\2", reason)
+            reason = re.sub(_REPAIRED_COPY_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {expected[0]}"
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
         room = LONGEST_LINE - len(f"{path}{what}{remedy}") - _NUM_CHARS_OF_PLACE
@@ -52,18 +52,18 @@ def raise_logged_errors() -> Iterator[None]:
     """Raise RuntimeError for errors that Drake only logs, and for replaced inertias."""
     errors: list[str] = []
 
-    def keep(record: logging.LogRecord) -> bool:
+    def keep_record(record: logging.LogRecord) -> bool:
         message = record.getMessage()
         if record.levelno >= logging.ERROR or "inertia" in message:
             errors.append(" ".join(message.split()))
         return False
 
     log = logging.getLogger("drake")
-    log.addFilter(keep)
+    log.addFilter(keep_record)
     try:
         with silent_stderr():  # the parsers below Drake write to stderr
             yield
     finally:
-        log.removeFilter(keep)
+        log.removeFilter(keep_record)
     if errors:
         raise RuntimeError("; ".join(dict.fromkeys(errors)))

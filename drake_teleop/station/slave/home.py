@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.arm import SLIDES, ArmModel, holding_torque
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, holding_torque
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
 from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
@@ -20,20 +20,20 @@ _MIN_INERTIA = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 # Shares of the joint ranges, about their middles, that are searched in this order.
-_RANGE_SHARES = (0.7, 0.9, 1.0)
+_TRIED_RANGE_SHARES = (0.7, 0.9, 1.0)
 #: Elbow up, reaching forward [rad]; home is the branch nearest to it.
 _Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
-def tool_down(
+def positions_with_tool_down(
     arm: ArmModel, position: NDArray[np.float64], R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[NDArray[np.float64], IkStatus]:
     """Return joint positions (n,) [rad] for S at `position` [m, in W] and `R_WS`, and status."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
-    middle = arm.middle
-    for share in _RANGE_SHARES:
+    middle = arm.middle_positions
+    for share in _TRIED_RANGE_SHARES:
         lower, upper = (middle + share * (limit - middle) for limit in (arm.lower, arm.upper))
         inside = replace(arm, lower=lower, upper=upper)
         q, status = find_posture(inside, pose, middle)
@@ -43,7 +43,7 @@ def tool_down(
 
 
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    q, status = tool_down(arm, np.array(position))
+    q, status = positions_with_tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
     else:
@@ -90,7 +90,7 @@ def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
     share = np.abs(torque) / arm.effort_limit
     k = int(share.argmax())
     if share[k] > 1.0:
-        unit = "N" if arm.table[k, SLIDES] else "N m"
+        unit = "N" if arm.table[k, IS_PRISMATIC_COLUMN] else "N m"
         raise DrakeTeleopError(
             f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {arm.joint_names[k]} "
             f"needs {abs(torque[k]):.3g} of its {arm.effort_limit[k]:.3g} {unit}",

@@ -17,17 +17,17 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
-from drake_teleop.station.slave.arm import SLIDES, ArmModel, forward_kinematics
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel, forward_kinematics
 
 Array = NDArray[np.float64]
 
-SHOULDER_HEIGHT = 0.420
+SHOULDER_HEIGHT_M = 0.420
 """Base to shoulder [m]."""
-UPPER_ARM = 0.450
+UPPER_ARM_LENGTH_M = 0.450
 """Shoulder to elbow [m]."""
-FOREARM = 0.450
+FOREARM_LENGTH_M = 0.450
 """Elbow to wrist centre [m]."""
-FLANGE = 0.085
+FLANGE_OFFSET_M = 0.085
 """Wrist centre to the origin of S, along z_S [m]."""
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
@@ -67,14 +67,16 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array) -> int:
+def _all_solutions_into(
+    R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array
+) -> int:
     """Write all eight solutions to q (8, 6), nan if out of reach; `clamp` moves p into reach."""
     status = _OK
-    x = p[0] - FLANGE * R[0, 2]
-    y = p[1] - FLANGE * R[1, 2]
-    z = p[2] - FLANGE * R[2, 2] - SHOULDER_HEIGHT
-    reach = UPPER_ARM + FOREARM
-    inner_reach = abs(UPPER_ARM - FOREARM)
+    x = p[0] - FLANGE_OFFSET_M * R[0, 2]
+    y = p[1] - FLANGE_OFFSET_M * R[1, 2]
+    z = p[2] - FLANGE_OFFSET_M * R[2, 2] - SHOULDER_HEIGHT_M
+    reach = UPPER_ARM_LENGTH_M + FOREARM_LENGTH_M
+    inner_reach = abs(UPPER_ARM_LENGTH_M - FOREARM_LENGTH_M)
     distance = np.sqrt(x * x + y * y + z * z)
     if distance > reach or distance < inner_reach:
         if not clamp:
@@ -100,7 +102,9 @@ def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q
         for b in range(2):
             q3 = q3_up if b == 0 else -q3_up
             to_wrist = np.arctan2(-rho if a == 0 else rho, z)
-            q2 = to_wrist - np.arctan2(FOREARM * np.sin(q3), UPPER_ARM + FOREARM * np.cos(q3))
+            q2 = to_wrist - np.arctan2(
+                FOREARM_LENGTH_M * np.sin(q3), UPPER_ARM_LENGTH_M + FOREARM_LENGTH_M * np.cos(q3)
+            )
             c, s = np.cos(q2 + q3), np.sin(q2 + q3)
             # M = Ry(q2 + q3) Rz(-q1) R = Rz(q4) Ry(-q5) Rz(q6)
             u = c1 * R[0, 2] + s1 * R[1, 2]
@@ -152,7 +156,7 @@ def _nearest_branch(
     if not (np.isfinite(R.sum()) and all_in_range(p)):
         return _BAD_POSE
     branches = np.empty((8, 6))
-    status = _branches(R, p, reference[0], reference[3], True, branches)
+    status = _all_solutions_into(R, p, reference[0], reference[3], True, branches)
     best = -1
     best_distance = np.inf
     for row in range(8):
@@ -195,7 +199,7 @@ def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
     q5 <= 0. Joint limits are ignored; an undetermined joint is 0.
     """
     q = np.empty((8, 6))
-    _branches(np.ascontiguousarray(R_WS), p_WS, 0.0, 0.0, False, q)
+    _all_solutions_into(np.ascontiguousarray(R_WS), p_WS, 0.0, 0.0, False, q)
     return q - 2.0 * np.pi * np.ceil(q / (2.0 * np.pi) - 0.5)
 
 
@@ -220,7 +224,7 @@ def nearest_branch(
 
 
 def has_closed_form(arm: ArmModel) -> bool:
-    if arm.num_joints != 6 or arm.table[:, SLIDES].any():
+    if arm.num_joints != 6 or arm.table[:, IS_PRISMATIC_COLUMN].any():
         return False
     R_WS, p_WS, endless = np.empty((3, 3)), np.empty(3), np.full(6, np.inf)
     for q in ([0.3, -0.5, -1.1, 0.7, 0.9, -0.4], [-1.0, 0.6, 1.3, -0.8, 0.5, 1.2]):
@@ -262,7 +266,7 @@ class InverseKinematics(LeafSystem):
         self.DeclareVectorOutputPort("joint_command", 6, weak_callback(self._calc_command), inputs)
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status), inputs)
 
-    def _solve(self, context: Context, q: np.ndarray) -> int:
+    def _solve_command(self, context: Context, q: np.ndarray) -> int:
         return solve_pose_command(
             self._pose.Eval(context),
             self._position.Eval(context),
@@ -273,7 +277,7 @@ class InverseKinematics(LeafSystem):
         )
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        self._solve(context, output.get_mutable_value())
+        self._solve_command(context, output.get_mutable_value())
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._solve(context, np.empty(6))
+        output[0] = self._solve_command(context, np.empty(6))

@@ -12,7 +12,7 @@ from drake_teleop.common.blocks import ONE_DICT, all_in_range, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.slave.arm import SLIDES, ArmModel
+from drake_teleop.station.slave.arm import IS_PRISMATIC_COLUMN, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import (
     IkStatus,
     InverseKinematics,
@@ -22,7 +22,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverse
 
 Array = NDArray[np.float64]
 
-AUTOMATIC = "automatic"
+AUTOMATIC_METHOD = "automatic"
 """Name that selects the closed form where it exists, otherwise the numeric method."""
 
 IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
@@ -42,13 +42,13 @@ _RANGE_TOLERANCE = 0.01
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
     """Return the key in `IK_METHODS` for the scenario's setting, or raise DrakeTeleopError."""
-    if name == AUTOMATIC:
+    if name == AUTOMATIC_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
         raise DrakeTeleopError(
             "the closed form is that of an RX90 whose base stands at the world's origin",
             where="slave.inverse_kinematics",
-            remedy=f"set it to {AUTOMATIC} or numeric",
+            remedy=f"set it to {AUTOMATIC_METHOD} or numeric",
         )
     return name
 
@@ -72,7 +72,7 @@ class JointFollower(LeafSystem):
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _next(self, context: Context) -> tuple[Array, IkStatus]:
+    def _next_command(self, context: Context) -> tuple[Array, IkStatus]:
         last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
         if not all_in_range(leader):
             return last, IkStatus.BAD_POSE
@@ -81,13 +81,13 @@ class JointFollower(LeafSystem):
         return np.clip(within, last - self._step, last + self._step), status
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._next(context)[0])
+        output.SetFromVector(self._next_command(context)[0])
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._next(context)[1]
+        output[0] = self._next_command(context)[1]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(0, self._next(context)[0])
+        discrete_state.set_value(0, self._next_command(context)[0])
 
 
 class JointTrajectory(LeafSystem):
@@ -129,7 +129,7 @@ class SlaveMonitor(LeafSystem):
         if inside.all():
             return
         joint = int(inside.argmin())
-        unit = "m" if self._arm.table[joint, SLIDES] else "rad"
+        unit = "m" if self._arm.table[joint, IS_PRISMATIC_COLUMN] else "rad"
         # Returning EventStatus.Failed crashes for systems written in Python.
         raise DrakeTeleopError(
             f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s: "

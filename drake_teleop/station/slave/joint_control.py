@@ -21,11 +21,15 @@ from drake_teleop.station.slave.arm import (
     inverse_dynamics,
     jacobian,
 )
-from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface, PositionServo
+from drake_teleop.station.slave.position_servo import (
+    POSITION_INTERFACES,
+    PositionInterface,
+    PositionServo,
+)
 
 Array = NDArray[np.float64]
 
-COMPUTED_TORQUE = "computed_torque"
+COMPUTED_TORQUE_NAME = "computed_torque"
 
 
 @settings
@@ -40,8 +44,8 @@ class JointControlConfig:
         70.0, "Hz", 0.1, 1e4, "bandwidth of the velocity loop (E)"
     )
     servo: str = choice(
-        COMPUTED_TORQUE,
-        (COMPUTED_TORQUE, *INTERFACES, "position"),
+        COMPUTED_TORQUE_NAME,
+        (COMPUTED_TORQUE_NAME, *POSITION_INTERFACES, "position"),
         "computed_torque uses the bandwidths above; the others are position interfaces: by name, or"
         " position for the fields of `interface`",
     )
@@ -49,12 +53,12 @@ class JointControlConfig:
 
     @property
     def position_interface(self) -> PositionInterface | None:
-        if self.servo == COMPUTED_TORQUE:
+        if self.servo == COMPUTED_TORQUE_NAME:
             return None
-        return self.interface or INTERFACES.get(self.servo, PositionInterface())
+        return self.interface or POSITION_INTERFACES.get(self.servo, PositionInterface())
 
     @property
-    def lag(self) -> float:
+    def tracking_delay_s(self) -> float:
         """Approximate delay of the joints behind a steadily moving command [s]."""
         interface = self.position_interface
         if interface is not None:
@@ -65,11 +69,15 @@ class JointControlConfig:
     def speed_gain(self) -> float:
         """Commanded joint speed divided by the position error [1/s]."""
         interface = self.position_interface
-        return 2 * np.pi * self.position_bandwidth_hz if interface is None else 1 / self.lag
+        return (
+            2 * np.pi * self.position_bandwidth_hz
+            if interface is None
+            else 1 / self.tracking_delay_s
+        )
 
     def check(self, where: str, rate: float) -> None:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
-        if self.servo == COMPUTED_TORQUE and self.interface is not None:
+        if self.servo == COMPUTED_TORQUE_NAME and self.interface is not None:
             raise DrakeTeleopError(
                 "computed torque uses bandwidths, not an interface",
                 where=f"{where}.interface",
@@ -81,12 +89,13 @@ class JointControlConfig:
 
     def check_computed_torque(self, what: str) -> None:
         """Raise DrakeTeleopError unless the servo is computed torque; `what` names the caller."""
-        if self.servo != COMPUTED_TORQUE:
+        if self.servo != COMPUTED_TORQUE_NAME:
             raise DrakeTeleopError(
                 f"{what} does not support the servo {self.servo}",
                 where="joint_control.servo",
-                remedy=f"choose {COMPUTED_TORQUE}, with a position_bandwidth_hz of"
-                f" {1 / (2 * np.pi * self.lag):.2g} for the same lag; `run` supports every servo",
+                remedy=f"choose {COMPUTED_TORQUE_NAME}, with a position_bandwidth_hz of"
+                f" {1 / (2 * np.pi * self.tracking_delay_s):.2g} for the same lag; `run` supports"
+                " every servo",
             )
 
 
@@ -116,7 +125,9 @@ def joint_control_torque(
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
-def servo_numbers(arm: ArmModel, config: JointControlConfig) -> tuple[float, float, Array, Array]:
+def servo_gains_and_limits(
+    arm: ArmModel, config: JointControlConfig
+) -> tuple[float, float, Array, Array]:
     """Return gains kp, kv [1/s] and (n,) limits of joint speed and torque."""
     return (
         2 * np.pi * config.position_bandwidth_hz,
@@ -154,7 +165,7 @@ class JointControl(LeafSystem):
         super().__init__()
         n = arm.num_joints
         self._arm = arm.table
-        self._constants = (*servo_numbers(arm, config), np.zeros(3 * n))
+        self._constants = (*servo_gains_and_limits(arm, config), np.zeros(3 * n))
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
@@ -205,7 +216,7 @@ def MakeJointControl(
 
 def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
     """Return the position interface that `servo` of a `joint_control` block names, or None."""
-    return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))
+    return copy.deepcopy(POSITION_INTERFACES.get(str((block or {}).get("servo"))))
 
 
 def mass_matrix(arm: ArmModel, q: Array) -> Array:

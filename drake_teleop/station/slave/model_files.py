@@ -20,8 +20,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_text, read_yaml
 from drake_teleop.station.slave.chain_joints import check_tree
 from drake_teleop.station.slave.drake_errors import (
-    ROBOT,
-    SCENE,
+    ROBOT_DESCRIPTION,
+    SCENE_DESCRIPTION,
     raise_logged_errors,
     translate_drake_errors,
 )
@@ -29,13 +29,13 @@ from drake_teleop.station.slave.model.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairedModel
 from drake_teleop.station.slave.model.sdf_repair import repair_sdf
-from drake_teleop.station.slave.model.urdf_repair import Purpose, repair_urdf
+from drake_teleop.station.slave.model.urdf_repair import ModelPurpose, repair_urdf
 
-_XACRO = "run it through xacro first, and give the URDF that comes out"
-_REPAIRS = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
+_XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
+_REPAIR_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 
 
-class ReadModel(NamedTuple):
+class ModelInPlant(NamedTuple):
     """Content of a model file in a plant.
 
     Attributes:
@@ -52,14 +52,14 @@ class ReadModel(NamedTuple):
 
 
 def read_model(
-    plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: Purpose
-) -> ReadModel:
+    plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
+) -> ModelInPlant:
     """Repair a model's text and parse it into a plant."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
     if kind == ".xacro":
-        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO)
+        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO_REMEDY)
     if kind == ".xml":
         read_text(path)  # raises an error for invalid encoding
     if kind == ".yaml":
@@ -72,7 +72,7 @@ def read_model(
     files.check(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
-    expected = SCENE if purpose.is_scene else ROBOT
+    expected = SCENE_DESCRIPTION if purpose.is_scene else ROBOT_DESCRIPTION
     with translate_drake_errors(path, expected, folder.name):
         read = _add_directives if kind == ".yaml" else _add_file
         instances, repaired = read(parser, path, files, purpose, folder)
@@ -84,7 +84,7 @@ def read_model(
             remedy="remove them; only motors, gravity and contact move the arm",
         )
     is_complete = all(each.text for each in repaired)
-    return ReadModel(
+    return ModelInPlant(
         instances,
         list(dict.fromkeys(text for each in repaired for text in each.assumptions)),
         {n: x for each in repaired for n, x in each.effort_limits.items()} if is_complete else None,
@@ -98,10 +98,10 @@ def _add_file(
     parser: Parser,
     path: Path,
     files: ModelFiles,
-    purpose: Purpose,
+    purpose: ModelPurpose,
     folder: TemporaryDirectory[str],
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    repaired = _repair(path, files, purpose, Path(folder.name))
+    repaired = _repair_file(path, files, purpose, Path(folder.name))
     with raise_logged_errors():
         if repaired.text:
             kind = path.suffix.lower().removeprefix(".")
@@ -115,19 +115,18 @@ def _add_directives(
     parser: Parser,
     path: Path,
     files: ModelFiles,
-    purpose: Purpose,
+    purpose: ModelPurpose,
     folder: TemporaryDirectory[str],
 ) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
-    """Add the models of a directives file after repairs; keep its welds and positions."""
     with raise_logged_errors():
         directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
     repaired, purpose = dict[Path, RepairedModel](), purpose._replace(in_directives=True)
     for added in (each.add_model for each in directives.directives if each.add_model):
-        file = files.file(added.file)
+        file = files.find_file(added.file)
         if file is None:
             continue  # Drake reports it
         if file not in repaired:
-            repaired[file] = _repair(file, files, purpose, Path(folder.name))
+            repaired[file] = _repair_file(file, files, purpose, Path(folder.name))
         if repaired[file].text:
             copy = Path(folder.name) / f"{len(repaired)}_{file.name}"
             copy.write_text(repaired[file].text, encoding="utf-8")
@@ -137,12 +136,13 @@ def _add_directives(
     return [each.model_instance for each in models], list(repaired.values())
 
 
-def _repair(path: Path, files: ModelFiles, purpose: Purpose, folder: Path) -> RepairedModel:
-    """Return the repaired text of a file; without a text if Drake shall read the file itself."""
+def _repair_file(
+    path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
+) -> RepairedModel:
     kind = path.suffix.lower()
-    if kind not in _REPAIRS:
+    if kind not in _REPAIR_OF_SUFFIX:
         return RepairedModel("", [], {})
     root = read_xml(path)
     if any(element.tag.startswith("xacro:") for element in root.iter()):
-        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO)
-    return _REPAIRS[kind](root, path, files, purpose, folder)
+        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO_REMEDY)
+    return _REPAIR_OF_SUFFIX[kind](root, path, files, purpose, folder)

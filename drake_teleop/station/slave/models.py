@@ -13,17 +13,17 @@ from pydrake.multibody.tree import Frame, ModelInstanceIndex, RigidBody, WeldJoi
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.chain_joints import (
-    actuate,
+    add_actuators,
     assume_rotor_inertias,
     check_chain,
-    moves,
-    weld_at,
+    is_joint_moving,
     weld_base,
     weld_free_bodies,
+    weld_joints_at,
     weld_other_joints,
 )
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.model.urdf_repair import Purpose
+from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 from drake_teleop.station.slave.model_files import read_model
 
 _MAX_NAMES = 12  # names of frames in an error: the most similar ones
@@ -63,18 +63,18 @@ def ParseModel(
     models raise DrakeTeleopError.
     """
     before, hold, where = set(plant.GetJointIndices()), hold or {}, str(path)
-    read = read_model(plant, path, package_paths, Purpose(sensor_frame, hold))
+    read = read_model(plant, path, package_paths, ModelPurpose(sensor_frame, hold))
     frame = _sensor_frame(plant, read.instances, sensor_frame, where)
     added = set(plant.GetJointIndices()) - before
-    held = weld_at(plant, hold, added)
+    held = weld_joints_at(plant, hold, added)
     chain = weld_base(plant, frame, X_WBase, where)
     check_chain(plant, chain, read.dependent, where)
     free = weld_free_bodies(plant, read.instances)
     with translate_drake_errors(path):
         held += weld_other_joints(plant, before, chain)
-        actuate(plant, chain, read.effort_limits)
+        add_actuators(plant, chain, read.effort_limits)
         rotors = assume_rotor_inertias(plant, chain, frame, read.auxiliary)
-    instances = {plant.get_joint(k).model_instance() for k in chain if moves(plant, k)}
+    instances = {plant.get_joint(k).model_instance() for k in chain if is_joint_moving(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
         raise DrakeTeleopError(
@@ -92,7 +92,7 @@ def ParseTool(
 ) -> ParsedTool:
     """Parse a tool with one root link, weld the root to S ("sensor_weld"), weld other joints."""
     before = set(plant.GetJointIndices())
-    read = read_model(plant, path, package_paths, Purpose(is_tool=True))
+    read = read_model(plant, path, package_paths, ModelPurpose(is_tool=True))
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
@@ -112,7 +112,7 @@ def ParseTool(
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     """Parse the surroundings of an arm; return the folder of their converted meshes."""
-    read = read_model(plant, path, (), Purpose(is_scene=True))
+    read = read_model(plant, path, (), ModelPurpose(is_scene=True))
     for name, what in read.dependent.items():
         raise DrakeTeleopError(
             f"{name} {what}",

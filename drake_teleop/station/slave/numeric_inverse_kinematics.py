@@ -25,25 +25,25 @@ from drake_teleop.common.vectors import (
     vector_at,
 )
 from drake_teleop.station.slave.arm import (
-    PHI,
-    SLIDES,
-    TRANSLATION,
+    IS_PRISMATIC_COLUMN,
+    PHI_COLUMN,
+    TRANSLATION_COLUMN,
     ArmModel,
     jacobian_and_pose,
-    solve_spd,
+    solve_positive_definite,
 )
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 Array = NDArray[np.float64]
 
-MET = 1e-8
+POSE_TOLERANCE_M = 1e-8
 """Largest error of position [m] and orientation [rad] at which a pose counts as met."""
 
 # Largest error that is rounding only [m].
 _ROUNDING_ERROR_M = 1e-14
-SINGULAR = 5e-3
+MIN_SINGULAR_VALUE_M = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
-STEPS = 10
+MAX_STEPS = 10
 """Maximum number of Levenberg-Marquardt steps per command; two or three are typical."""
 # Minimum damping of a step [m^2], which keeps redundant joints at rest.
 _MIN_DAMPING = 1e-14
@@ -58,11 +58,17 @@ _SEARCH_TOLERANCE_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _ESCAPE_STEP, _SEARCH_ESCAPE_STEP = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
-_COPLANAR_AXES = 0.1
+_MAX_COPLANAR_VOLUME = 0.1
 
-_OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = (
-    map(int, IkStatus)
-)
+(
+    _STATUS_OK,
+    _WRIST_SINGULAR,
+    _SHOULDER_SINGULAR,
+    _OUT_OF_REACH,
+    _JOINT_LIMIT,
+    _BAD_POSE,
+    _SPEED_LIMIT,
+) = map(int, IkStatus)
 
 
 @njit(cache=True)
@@ -87,7 +93,6 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
 
 @njit(cache=True)
 def _normal_matrix(J, H):
-    """Write J^T J to H, or J J^T if H has that size."""
     n = H.shape[0]
     rows = n == J.shape[1]
     for i in range(n):
@@ -104,7 +109,6 @@ def _normal_matrix(J, H):
 
 @njit(cache=True)
 def _smallest_eigenvalue(H, u):
-    """Return the smallest eigenvalue of H; write its eigenvector to u (inverse iteration)."""
     m = H.shape[0]
     M = np.empty((m, m))
     for i in range(m):
@@ -115,7 +119,7 @@ def _smallest_eigenvalue(H, u):
             for k in range(m):
                 M[i, k] = H[i, k]
             M[i, i] += _MIN_DAMPING
-        solve_spd(M, u)
+        solve_positive_definite(M, u)
         growth = 0.0
         for i in range(m):
             growth += u[i] * u[i]
@@ -126,7 +130,7 @@ def _smallest_eigenvalue(H, u):
 
 
 @njit(cache=True)
-def _is_held(q, lower, upper, i, push):
+def _is_held_at_limit(q, lower, upper, i, push):
     return (push > 0.0 and q[i] >= upper[i]) or (push < 0.0 and q[i] <= lower[i])
 
 
@@ -139,7 +143,7 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
     for i in range(n):
-        held[i] = _is_held(q, lower, upper, i, g[i])
+        held[i] = _is_held_at_limit(q, lower, upper, i, g[i])
     outside = True
     while outside:
         for i in range(n):
@@ -149,7 +153,7 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
                 if held[k] and not held[i]:
                     d[i] -= H[i, k] * fixed[k]
             M[i, i] = 1.0 if held[i] else H[i, i] + damping
-        solve_spd(M, d)
+        solve_positive_definite(M, d)
         outside = False
         for i in range(n):
             if not (held[i] or lower[i] <= q[i] + d[i] <= upper[i]):
@@ -163,7 +167,7 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
 
 
 @njit(cache=True)
-def _step_alone(J, e, i):
+def _best_step_of_joint(J, e, i):
     """Return the displacement of joint i alone that reduces the error e (6,) most."""
     slope, square = 0.0, 0.0
     for k in range(6):
@@ -174,10 +178,9 @@ def _step_alone(J, e, i):
 
 @njit(cache=True)
 def _singularity_status(L, J):
-    """Return WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR."""
     n = J.shape[1]
     a, b, c = vector_at(J[3:, n - 3], 0), vector_at(J[3:, n - 2], 0), vector_at(J[3:, n - 1], 0)
-    coplanar = abs(dot(a, cross(b, c))) < _COPLANAR_AXES * L**3
+    coplanar = abs(dot(a, cross(b, c))) < _MAX_COPLANAR_VOLUME * L**3
     return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 
@@ -218,7 +221,9 @@ def follow_pose(
             step = pull * (posture[i] - q[i])
             if upper[i] - lower[i] == np.inf:
                 # The last joint turns the tool without the links.
-                step = pull * np.sin(posture[i] - q[i]) if i < n - 1 else _step_alone(J, e, i)
+                step = (
+                    pull * np.sin(posture[i] - q[i]) if i < n - 1 else _best_step_of_joint(J, e, i)
+                )
             q[i] = min(max(q[i] + step, low[i]), high[i])
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
@@ -258,8 +263,11 @@ def follow_pose(
                 relative_damping = 10.0 * max(relative_damping, _INITIAL_DAMPING)
         _jacobian_and_error(table, L, pose, q, x, J, e)
         p, rotation = vector_at(e, 0), vector_at(e, 3)
-        if dot(p, p) <= MET * MET and dot(rotation, rotation) <= L * L * MET * MET:
-            return _OK
+        if (
+            dot(p, p) <= POSE_TOLERANCE_M * POSE_TOLERANCE_M
+            and dot(rotation, rotation) <= L * L * POSE_TOLERANCE_M * POSE_TOLERANCE_M
+        ):
+            return _STATUS_OK
         if towards_posture:
             # The pose has priority: repeat without the posture.
             towards_posture = False
@@ -277,7 +285,7 @@ def follow_pose(
             push = 0.0
             for k in range(6):
                 push += J[k, i] * e[k]
-            if not _is_held(q, low, high, i, push):
+            if not _is_held_at_limit(q, low, high, i, push):
                 free += push * push
             elif held < 0 or lower[i] < q[i] < upper[i]:
                 held = i
@@ -325,13 +333,13 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
             arm.table, L, pose, start, lower, upper, far, start, 0.0, 0.0,
             _SEARCH_STEPS, q,
         )  # fmt: skip
-        if found in (_OK, _BAD_POSE):
+        if found in (_STATUS_OK, _BAD_POSE):
             return _nearest_turns(arm, q, reference), IkStatus(found)
         squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
-            if squared < _SEARCH_TOLERANCE_M**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
+            if squared < _SEARCH_TOLERANCE_M**2 and np.linalg.svd(J)[1][-1] < MIN_SINGULAR_VALUE_M:
                 status = _singularity_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = first + part * width
@@ -340,13 +348,13 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
 
 def _nearest_turns(arm: ArmModel, q: Array, reference: Array) -> Array:
     turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
-    nearer = q + np.where(arm.table[:-1, SLIDES] == 0, turns, 0.0)
+    nearer = q + np.where(arm.table[:-1, IS_PRISMATIC_COLUMN] == 0, turns, 0.0)
     return np.where((arm.lower <= nearer) & (nearer <= arm.upper), nearer, q)
 
 
 def orientation_length(arm: ArmModel) -> float:
     """Return the length [m] that weights orientation against position error: reach / 5."""
-    return float(np.linalg.norm(arm.table[:, TRANSLATION:PHI], axis=1).sum()) / 5.0
+    return float(np.linalg.norm(arm.table[:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum()) / 5.0
 
 
 @njit(cache=True)
@@ -366,10 +374,10 @@ def _follow_command(
     if elapsed > 0.0:  # inf * 0 is nan
         for i in range(n):
             max_step[i] = speed[i] * elapsed
-    steps = np.int64(STEPS)  # a literal would compile `follow_pose` again
+    steps = np.int64(MAX_STEPS)  # a literal would compile `follow_pose` again
     return follow_pose(
         table, L, pose, reference, lower, upper, max_step, posture, min(pull * elapsed, 1.0),
-        SINGULAR, steps, q,
+        MIN_SINGULAR_VALUE_M, steps, q,
     )  # fmt: skip
 
 

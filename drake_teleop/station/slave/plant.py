@@ -23,7 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import quaternions_of
 from drake_teleop.station.environment.environment import Environment
-from drake_teleop.station.slave.arm import FRICTION, ArmModel, forward_kinematics, pose_into
+from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, forward_kinematics, pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
@@ -31,13 +31,18 @@ from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_pos
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
-from drake_teleop.station.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
-from drake_teleop.station.slave.tool import AddTool, shapes_reach
+from drake_teleop.station.slave.surroundings import (
+    AddEnvironment,
+    ContactWith,
+    ToolContactModel,
+    make_no_contact,
+)
+from drake_teleop.station.slave.tool import AddTool, end_of_shapes
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
 _SAME_REACH_M = 1e-3
 #: Name of the arm's model instance in every plant.
-ARM = "arm"
+ARM_INSTANCE_NAME = "arm"
 
 
 @dataclass(frozen=True)
@@ -63,7 +68,7 @@ class SlavePlant:
     start: NDArray[np.float64]
     X_WS_start: NDArray[np.float64]
     tip: NDArray[np.float64]
-    contact: Contact
+    contact: ToolContactModel
     assumptions: tuple[str, ...]
     config: Slave
     environment: Environment | None
@@ -74,22 +79,22 @@ class SlavePlant:
         return self.contact.pairs
 
     @cached_property
-    def physics(self) -> tuple[NDArray[np.float64], ...]:
+    def physics_of_plant(self) -> tuple[NDArray[np.float64], ...]:
         """Argument of `plant_rates`: arm table, view of its load, pairs, leaf, joints, wrenches.
 
         The table is a copy with dry friction, and with the load that a grasp may change.
         """
         carried = self.arm.with_load(self.arm.phi_load)
-        carried.table[:-1, FRICTION] = self.friction
+        carried.table[:-1, FRICTION_COLUMN] = self.joint_friction
         contact = self.contact.pairs, self.contact.leaf, self.contact.joints
         return carried.table, carried.load, *contact, np.zeros((0, 0))
 
     @property
-    def friction(self) -> NDArray[np.float64]:
+    def joint_friction(self) -> NDArray[np.float64]:
         return friction_of_joints(self.config.friction, self.arm.joint_names)
 
     @property
-    def sheet(self) -> ModelInstanceIndex | None:
+    def sheet_instance(self) -> ModelInstanceIndex | None:
         """Model instance of the leaf, or of another `moving_part`; None without one."""
         return self.contact.sheet
 
@@ -100,7 +105,7 @@ class SlavePlant:
     @property
     def sensed_sheet(self) -> ModelInstanceIndex | None:
         """Model instance of the sheet if the compiled contact law moves it, else None."""
-        return None if self.contact.beyond else self.sheet
+        return None if self.contact.beyond else self.sheet_instance
 
     @property
     def start_tip(self) -> NDArray[np.float64]:
@@ -118,7 +123,7 @@ def start_pose(slave: Slave) -> NDArray[np.float64]:
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
-    written = tuple(path.stat().st_mtime_ns for path in slave.files())
+    written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
     return _nominal_slave(HashableByValue(slave), written)
 
 
@@ -162,8 +167,8 @@ def AddSlavePlant(
     instance, tool = parsed.instance, parsed.tool
     surroundings = None if environment is None else AddEnvironment(plant, environment)
     with translate_drake_errors(slave.path):
-        finalize(plant)
-    contact = no_contact()
+        finalize_plant(plant)
+    contact = make_no_contact()
     if environment is not None and surroundings is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
@@ -188,7 +193,7 @@ def AddSlavePlant(
         arm,
         start,
         X_WS_start,
-        _tip(plant, slave, parsed, arm),
+        _tip_of_tool(plant, slave, parsed, arm),
         contact,
         (*parsed.assumptions, *assumptions),
         slave,
@@ -231,9 +236,11 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     model = ParseModel(
         plant, slave.path, slave.sensor_frame, slave.packages, slave.X_WBase, slave.hold
     )
-    if plant.HasModelInstanceNamed(ARM):
-        plant.RenameModelInstance(plant.GetModelInstanceByName(ARM), f"{ARM}_of_model")
-    plant.RenameModelInstance(model.instance, ARM)
+    if plant.HasModelInstanceNamed(ARM_INSTANCE_NAME):
+        plant.RenameModelInstance(
+            plant.GetModelInstanceByName(ARM_INSTANCE_NAME), f"{ARM_INSTANCE_NAME}_of_model"
+        )
+    plant.RenameModelInstance(model.instance, ARM_INSTANCE_NAME)
     set_torque_limits(plant, model.instance, slave.torque_limits)
     frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
     assumptions, folders = [*model.assumptions], [model.folder]
@@ -260,7 +267,7 @@ def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
     return near + [far for each in near for far in bodies_beyond(plant, each)]
 
 
-def finalize(plant: MultibodyPlant) -> None:
+def finalize_plant(plant: MultibodyPlant) -> None:
     """Finalize a continuous plant without Drake's warnings about joint limits."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
@@ -291,7 +298,7 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
     """Return the corners (k, 3) in S [m] of the convex hull or box of each shape on the sensor."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
-    finalize(plant)
+    finalize_plant(plant)
     context, inspector = plant.CreateDefaultContext(), scene_graph.model_inspector()
     hulls, signs = [], np.array(list(product((-1.0, 1.0), repeat=3)))
     for body in bodies_beyond(plant, parsed.sensor_frame.body()):
@@ -317,7 +324,7 @@ def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.array([*np.mean(middles, axis=0), reach])
 
 
-def _tip(
+def _tip_of_tool(
     plant: MultibodyPlant, slave: Slave, parsed: ParsedSlave, arm: ArmModel
 ) -> NDArray[np.float64]:
     if slave.tip:
@@ -332,7 +339,7 @@ def _tip(
             for frame in (parsed.sensor_frame, tip)
         )
         return X_WS.InvertAndCompose(X_WTip).translation()
-    reach = None if slave.tool is None else shapes_reach(slave.tool)
+    reach = None if slave.tool is None else end_of_shapes(slave.tool)
     if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
         return _end_of_hulls(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
@@ -352,12 +359,12 @@ class Arm:
         return np.concatenate([quaternions_of(R_WS[None])[0], p_WS])
 
 
-def arm_of(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
+def arm_of_model_file(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
     """Return the kinematics of the arm in a model file, or raise DrakeTeleopError."""
     plant = MultibodyPlant(0.0)
     with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)
-        finalize(plant)
+        finalize_plant(plant)
         found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
     arm = Arm(found.joint_names, found.table)
     arm.pose(np.zeros(found.num_joints))  # Load the compiled function before the first reading.

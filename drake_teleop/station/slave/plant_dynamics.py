@@ -18,19 +18,19 @@ from drake_teleop.common.vectors import (
     rotate_vector,
     vector_at,
 )
-from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, bodies_into
+from drake_teleop.station.environment.moving_bodies import NUM_POSE_AND_TWIST, poses_and_twists_into
 from drake_teleop.station.environment.point_contact import (
-    BODY,
-    WIDTH,
+    BODY_COLUMN,
+    NUM_PAIR_COLUMNS,
     contact_force,
-    indentation,
-    separation,
+    depth_of_sphere_in_box,
+    min_distance_of_boxes,
 )
 from drake_teleop.station.slave.arm import ArmModel, forward_dynamics, forward_kinematics, jacobian
-from drake_teleop.station.slave.surroundings import Contact
+from drake_teleop.station.slave.surroundings import ToolContactModel
 
 #: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
-FAR, TOUCHING, WATCHED = range(3)
+PROXIMITY_FAR, PROXIMITY_TOUCHING, PROXIMITY_NEAR_MONITORED = range(3)
 _WATCHED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
 _TOUCH_TOLERANCE_M = 1e-9  # m
 
@@ -41,7 +41,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
     Args:
         arm: `ArmModel.table`.
-        pairs: (k, 28) pairs of shapes, `Pairs.known`.
+        pairs: (k, 28) pairs of shapes, `ShapePairs.known`.
         joints: (m, 21) joints of moving bodies, `JointTable`.
         applied_W: (6,) additional [f; tau] about So, in W [N, N m].
         sheet: (2,) deflection of the leaf and its rate [m, m/s].
@@ -55,13 +55,13 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False
-    bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
-    bodies_into(joints, state, bodies)
+    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
-        depth = indentation(box, p_WS, R_WS, sheet[0], normal)
+        box = _place_box_at_body(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
+        depth = depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
         if not has_twist:
@@ -73,21 +73,21 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         point_velocity = plus(vector_at(twist, 0), cross(vector_at(twist, 3), lever))
         for i in range(3):
             velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
-        if pair[BODY] >= 0.0:
-            body = bodies[int(pair[BODY])]
+        if pair[BODY_COLUMN] >= 0.0:
+            body = bodies[int(pair[BODY_COLUMN])]
             lever = minus(vector_at(normal, 3), vector_at(body, 4))
             point_velocity = plus(vector_at(body, 10), cross(vector_at(body, 7), lever))
             for i in range(3):
                 velocity[i] -= point_velocity[i]
         contact_force(pair, depth, normal[:3], velocity, force)
-        add_force(wrench_W, normal[3:], force)
+        add_force_to_wrench(wrench_W, normal[3:], force)
 
 
 @njit(cache=True)
-def _place_box(pair, bodies, placed):
+def _place_box_at_body(pair, bodies, placed):
     """Write the pair, with its box at the pose of its body, to `placed` (28,); return `placed`."""
-    body = bodies[int(pair[BODY])]
-    copy_into(placed, 0, pair, 0, WIDTH)
+    body = bodies[int(pair[BODY_COLUMN])]
+    copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
     turn = (body[0], body[1], body[2], body[3])
     for i in range(3):
         column = rotate_vector(turn, (pair[4 + i], pair[7 + i], pair[10 + i]))
@@ -100,27 +100,27 @@ def _place_box(pair, bodies, placed):
 
 @njit(cache=True)
 def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
-    """Return the tool's proximity `FAR`, `TOUCHING` or `WATCHED`; `watched` is `Pairs.watched`."""
+    """Return `PROXIMITY_FAR`, or that of a nearer tool; `watched` is `ShapePairs.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
-    bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
-    bodies_into(joints, state, bodies)
+    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
-        if pair[BODY] >= 0.0:
-            _place_box(pair, bodies, placed)
+        if pair[BODY_COLUMN] >= 0.0:
+            _place_box_at_body(pair, bodies, placed)
         else:
-            copy_into(placed, 0, pair, 0, WIDTH)
-        if separation(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
-            return WATCHED
+            copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
+        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
+            return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
-        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
-        if indentation(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
-            return TOUCHING
-    return FAR
+        box = _place_box_at_body(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
+        if depth_of_sphere_in_box(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
+            return PROXIMITY_TOUCHING
+    return PROXIMITY_FAR
 
 
 @njit(cache=True)
-def add_force(wrench_W, p_WC, force_W):
+def add_force_to_wrench(wrench_W, p_WC, force_W):
     """Add a force (3,) [N] at point C to a wrench (6,) about the world's origin, in W."""
     add_into(wrench_W, 0, force_W)
     add_into(wrench_W, 3, cross(p_WC, force_W))
@@ -135,7 +135,7 @@ class ToolContact(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, arm: ArmModel, contact: Contact) -> None:
+    def __init__(self, arm: ArmModel, contact: ToolContactModel) -> None:
         super().__init__()
         n = self._n = arm.num_joints
         self._contact = arm.table, contact.pairs, contact.joints, np.zeros(6)
@@ -174,7 +174,7 @@ def assemble_state(state, around, x):
 def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
     """Write the time derivative xdot (2 n + 2,) of the plant's state x, and the contact wrench.
 
-    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m].
+    `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m].
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
@@ -190,7 +190,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
         applied = np.empty(6)
         environment_wrench(arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied)
         wrench_W += applied
-    rates_under(physics, x, tau, applied_W, wrench_W, xdot)
+    plant_rates_under_wrench(physics, x, tau, applied_W, wrench_W, xdot)
 
 
 @njit(cache=True)
@@ -212,7 +212,7 @@ def _take_given_wrench(given, x, wrench_W):
 
 
 @njit(cache=True)
-def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
+def plant_rates_under_wrench(physics, x, tau, applied_W, wrench_W, xdot):
     """Write the time derivative xdot of the plant's state x under the contact wrench `wrench_W`."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1

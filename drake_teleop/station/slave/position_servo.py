@@ -21,7 +21,7 @@ from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dyn
 
 # Memory of the servo: periods since the last command, index of the oldest command in the queue;
 # then target, r and dr/dt (n each), and the queue of commands.
-_COUNT, _OLDEST = 0, 1
+_COUNT_INDEX, _OLDEST_COMMAND_INDEX = 0, 1
 # Braking v^2 = 2 a d with 80 % of the largest acceleration.
 _BRAKING_FACTOR = 2 * 0.8
 
@@ -72,7 +72,7 @@ class PositionInterface:
 
 
 #: Interfaces by name; docs/station.md lists the sources.
-INTERFACES: dict[str, PositionInterface] = {
+POSITION_INTERFACES: dict[str, PositionInterface] = {
     "ur_servoj": PositionInterface(),
     "franka_position": PositionInterface(
         command_hz=1000.0,
@@ -87,7 +87,7 @@ INTERFACES: dict[str, PositionInterface] = {
 
 
 @njit(cache=True)
-def _generate(command, interface, limits, memory, reference):
+def _generate_reference(command, interface, limits, memory, reference):
     """Accept the command (n,) [rad] if due, and advance the reference r by one period.
 
     Args:
@@ -100,15 +100,15 @@ def _generate(command, interface, limits, memory, reference):
     period, gain, lookahead, _, every, queued = interface
     n = command.shape[0]
     target, r, speed = memory[2 : 2 + n], memory[2 + n : 2 + 2 * n], memory[2 + 2 * n : 2 + 3 * n]
-    if memory[_COUNT] == 0.0 and all_in_range(command):
+    if memory[_COUNT_INDEX] == 0.0 and all_in_range(command):
         if queued > 0.0:
-            place = 2 + 3 * n + int(memory[_OLDEST]) * n
+            place = 2 + 3 * n + int(memory[_OLDEST_COMMAND_INDEX]) * n
             copy_into(target, 0, memory, place, n)
             copy_into(memory, place, command, 0, n)
-            memory[_OLDEST] = (memory[_OLDEST] + 1.0) % queued
+            memory[_OLDEST_COMMAND_INDEX] = (memory[_OLDEST_COMMAND_INDEX] + 1.0) % queued
         else:
             copy_into(target, 0, command, 0, n)
-    memory[_COUNT] = (memory[_COUNT] + 1.0) % every
+    memory[_COUNT_INDEX] = (memory[_COUNT_INDEX] + 1.0) % every
     for i in range(n):
         away = target[i] - r[i]
         fastest = min(limits[0, i], math.sqrt(_BRAKING_FACTOR * limits[1, i] * abs(away)))
@@ -132,7 +132,7 @@ def position_servo_torque(
     readings are invalid, the torque compensates gravity.
     """
     n = torque.shape[0]
-    _generate(command, interface, limits, memory, scratch)
+    _generate_reference(command, interface, limits, memory, scratch)
     q, v, wanted, w = scratch[3], scratch[4], scratch[5], interface[3]
     if all_in_range(state):
         copy_into(q, 0, state, 0, n)

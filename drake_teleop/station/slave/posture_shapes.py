@@ -36,7 +36,7 @@ from pydrake.multibody.tree import BodyIndex, PrismaticJoint, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.station.environment.environment import Environment, Several
+from drake_teleop.station.environment.environment import Environment, SeveralObjects
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.model.meshes import AddSkeleton
 from drake_teleop.station.slave.model.repair_report import join_names
@@ -45,7 +45,7 @@ from drake_teleop.station.slave.plant import (
     NominalSlave,
     ParseSlave,
     bodies_beyond,
-    finalize,
+    finalize_plant,
 )
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
@@ -54,9 +54,9 @@ from drake_teleop.station.slave.surroundings import AddEnvironment
 MIN_DEPTH_M = 1e-3
 _MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
-_NUM_POSTURES, _DESIGN_SHARE = 200, 0.95
+_NUM_POSTURES, _OVERLAP_BY_DESIGN_SHARE = 200, 0.95
 _SAME_DIRECTION = 0.999  # cosine of the angle between the axes of a telescope
-_SIDES = 24  # points on a circumference of a round shape
+_NUM_POLYHEDRON_SIDES = 24  # points on a circumference of a round shape
 
 
 class Overlap(NamedTuple):
@@ -88,10 +88,10 @@ class PostureShapes:
         self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
         beyond = bodies_beyond(self.plant, self._parsed.sensor_frame.body())
         self.tool_bodies = {body.index() for body in beyond}
-        if sticks and not any(map(self._has_shapes, self.moving() - self.tool_bodies)):
+        if sticks and not any(map(self._has_shapes, self.moving_bodies() - self.tool_bodies)):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
         _make_solid(self.plant, self._scene_graph)
-        finalize(self.plant)
+        finalize_plant(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
         self._exclude_joined()
@@ -138,11 +138,11 @@ class PostureShapes:
         """Return the pairs of overlapping bodies, except those that overlap by design."""
         return [
             Overlap(self.plant.get_body(first), self.plant.get_body(second), distance)
-            for (first, second), distance in self._distances().items()
+            for (first, second), distance in self._distances_of_bodies().items()
             if (first, second) not in self._by_design
         ]
 
-    def points(self, bodies: Collection[BodyIndex]) -> Array:
+    def points_on_bodies(self, bodies: Collection[BodyIndex]) -> Array:
         return np.vstack(
             [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hulls(body))]
         )
@@ -155,13 +155,13 @@ class PostureShapes:
         X_WB = self.plant.EvalBodyPoseInWorld(self.context, body)
         return [(X_WB @ points.T).T for points in hulls]
 
-    def anchored(self) -> set[BodyIndex]:
+    def anchored_bodies(self) -> set[BodyIndex]:
         fixed = self.plant.GetBodiesWeldedTo(self.plant.world_body())
         return {body.index() for body in fixed} - self.surroundings
 
-    def moving(self) -> set[BodyIndex]:
+    def moving_bodies(self) -> set[BodyIndex]:
         every = set(map(BodyIndex, range(self.plant.num_bodies())))
-        return every - self.surroundings - self.anchored()
+        return every - self.surroundings - self.anchored_bodies()
 
     def _has_shapes(self, index: BodyIndex) -> bool:
         body, plant = self.plant.get_body(index), self.plant
@@ -169,7 +169,7 @@ class PostureShapes:
             plant.GetCollisionGeometriesForBody(body) or plant.GetVisualGeometriesForBody(body)
         )
 
-    def _distances(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
+    def _distances_of_bodies(self) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
         query = self._scene_graph.get_query_output_port().Eval(scene)
         found: dict[tuple[BodyIndex, BodyIndex], float] = {}
@@ -181,13 +181,12 @@ class PostureShapes:
         return found
 
     def _exclude_joined(self) -> None:
-        """Ignore overlaps in the environment, in a link, and across a joint or telescope."""
         plant, manager = self.plant, self._scene_graph.collision_filter_manager()
 
-        def link(body: RigidBody) -> set[BodyIndex]:
+        def bodies_of_link(body: RigidBody) -> set[BodyIndex]:
             return {each.index() for each in plant.GetBodiesWeldedTo(body)} - self.surroundings
 
-        def shapes(bodies: Collection[BodyIndex]) -> GeometrySet:
+        def shapes_of_bodies(bodies: Collection[BodyIndex]) -> GeometrySet:
             return GeometrySet([shape for each in bodies for shape in self.shapes_of(each)])
 
         context, together = plant.CreateDefaultContext(), [self.surroundings]
@@ -195,7 +194,7 @@ class PostureShapes:
         for joint in map(plant.get_joint, plant.GetJointIndices()):
             if joint.child_body().index() in self.surroundings:
                 continue
-            joined = link(joint.parent_body()) | link(joint.child_body())
+            joined = bodies_of_link(joint.parent_body()) | bodies_of_link(joint.child_body())
             if isinstance(joint, PrismaticJoint):
                 R_WF = joint.frame_on_parent().CalcPoseInWorld(context).rotation()
                 axis, others = R_WF @ joint.translation_axis(), telescopes
@@ -208,15 +207,15 @@ class PostureShapes:
                 telescopes.append((axis, joined))
             together.append(joined)
         for bodies in together:
-            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes(bodies)))
+            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes_of_bodies(bodies)))
 
     def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
-        least = int(np.ceil(_DESIGN_SHARE * _NUM_POSTURES))
+        least = int(np.ceil(_OVERLAP_BY_DESIGN_SHARE * _NUM_POSTURES))
         limits = sampled_range(self.arm)
         for left in range(_NUM_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
-            counts.update(p for p in self._distances() if not self.surroundings & set(p))
+            counts.update(p for p in self._distances_of_bodies() if not self.surroundings & set(p))
             if max(counts.values(), default=0) + left <= least:
                 return set()
         return {pair for pair, count in counts.items() if count >= least}
@@ -236,7 +235,7 @@ def start_overlaps(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return sentences about pairs of bodies that overlap at the start, and the assumptions."""
     parts = [] if environment is None else list(environment.parts)
-    written = tuple(path.stat().st_mtime_ns for path in slave.files())
+    written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
     return _start_overlaps(HashableByValue((slave, parts)), written)
 
 
@@ -245,7 +244,7 @@ def _start_overlaps(
     key: HashableByValue, _: tuple[int, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
-    shapes = PostureShapes(slave, Several(parts) if parts else None)
+    shapes = PostureShapes(slave, SeveralObjects(parts) if parts else None)
     shapes.move_to(NominalSlave(slave).start)
     return tuple(overlap_texts(shapes)), tuple(shapes.assumptions)
 
@@ -306,7 +305,7 @@ def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Arra
         ball = shape.radius() * _unit_sphere()
         points = np.vstack([ball - end, ball + end])
     elif isinstance(shape, Cylinder):
-        rim = _unit_sphere()[_SIDES : 2 * _SIDES] * [1.0, 1.0, 0.0]
+        rim = _unit_sphere()[_NUM_POLYHEDRON_SIDES : 2 * _NUM_POLYHEDRON_SIDES] * [1.0, 1.0, 0.0]
         rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
         end = [0.0, 0.0, shape.length() / 2]
         points = np.vstack([rim - end, rim + end])
@@ -320,10 +319,12 @@ def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Arra
 
 
 def _unit_sphere() -> Array:
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
-    longitude = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, _NUM_POLYHEDRON_SIDES // 2 + 1)
+    longitude = 2 * np.pi * np.arange(_NUM_POLYHEDRON_SIDES) / _NUM_POLYHEDRON_SIDES
     rings = [
-        np.column_stack([c * np.cos(longitude), c * np.sin(longitude), np.full(_SIDES, s)])
+        np.column_stack(
+            [c * np.cos(longitude), c * np.sin(longitude), np.full(_NUM_POLYHEDRON_SIDES, s)]
+        )
         for c, s in zip(np.cos(latitude), np.sin(latitude), strict=True)
     ]
     return np.vstack(rings)

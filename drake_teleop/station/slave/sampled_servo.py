@@ -20,7 +20,7 @@ from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
     JointControlConfig,
     joint_control_torque,
-    servo_numbers,
+    servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_dynamics import assemble_state, plant_rates
@@ -45,7 +45,7 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 
 @njit(cache=True)
-def torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
+def torque_line_into(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
     """Write the torque over the next `samples` as a line in time.
 
     Args:
@@ -53,8 +53,8 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
         command: (n,) joint command [rad].
         state: (2 n,) [q; v].
         sheet: (2,) deflection of the leaf and its rate.
-        servo: gains and limits from `servo_numbers`.
-        physics: `SlavePlant.physics`.
+        servo: gains and limits from `servo_gains_and_limits`.
+        physics: `SlavePlant.physics_of_plant`.
         period: of the servo [s].
         line: (3 n,) output: torque [N m], its rate [N m/s], last sample [N m].
     """
@@ -120,7 +120,8 @@ class SampledServo(LeafSystem):
         n = self._n = arm.num_joints
         self._arm = arm.table
         self._constants = (
-            servo_numbers(arm, config), slave.physics, samples, period, np.zeros(3 * n)
+            servo_gains_and_limits(arm, config), slave.physics_of_plant, samples, period,
+            np.zeros(3 * n)
         )  # fmt: skip
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
@@ -145,7 +146,7 @@ class SampledServo(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         following = discrete_state.get_mutable_value(0)
-        torque_line(
+        torque_line_into(
             self._arm,
             self._command.Eval(context),
             self._state.Eval(context),

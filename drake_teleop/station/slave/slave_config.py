@@ -12,7 +12,7 @@ from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
-from drake_teleop.station.slave.joint_commands import AUTOMATIC, IK_METHODS
+from drake_teleop.station.slave.joint_commands import AUTOMATIC_METHOD, IK_METHODS
 from drake_teleop.station.slave.tool import Tool, steel_ball_radius
 
 
@@ -35,8 +35,8 @@ class Slave:
     )
     payload: Payload = field(default_factory=Payload)
     inverse_kinematics: str = choice(
-        AUTOMATIC,
-        (AUTOMATIC,),
+        AUTOMATIC_METHOD,
+        (AUTOMATIC_METHOD,),
         "closed_form: for arms with the geometry of the RX90; numeric: for any arm, within joint"
         " speeds; automatic: closed_form where possible",
         IK_METHODS,
@@ -92,7 +92,7 @@ class Slave:
     def X_WBase(self) -> RigidTransform:
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
-    def files(self) -> list[Path]:
+    def model_files(self) -> list[Path]:
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
         return [path for path in paths if path.is_file()]
 
@@ -130,16 +130,16 @@ class Slave:
     def found_from(self, folder: Path) -> "Slave":
         """Return a copy with relative file paths resolved from `folder`."""
 
-        def found(name: str) -> str:
+        def resolved_path(name: str) -> str:
             return str((folder / name).resolve()) if name else ""
 
         tool = self.tool
         if tool is not None and tool.model:
-            tool = dataclasses.replace(tool, model=found(tool.model))
+            tool = dataclasses.replace(tool, model=resolved_path(tool.model))
         return dataclasses.replace(
             self,
-            model=found(self.model),
-            package_paths=[found(path) for path in self.package_paths],
+            model=resolved_path(self.model),
+            package_paths=[resolved_path(path) for path in self.package_paths],
             tool=tool,
         )
 

@@ -27,30 +27,34 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
-    JOINT_WIDTH,
-    POSE_AND_TWIST,
+    NUM_JOINT_COLUMNS,
+    NUM_POSE_AND_TWIST,
     JointTable,
-    bodies_into,
+    poses_and_twists_into,
 )
-from drake_teleop.station.environment.point_contact import WATCHED_WIDTH, WIDTH, ContactPairs
+from drake_teleop.station.environment.point_contact import (
+    NUM_MONITORED_COLUMNS,
+    NUM_PAIR_COLUMNS,
+    ContactPairs,
+)
 
 _FRAME_TOLERANCE = 1e-12  # rounding of frames
 _MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
 
 
-class Touched(NamedTuple):
+class AddedEnvironment(NamedTuple):
     """Model instances of an added environment, and the leaf's model instance or None."""
 
     instances: Collection[ModelInstanceIndex]
     sheet: ModelInstanceIndex | None
 
 
-class Contact(NamedTuple):
+class ToolContactModel(NamedTuple):
     """Model of the contact between tool and environment.
 
     Attributes:
-        pairs: (k, 28) `Pairs.known`; empty if `beyond` is set.
-        watched: (l, 40) `Pairs.watched`, pairs that Drake computes at close range.
+        pairs: (k, 28) `ShapePairs.known`; empty if `beyond` is set.
+        watched: (l, 40) `ShapePairs.watched`, pairs that Drake computes at close range.
         joints: (m, 21) joints of `JointTable`, which move the boxes of `pairs`.
         plant_size: size of the plant's state, 0 without joints.
         beyond: reason for using Drake's contact results instead of the compiled law, or empty.
@@ -72,25 +76,25 @@ class Contact(NamedTuple):
     moving: dict[str, BodyIndex]
 
     @property
-    def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def compiled_law_arguments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return self.pairs, self.joints
 
 
-def no_contact() -> Contact:
+def make_no_contact() -> ToolContactModel:
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
-    pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
-    watched = np.zeros((0, WATCHED_WIDTH))
-    return Contact(pairs, watched, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
+    pairs, joints = np.zeros((0, NUM_PAIR_COLUMNS)), np.zeros((0, NUM_JOINT_COLUMNS))
+    watched = np.zeros((0, NUM_MONITORED_COLUMNS))
+    return ToolContactModel(pairs, watched, joints, 0, "", frozenset(), frozenset(), leaf, None, {})
 
 
-def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
+def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> AddedEnvironment:
     before, sheet = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
             sheet = ModelInstanceIndex(plant.num_model_instances())
         part.AddTo(plant)
     added = range(before, plant.num_model_instances())
-    return Touched([ModelInstanceIndex(index) for index in added], sheet)
+    return AddedEnvironment([ModelInstanceIndex(index) for index in added], sheet)
 
 
 def ContactWith(
@@ -99,8 +103,8 @@ def ContactWith(
     sensor_frame: Frame,
     tool: BodyIndex,
     environment: Environment,
-    touched: Touched,
-) -> Contact:
+    touched: AddedEnvironment,
+) -> ToolContactModel:
     """Return the contact of the tool with the environment, in a finalized plant.
 
     `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
@@ -108,7 +112,7 @@ def ContactWith(
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
-    contact = no_contact()._replace(
+    contact = make_no_contact()._replace(
         # Integers, because Drake's identifiers would keep the plant alive.
         bodies=frozenset(int(index) for index in shapes),
         shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
@@ -151,7 +155,7 @@ def _X_SBody(
     return RigidTransform() if X_SBody.IsNearlyIdentity(_FRAME_TOLERANCE) else X_SBody
 
 
-def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> None:
+def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactModel) -> None:
     if not contact.moving:
         return
     inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
@@ -165,7 +169,7 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> 
         )
 
 
-def _unmodelled_contact(environment: Environment, contact: Contact) -> str:
+def _unmodelled_contact(environment: Environment, contact: ToolContactModel) -> str:
     if environment.hydroelastic:
         return "contacts have areas"
     if contact.sheet is not None and len(environment.parts) > 1:
@@ -173,7 +177,7 @@ def _unmodelled_contact(environment: Environment, contact: Contact) -> str:
     return ""
 
 
-def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex]:
+def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, BodyIndex]:
     """Return the moving bodies of a finalized plant, except the leaf, by unique name."""
     bodies = [
         plant.get_body(index)
@@ -184,14 +188,14 @@ def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     names = [body.name() for body in moving]
     return {
-        _signal_name(
+        _unique_signal_name(
             body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()
         ): (body.index())
         for body in moving
     }
 
 
-def _signal_name(name: str) -> str:
+def _unique_signal_name(name: str) -> str:
     return re.sub(r"\W+", "_", name)
 
 
@@ -201,7 +205,7 @@ def supports_pose(joint: Joint) -> bool:
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
-def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
+def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
     if isinstance(joint, RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
@@ -219,10 +223,10 @@ class MovingPose(LeafSystem):
     def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
         super().__init__()
         self._joints, order = JointTable(plant, [body])
-        self._bodies = np.empty((len(order), POSE_AND_TWIST))
+        self._bodies = np.empty((len(order), NUM_POSE_AND_TWIST))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        bodies_into(self._joints, self._state.Eval(context), self._bodies)
+        poses_and_twists_into(self._joints, self._state.Eval(context), self._bodies)
         output.SetFromVector(self._bodies[-1, :7])  # the body is last in its chain

@@ -23,7 +23,7 @@ from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
 _STEEL_DENSITY = 7850.0  # kg/m^3
 # Contact material of the shapes, as for the ball of tool.sdf.
-_STIFFNESS, _DISSIPATION, _FRICTION = 4e5, 1.0, 0.2
+_TOOL_STIFFNESS, _TOOL_DISSIPATION, _TOOL_FRICTION = 4e5, 1.0, 0.2
 _ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
 _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
@@ -102,7 +102,7 @@ class Tool:
                 where=f"{where}.mass",
                 remedy="give the mass, or remove them",
             )
-        if not _inertia(self).IsPhysicallyValid():
+        if not _spatial_inertia_of(self).IsPhysicallyValid():
             raise DrakeTeleopError(
                 "the inertia is impossible for a rigid body",
                 where=f"{where}.inertia",
@@ -110,7 +110,7 @@ class Tool:
             )
 
 
-def shapes_reach(tool: Tool) -> list[float] | None:
+def end_of_shapes(tool: Tool) -> list[float] | None:
     """Return the end p_STip (3,) [m] of the shape that reaches farthest along z_S, or None."""
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
@@ -126,7 +126,7 @@ def AddTool(
     """Add the tool to a plant and weld it to the sensor frame by the joint "sensor_weld"."""
     if tool.mass == 0.0:
         return ParseTool(plant, tool.path, sensor_frame, package_paths)
-    body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _inertia(tool))
+    body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _spatial_inertia_of(tool))
     weld = WeldJoint("sensor_weld", sensor_frame, body.body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     if plant.geometry_source_is_registered():
@@ -136,8 +136,8 @@ def AddTool(
 
 def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     surface = ProximityProperties()
-    friction = CoulombFriction(_FRICTION, _FRICTION)
-    AddContactMaterial(surface, _DISSIPATION, _STIFFNESS, friction)
+    friction = CoulombFriction(_TOOL_FRICTION, _TOOL_FRICTION)
+    AddContactMaterial(surface, _TOOL_DISSIPATION, _TOOL_STIFFNESS, friction)
     if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _COLOUR)
@@ -152,7 +152,7 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
             plant.RegisterVisualGeometry(body, middle, rod, f"{name}_rod", _COLOUR)
 
 
-def _inertia(tool: Tool) -> SpatialInertia:
+def _spatial_inertia_of(tool: Tool) -> SpatialInertia:
     if tool.mass == 0.0:
         return SpatialInertia.Zero()
     if not any(tool.inertia):

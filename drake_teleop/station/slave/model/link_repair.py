@@ -7,11 +7,11 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, parse_number
 from drake_teleop.station.slave.model.model_tree import WORLD
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_ENTRIES = {
+_INERTIA_ENTRIES = {
     "ixx": (0, 0),
     "ixy": (0, 1),
     "ixz": (0, 2),
@@ -20,10 +20,10 @@ _ENTRIES = {
     "izz": (2, 2),
 }
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
-_ROUNDING, _SUSPICIOUS = 1e-3, 0.05
+_ROUNDING_SHARE, _SUSPICIOUS_SHARE = 1e-3, 0.05
 _NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
-_MARGIN = 1e-9
+_TRIANGLE_INEQUALITY_MARGIN = 1e-9
 
 
 def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
@@ -35,7 +35,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     name, inertial = link.get("name", ""), link.find("inertial")
     if inertial is None or inertial.find("mass") is None:
         if is_sdf:
-            report.state("1 kg, the default of SDF, for", name)
+            report.state_assumption("1 kg, the default of SDF, for", name)
         elif inertial is not None:
             link.remove(inertial)
         return not is_sdf
@@ -43,7 +43,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
         link.remove(inertial)
         return False
     text = _mass_text(inertial)
-    mass, inertia = number(text), _inertia(inertial, is_sdf=is_sdf)
+    mass, inertia = parse_number(text), _inertia_tensor_of(inertial, is_sdf=is_sdf)
     fault = ""
     if not 0.0 <= mass <= MAX_VALUE:
         fault = f"mass {text} kg is not between 0 and {MAX_VALUE:g} kg"
@@ -53,15 +53,17 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
         link.remove(inertial)
         what = "an impossible inertia left out, as no joint of the arm moves the link, of"
-        report.state(what, name)
+        report.state_assumption(what, name)
     elif fault:
-        report.refuse(f"link {name}: {fault}")
+        report.add_fault(f"link {name}: {fault}")
     else:
         if no_mass and inertia.any():
-            report.repair("an inertia without a mass left out of", name)
+            report.state_repair("an inertia without a mass left out of", name)
         nearest = np.zeros((3, 3)) if no_mass else possible_inertia(inertia, name, report)
         link.remove(inertial)
-        _write(link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf)
+        _write_inertial(
+            link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf
+        )
     return not at_rest and not inertia.any()
 
 
@@ -70,14 +72,14 @@ def _mass_text(inertial: Element) -> str:
     return "" if mass is None else (mass.get("value") or mass.text or "").strip()
 
 
-def _inertia(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
+def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
     element, tensor = inertial.find("inertia"), np.zeros((3, 3))
     if element is None:
         return np.eye(3) if is_sdf else tensor
-    for name, (row, column) in _ENTRIES.items():
+    for name, (row, column) in _INERTIA_ENTRIES.items():
         default = "1" if is_sdf and row == column else "0"
         text = element.get(name) or element.findtext(name) or default
-        tensor[row, column] = tensor[column, row] = number(text)
+        tensor[row, column] = tensor[column, row] = parse_number(text)
     return tensor
 
 
@@ -86,16 +88,16 @@ def possible_inertia(
 ) -> NDArray[np.float64]:
     """Return the nearest inertia tensor (3, 3) that the link `name` can have; state a change."""
     nearest, change = nearest_possible_inertia(inertia)
-    if 0.0 < change <= _ROUNDING or 0.0 < change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
-        report.state("an inertia corrected for rounding of", name)
+    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
+        report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
-        warning = "warning: " if change > _SUSPICIOUS else ""
-        report.repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
+        warning = "warning: " if change > _SUSPICIOUS_SHARE else ""
+        report.state_repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
     return nearest
 
 
-def _write(
+def _write_inertial(
     link: Element,
     pose: Element | None,
     mass: float,
@@ -106,7 +108,7 @@ def _write(
     inertial = SubElement(link, "inertial")
     if pose is not None:
         inertial.append(pose)
-    entries = {name: f"{inertia[place]:.17g}" for name, place in _ENTRIES.items()}
+    entries = {name: f"{inertia[place]:.17g}" for name, place in _INERTIA_ENTRIES.items()}
     if is_sdf:
         SubElement(inertial, "mass").text = f"{mass:.17g}"
         element = SubElement(inertial, "inertia")
@@ -134,6 +136,6 @@ def nearest_possible_inertia(
     if given[0] >= 0.0 and deficit <= 0.0:
         return inertia, 0.0
     moments += max(deficit, 0.0) / 3.0 * np.array([1.0, 1.0, -1.0])
-    moments[0] += _MARGIN * largest
+    moments[0] += _TRIANGLE_INEQUALITY_MARGIN * largest
     distance = float(np.abs(moments - given).max()) / largest
     return (axes * moments) @ axes.T, distance

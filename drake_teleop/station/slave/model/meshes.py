@@ -14,14 +14,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
-from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, parse_number
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
 _READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Numbers of each dimension of a shape.
-_DIMENSIONS = {
+_DIMENSIONS_OF_SHAPE = {
     "box": {"size": 3},
     "sphere": {"radius": 1},
     "cylinder": {"radius": 1, "length": 1},
@@ -70,34 +70,33 @@ def remove_unusable_shapes(
 def _shape_fault(shape: ElementTree.Element) -> str | None:
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
-    if inner is None or kind not in _DIMENSIONS:
+    if inner is None or kind not in _DIMENSIONS_OF_SHAPE:
         return f"{kind or 'empty'} shapes cannot be read"
-    sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS[kind]
+    sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS_OF_SHAPE[kind]
     for name, count in sizes.items():
-        values = _values(inner.get(name) or inner.findtext(name))
+        values = _values_in_text(inner.get(name) or inner.findtext(name))
         if len(values) != count or not all(0.0 < value <= MAX_VALUE for value in values):
             return f"the {name} of a {kind} is no usable size"
-    scale = _values(inner.get("scale") or inner.findtext("scale"))
+    scale = _values_in_text(inner.get("scale") or inner.findtext("scale"))
     places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
     texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
-    numbers = [value for text in texts for value in _values(text)]
+    numbers = [value for text in texts for value in _values_in_text(text)]
     valid = all(scale) and all(abs(value) <= MAX_VALUE for value in numbers)
     return None if valid else "of an invalid place or scale"
 
 
-def _values(text: str | None) -> list[float]:
-    return [number(word) for word in (text or "").split()]
+def _values_in_text(text: str | None) -> list[float]:
+    return [parse_number(word) for word in (text or "").split()]
 
 
 def _mesh_fault(
     shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> str | None:
-    """Return the fault of a shape's mesh as text; without a fault, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
     address = (mesh.get("filename") or mesh.findtext("uri") or "").strip()
-    file = files.file(address, model.resolve().parent)
+    file = files.find_file(address, model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
     if not files.may_read(file):
@@ -158,14 +157,14 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
         parent = joint.parent_body()
         on_world = parent.index() == plant.world_body().index()
         if not isinstance(joint, WeldJoint):
-            _add_stick(plant, joint.frame_on_child(), _in_body(end, body, inboard), body)
+            _add_stick(plant, joint.frame_on_child(), _pose_in_body(end, body, inboard), body)
             end = joint.frame_on_parent()
         elif on_world:
-            _add_stick(plant, body.body_frame(), _in_body(end, body, inboard), body)
+            _add_stick(plant, body.body_frame(), _pose_in_body(end, body, inboard), body)
         body = parent
 
 
-def _in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
+def _pose_in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
     """Return the pose X_BodyFrame of a frame on the body, or on a body welded to it."""
     pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
     while on.index() != body.index():

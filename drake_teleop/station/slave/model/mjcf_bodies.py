@@ -22,19 +22,25 @@ from drake_teleop.station.slave.model.mjcf_elements import (
 from drake_teleop.station.slave.model.mjcf_masses import (
     NO_MASS,
     MassProperties,
-    combined,
+    combine_properties,
     fitted_shape,
     mesh_properties,
-    primitive,
+    primitive_properties,
 )
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
 
 # Elements that generate bodies or joints.
-_GENERATORS = ("replicate", "attach", "composite", "flexcomp")
-_DENSITY = 1000.0  # kg/m^3, default of MuJoCo
+_GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
+_DEFAULT_DENSITY = 1000.0  # kg/m^3, default of MuJoCo
 _UNSUPPORTED_SHAPES = ("hfield", "sdf")
-_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # numbers in size
-_ROUND = ("capsule", "cylinder")
+_NUM_SIZES_OF_SHAPE = {
+    "sphere": 1,
+    "capsule": 2,
+    "cylinder": 2,
+    "ellipsoid": 3,
+    "box": 3,
+}  # numbers in size
+_ROUND_SHAPES = ("capsule", "cylinder")
 _MAX_VISIBLE_GROUP = 2  # as in MuJoCo and Drake
 _Array = NDArray[np.float64]
 
@@ -58,7 +64,7 @@ class Joint:
         turn = RotationMatrix(AngleAxis(q - self.ref, self.axis))
         return RigidTransform(turn, self.anchor - turn @ self.anchor)
 
-    def moved(self, X: RigidTransform) -> Joint:
+    def in_other_axes(self, X: RigidTransform) -> Joint:
         """Return the joint with anchor and axis in other axes."""
         anchor, axis = X @ self.anchor, X.rotation() @ self.axis
         limits, ref = self.limits, self.ref
@@ -76,17 +82,17 @@ class Geom:
     mesh: Mesh | None
 
     @property
-    def touches(self) -> bool:
+    def takes_part_in_contacts(self) -> bool:
         """Whether the shape takes part in contacts."""
-        return touches(self.attributes)
+        return takes_part_in_contacts(self.attributes)
 
     @property
-    def visible(self) -> bool:
+    def is_visible(self) -> bool:
         """Whether MuJoCo shows the shape by default."""
         return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GROUP
 
 
-def touches(shape: Attributes) -> bool:
+def takes_part_in_contacts(shape: Attributes) -> bool:
     """Return whether a shape takes part in contacts."""
     return any(shape.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
 
@@ -105,9 +111,9 @@ class Body:
     generators: list[str] = field(default_factory=list)
     is_auxiliary: bool = False  # a body that the file does not have
 
-    def all(self) -> list[Body]:
+    def with_descendants(self) -> list[Body]:
         """Return the body and all bodies on it."""
-        return [self, *(body for child in self.children for body in child.all())]
+        return [self, *(body for child in self.children for body in child.with_descendants())]
 
     def path_to(self, name: str) -> list[Body]:
         """Return the bodies from this one to a body, or an empty list."""
@@ -130,7 +136,7 @@ class BodyReader:
         """Remove the bodies from the world; return them with `childclass` and pose of the frame."""
         found = []
 
-        def collect(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
+        def collect_bodies(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
             childclass = parent.get("childclass") or childclass
             for child in list(parent):
                 if child.tag == "body":
@@ -138,10 +144,10 @@ class BodyReader:
                     parent.remove(child)
                 elif child.tag == "frame":
                     attributes = Attributes(child.attrib, "frame", self._mjcf.report)
-                    collect(child, childclass, X_WF @ self._mjcf.pose(attributes))
+                    collect_bodies(child, childclass, X_WF @ self._mjcf.pose(attributes))
 
         for element in self._mjcf.root.findall("worldbody"):
-            collect(element, "", RigidTransform())
+            collect_bodies(element, "", RigidTransform())
         return found
 
     def read_world(self) -> Body:
@@ -151,16 +157,16 @@ class BodyReader:
             self._read_content(world, element, element.get("childclass", ""), RigidTransform())
         return world
 
-    def read(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
+    def read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
         """Return a body, in a frame of its parent, with all bodies on it."""
-        name = element.get("name") or self._invent("body")
+        name = element.get("name") or self._invent_name("body")
         attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
         body = Body(name, X_PF @ self._mjcf.pose(attributes))
         childclass = element.get("childclass") or childclass
         self._read_content(body, element, childclass, RigidTransform())
         return body
 
-    def _invent(self, stem: str) -> str:
+    def _invent_name(self, stem: str) -> str:
         for number in self._counters.setdefault(stem, count(1)):
             if (name := f"{stem}_{number}") not in self._names:
                 break
@@ -175,47 +181,56 @@ class BodyReader:
                 inner = child.get("childclass") or childclass
                 self._read_content(body, child, inner, X_BF @ self._mjcf.pose(attributes))
             elif child.tag == "body":
-                body.children.append(self.read(child, childclass, X_BF))
+                body.children.append(self.read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
-                body.joints.append(self._joint(body, attributes, child.tag).moved(X_BF))
+                body.joints.append(
+                    self._read_joint(body, attributes, child.tag).in_other_axes(X_BF)
+                )
             elif child.tag == "geom":
                 self._add_geom(body, attributes, X_BF)
             elif child.tag == "site":
                 body.sites[child.get("name", "")] = X_BF @ self._mjcf.pose(attributes)
             elif child.tag == "inertial":
-                body.inertial = self._inertial(body, attributes).transformed(X_BF)
-            elif child.tag in _GENERATORS:
+                body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
+            elif child.tag in _GENERATOR_TAGS:
                 body.generators.append(child.tag)
 
-    def _joint(self, body: Body, given: Attributes, tag: str) -> Joint:
-        name = given.get("name") or self._invent(f"{body.name}_joint")
+    def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:
+        name = given.get("name") or self._invent_name(f"{body.name}_joint")
         given.label = f"joint {name}"
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
         if np.linalg.norm(axis) < MIN_LENGTH:
-            self._mjcf.report.refuse(f"joint {name}: its axis is 0")
+            self._mjcf.report.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.limits("range", "limited", automatic=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
         if kind == "hinge":
-            limits = limits and (self._mjcf.angle(limits[0]), self._mjcf.angle(limits[1]))
-            ref = self._mjcf.angle(ref)
+            limits = limits and (
+                self._mjcf.angle_in_rad(limits[0]),
+                self._mjcf.angle_in_rad(limits[1]),
+            )
+            ref = self._mjcf.angle_in_rad(ref)
         anchor = given.vector("pos", (0.0, 0.0, 0.0))
         return Joint(name, kind, anchor, axis / np.linalg.norm(axis), given, limits, ref)
 
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
         X_FG, size = self._mjcf.pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
-        if "fromto" in given and kind in (*_ROUND, "box", "ellipsoid"):
+        if "fromto" in given and kind in (*_ROUND_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(rotation_to(ends[0] - ends[1]), ends.mean(axis=0))
             half = float(np.linalg.norm(ends[0] - ends[1])) / 2
-            size = [size[0], half, 0.0] if kind in _ROUND else [size[0], size[0], half]
+            size = [size[0], half, 0.0] if kind in _ROUND_SHAPES else [size[0], size[0], half]
         found = self.meshes.find(name) if name else None
         mesh, fault = (None, found) if isinstance(found, str) else (found, "")
         if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
-        elif kind in _SIZES and not name and min(size[: _SIZES[kind]]) <= 0.0:
+        elif (
+            kind in _NUM_SIZES_OF_SHAPE
+            and not name
+            and min(size[: _NUM_SIZES_OF_SHAPE[kind]]) <= 0.0
+        ):
             fault = "shapes need a size above 0"
         if fault:
             self.lost.setdefault(fault, []).append((body, given))
@@ -229,26 +244,26 @@ class BodyReader:
                 return
             X_FG, mesh = X_FG @ X_GM, None
         if given.get("shellinertia") == "true":
-            self._mjcf.report.state("solid instead of hollow shapes of", body.name)
+            self._mjcf.report.state_assumption("solid instead of hollow shapes of", body.name)
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
-    def _inertial(self, body: Body, given: Attributes) -> MassProperties:
+    def _read_inertial(self, body: Body, given: Attributes) -> MassProperties:
         mass = float(given.vector("mass", (0.0,))[0])
         if mass < 0.0:
-            self._mjcf.report.refuse(f"body {body.name}: mass {mass:g} kg is negative")
+            self._mjcf.report.add_fault(f"body {body.name}: mass {mass:g} kg is negative")
         moments = given.vector("diaginertia", (0.0, 0.0, 0.0))
         inertia = np.diag(moments)
         if "fullinertia" in given:
             xx, yy, zz, xy, xz, yz = given.vector("fullinertia", (0.0,) * 6)
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return MassProperties(mass, np.zeros(3), inertia).transformed(self._mjcf.pose(given))
+        return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.pose(given))
 
     def mass(self, body: Body) -> MassProperties:
         """Return the body's mass properties, by its `inertial` or its shapes."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
-            given = combined([self._geom_mass(geom) for geom in body.geoms])
+            given = combine_properties([self._geom_mass(geom) for geom in body.geoms])
         mass, centre, inertia = given or NO_MASS
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:
@@ -263,10 +278,14 @@ class BodyReader:
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
             return NO_MASS
         try:
-            shape = mesh_properties(geom.mesh) if geom.mesh else primitive(geom.kind, geom.size)
+            shape = (
+                mesh_properties(geom.mesh)
+                if geom.mesh
+                else primitive_properties(geom.kind, geom.size)
+            )
         except ValueError as error:
-            self._mjcf.report.repair(f"no mass of a mesh ({error}) of", geom.attributes.label)
+            self._mjcf.report.state_repair(f"no mass of a mesh ({error}) of", geom.attributes.label)
             return NO_MASS
         mass = geom.attributes.number("mass", -1.0)
-        density = geom.attributes.number("density", _DENSITY)
-        return shape.scaled(mass if mass >= 0.0 else density * shape.mass).transformed(geom.X_BG)
+        density = geom.attributes.number("density", _DEFAULT_DENSITY)
+        return shape.with_mass(mass if mass >= 0.0 else density * shape.mass).in_frame(geom.X_BG)

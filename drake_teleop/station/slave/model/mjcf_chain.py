@@ -13,40 +13,50 @@ from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 
 _MAX_NAMES = 12  # names of frames in an error: the most similar ones
-_LOOPS = ("connect", "weld", "distance")
-_INTEGRATORS = ("integrator", "muscle", "user", "dcmotor")  # dynamics whose output has no range
+_LOOP_TAGS = ("connect", "weld", "distance")
+_DYNAMICS_WITH_STATE = (
+    "integrator",
+    "muscle",
+    "user",
+    "dcmotor",
+)  # dynamics whose output has no range
 
 
 def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     """Return the world's shapes and the body that carries the sensor; state the other bodies."""
     tops = reader.take_top_bodies()
-    kind = "body" if any(sensor in _names(top, "body") for top, *_ in tops) else "site"
-    carriers = [top for top in tops if sensor in _names(top[0], kind)]
+    kind = "body" if any(sensor in _names_of_elements(top, "body") for top, *_ in tops) else "site"
+    carriers = [top for top in tops if sensor in _names_of_elements(top[0], kind)]
     if len(carriers) != 1:
-        known = {name for tag in ("body", "site") for top, *_ in tops for name in _names(top, tag)}
+        known = {
+            name
+            for tag in ("body", "site")
+            for top, *_ in tops
+            for name in _names_of_elements(top, tag)
+        }
         near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_NAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies"
         what = f"{len(carriers) or 'no'} frames are named {sensor!r}; {remedy}"
         for fault in (what, *reader.meshes.inaccessible):
-            mjcf.report.refuse(fault)
-        mjcf.report.raise_causes(mjcf.path)
+            mjcf.report.add_fault(fault)
+        mjcf.report.raise_faults(mjcf.path)
     world = reader.read_world()
     others = [
         top.get("name") or "a body without name" for top, *_ in tops if top not in carriers[0]
     ]
     for name in (*others, *world.generators):
-        mjcf.report.state("left out, because the arm does not carry it:", name)
+        mjcf.report.state_assumption("left out, because the arm does not carry it:", name)
     world.generators.clear()
-    arm = _separate_joints(reader.read(*carriers[0]))
+    arm = _separate_joints(reader.read_body(*carriers[0]))
     if kind == "site":
         measured = {site for each in mjcf.children("sensor") if (site := _force_site(each))}
         arm = _insert_site(arm, sensor, is_measured=sensor in measured)
-        mjcf.report.state("a frame of the model in place of the site", sensor)
+        mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
     return world
 
 
-def read_all(reader: BodyReader) -> Body:
+def read_world_and_bodies(reader: BodyReader) -> Body:
     """Return the world with everything on it."""
     return _separate_joints(reader.read_world())
 
@@ -59,18 +69,22 @@ def hold_joints(
     The joints of `hold` remain, because they are welded after the parsing.
     """
     moving = list[tuple[Body, Joint]]()
-    for body in world.all():
+    for body in world.with_descendants():
         joints, body.joints = body.joints, []
         for joint in joints:
             if joint.kind == "free":
                 if chain:  # a tool is welded to the sensor
-                    mjcf.report.state("welded to the world, where it may float:", body.name)
+                    mjcf.report.state_assumption(
+                        "welded to the world, where it may float:", body.name
+                    )
             elif joint.name in hold:
                 body.joints.append(joint)
             elif body not in chain:
-                mjcf.report.state("held:", joint.name)
+                mjcf.report.state_assumption("held:", joint.name)
             elif joint.kind not in ("hinge", "slide"):
-                mjcf.report.refuse(f"{joint.name} is a {joint.kind} joint; use hinges and slides")
+                mjcf.report.add_fault(
+                    f"{joint.name} is a {joint.kind} joint; use hinges and slides"
+                )
             else:
                 body.joints.append(joint)
                 moving.append((body, joint))
@@ -80,28 +94,28 @@ def hold_joints(
 def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
     """Refuse couplings between joints of the chain; state the other ones that are left out."""
     report, moving = mjcf.report, {joint.name for joint in joints}
-    carriers = _carriers(arm, {id(body) for body in chain})
+    carriers = _moving_body_of_each_body(arm, {id(body) for body in chain})
     for element in mjcf.children("equality"):
         given = mjcf.attributes(element, "", element.tag)
         ends = [given.get(name, "") for name in ("joint1", "joint2")]
         if given.get("active") == "false":
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
-            report.refuse(f"{ends[0]} moves with another joint (equality); hold one of them")
-        elif element.tag in _LOOPS and _is_loop(given, carriers):
-            report.refuse(f"its links form a loop, by {element.tag}; cut it")
+            report.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
+        elif element.tag in _LOOP_TAGS and _is_loop(given, carriers):
+            report.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
-            report.state("no effect on the arm of the equality", name)
+            report.state_assumption("no effect on the arm of the equality", name)
     for element in mjcf.children("tendon"):
         for name in (each.get("joint", "") for each in element.iter("joint")):
             if name in moving:
-                report.state("no tendon, which the model has, of", name)
+                report.state_assumption("no tendon, which the model has, of", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
-            report.state("no spring, which the model has, of", joint.name)
+            report.state_assumption("no spring, which the model has, of", joint.name)
         if joint.attributes.number("frictionloss", 0.0) != 0.0:
-            report.state("no dry friction, which the model has, of", joint.name)
+            report.state_assumption("no dry friction, which the model has, of", joint.name)
 
 
 def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
@@ -109,13 +123,15 @@ def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
     for element in (*mjcf.children("equality"), *mjcf.children("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()
-            mjcf.report.repair("no coupling, which Drake does not read from MJCF, by", name)
+            mjcf.report.state_repair("no coupling, which Drake does not read from MJCF, by", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
-            mjcf.report.repair("no spring, which Drake does not read from MJCF, of", joint.name)
+            mjcf.report.state_repair(
+                "no spring, which Drake does not read from MJCF, of", joint.name
+            )
 
 
-def _names(top: Element, tag: str) -> set[str]:
+def _names_of_elements(top: Element, tag: str) -> set[str]:
     return {each.get("name", "") for each in top.iter(tag)}
 
 
@@ -125,7 +141,6 @@ def _force_site(sensor: Element) -> str:
 
 
 def _separate_joints(body: Body) -> Body:
-    """Give each joint its own body, because Drake reads the axes of a second one wrongly."""
     body.children = [_separate_joints(child) for child in body.children]
     outer, innermost = None, body
     for joint in body.joints[:-1]:
@@ -158,24 +173,23 @@ def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
         body.children.append(Body(site, X_BS, is_auxiliary=True))
         return body
     X_SB = X_BS.inverse()
-    joints = [joint.moved(X_SB) for joint in body.joints]
+    joints = [joint.in_other_axes(X_SB) for joint in body.joints]
     inner = replace(body, X_PB=X_SB, joints=[])
     return Body(site, body.X_PB @ X_BS, joints, children=[inner], is_auxiliary=True)
 
 
-def _carriers(arm: Body, chain: set[int]) -> dict[str, str]:
+def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
 
-    def collect(body: Body, carrier: str) -> Iterator[tuple[str, str]]:
+    def collect_carriers(body: Body, carrier: str) -> Iterator[tuple[str, str]]:
         carrier = body.name if id(body) in chain and body.joints else carrier
         yield body.name, carrier
         for child in body.children:
-            yield from collect(child, carrier)
+            yield from collect_carriers(child, carrier)
 
-    return dict(collect(arm, "world"))
+    return dict(collect_carriers(arm, "world"))
 
 
 def _is_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
-    """Return whether a constraint joins parts that joints of the chain move differently."""
     ends = [given.get("body1", "world"), given.get("body2", "world")]
     if "site1" in given or not all(end == "world" or end in carriers for end in ends):
         return False  # a free or mocap body, another arm
@@ -193,41 +207,48 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
         given = mjcf.attributes(element, "", f"actuator {element.get('name', '')}")
         name = given.get("joint") or given.get("jointinparent")
         if name:
-            by_joint[name] = by_joint.get(name, 0.0) + _limit(mjcf, given, element.tag)
+            by_joint[name] = by_joint.get(name, 0.0) + _effort_limit_of_actuator(
+                mjcf, given, element.tag
+            )
     limits = {}
     for joint in joints:
         own = joint.attributes.limits(
             "actuatorfrcrange", "actuatorfrclimited", automatic=mjcf.autolimits
         )
-        limit = min(by_joint.get(joint.name, float("inf")), _largest(own))
+        limit = min(by_joint.get(joint.name, float("inf")), _effort_in_both_directions(own))
         if 0.0 < limit < float("inf"):
             limits[joint.name] = limit
     return limits
 
 
-def _limit(mjcf: Mjcf, given: Attributes, tag: str) -> float:
+def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
     gear = abs(given.numbers("gear", (1.0,))[0])
-    force = _largest(given.limits("forcerange", "forcelimited", automatic=mjcf.autolimits))
-    if (gain := _gain(given, tag)) > 0.0:
+    force = _effort_in_both_directions(
+        given.limits("forcerange", "forcelimited", automatic=mjcf.autolimits)
+    )
+    if (gain := _force_per_control(given, tag)) > 0.0:
         control = given.limits("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
-        force = min(force, gain * _largest(control))
+        force = min(force, gain * _effort_in_both_directions(control))
     return gear * force
 
 
-def _gain(given: Attributes, tag: str) -> float:
+def _force_per_control(given: Attributes, tag: str) -> float:
     """Return force by control signal; 0 if the signal is no force (position servo)."""
     if tag == "motor":
         return 1.0
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
         return 0.0
     biased = given.get("biastype", "none") != "none" and any(given.numbers("biasprm", (0.0,) * 3))
-    if biased or given.get("gaintype", "fixed") != "fixed" or given.get("dyntype") in _INTEGRATORS:
+    if (
+        biased
+        or given.get("gaintype", "fixed") != "fixed"
+        or given.get("dyntype") in _DYNAMICS_WITH_STATE
+    ):
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])
 
 
-def _largest(limits: tuple[float, float] | None) -> float:
-    """Return the effort that is available in both directions, or in the only one."""
+def _effort_in_both_directions(limits: tuple[float, float] | None) -> float:
     if limits is None:
         return float("inf")
     smaller, larger = sorted(map(abs, limits))

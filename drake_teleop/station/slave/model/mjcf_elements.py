@@ -20,12 +20,12 @@ _MAX_DEPTH = 150  # largest depth of nested elements
 MIN_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
-_ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
+_ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
-_PARTIAL = ("size", "gear", "gainprm", "biasprm", "friction")
-_ACTUATORS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
-_ACTUATORS |= {"muscle", "adhesion", "dcmotor", "plugin"}
-_MAIN = "main"  # name of the class at the top
+_EXTENDABLE_ATTRIBUTES = ("size", "gear", "gainprm", "biasprm", "friction")
+_ACTUATOR_TAGS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
+_ACTUATOR_TAGS |= {"muscle", "adhesion", "dcmotor", "plugin"}
+_MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
 
 
 class Attributes(dict[str, str]):
@@ -44,10 +44,10 @@ class Attributes(dict[str, str]):
         except ValueError:
             values = [math.nan]
         if not all(map(math.isfinite, values)):
-            self._report.refuse(f"{self.label}: {name} {self[name]!r} is not a list of numbers")
+            self._report.add_fault(f"{self.label}: {name} {self[name]!r} is not a list of numbers")
             return list(default)
         if max(map(abs, values), default=0.0) > largest:
-            self._report.refuse(f"{self.label}: {name} {self[name]!r} exceeds {largest:g}")
+            self._report.add_fault(f"{self.label}: {name} {self[name]!r} exceeds {largest:g}")
             return list(default)
         return [*values, *default[len(values) :]][: len(default)]
 
@@ -56,7 +56,7 @@ class Attributes(dict[str, str]):
         count, values = len(default), self.numbers(name, default)
         if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > MAX_VALUE:
             what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_VALUE:g}"
-            self._report.refuse(f"{self.label}: {what}")
+            self._report.add_fault(f"{self.label}: {what}")
             return np.array(default)
         return np.array(values)
 
@@ -71,7 +71,7 @@ class Attributes(dict[str, str]):
         if limited == "false" or (limited == "auto" and not (automatic and lower != upper)):
             return None
         if lower > upper:
-            self._report.refuse(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
+            self._report.add_fault(f"{self.label}: {name} from {lower:g} to {upper:g} is empty")
         return lower, upper
 
 
@@ -89,16 +89,16 @@ class Mjcf:
         for element in self.root.findall("compiler"):
             self.compiler.update(element.attrib)
         if self.compiler.get("coordinate", "local") != "local":
-            self.report.refuse("coordinate='global', which MuJoCo no longer reads either")
+            self.report.add_fault("coordinate='global', which MuJoCo no longer reads either")
         self.autolimits = self.compiler.get("autolimits", "true") == "true"
-        self._defaults: dict[str, dict[str, dict[str, str]]] = {_MAIN: {}}
+        self._defaults: dict[str, dict[str, dict[str, str]]] = {_MAIN_DEFAULT_CLASS: {}}
         for element in self.root.findall("default"):
-            self._read_defaults(element, _MAIN, self._defaults[_MAIN])
+            self._read_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
     def file(self, element: Element, name: str, folder: str) -> Path | None:
         """Return a file beside the main file, or else beside the included one."""
         places = [self.path.resolve().parent, self._folders.get(element)]
-        found = (self.files.file(name, place / folder) for place in places if place)
+        found = (self.files.find_file(name, place / folder) for place in places if place)
         return next((file for file in found if file is not None and not file.is_dir()), None)
 
     def children(self, section: str) -> Iterator[Element]:
@@ -106,45 +106,49 @@ class Mjcf:
         for element in self.root.findall(section):
             yield from element
 
-    def angle(self, value: float) -> float:
+    def angle_in_rad(self, value: float) -> float:
         """Return an angle of the file in rad."""
         degrees = self.compiler.get("angle", "degree") == "degree"
         return math.radians(value) if degrees else value
 
     def attributes(self, element: Element, childclass: str, label: str) -> Attributes:
         """Return the attributes of an element, with the defaults of its class."""
-        name = element.get("class") or childclass or _MAIN
+        name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
-            self.report.refuse(f"{label}: there is no class {name}")
-            name = _MAIN
-        kind = "actuator" if element.tag in _ACTUATORS else element.tag
+            self.report.add_fault(f"{label}: there is no class {name}")
+            name = _MAIN_DEFAULT_CLASS
+        kind = "actuator" if element.tag in _ACTUATOR_TAGS else element.tag
         defaults = self._defaults[name].get(kind, {})
-        return Attributes(_merge(defaults, element.attrib), label, self.report)
+        return Attributes(_merge_defaults(defaults, element.attrib), label, self.report)
 
     def pose(self, attributes: Attributes) -> RigidTransform:
         """Return the pose of an element in its parent, from `pos` and its orientation."""
-        return RigidTransform(self._rotation(attributes), attributes.vector("pos", (0.0,) * 3))
+        return RigidTransform(
+            self._rotation_of_element(attributes), attributes.vector("pos", (0.0,) * 3)
+        )
 
-    def _rotation(self, given: Attributes) -> RotationMatrix:
+    def _rotation_of_element(self, given: Attributes) -> RotationMatrix:
         if "quat" in given:
             quat = given.vector("quat", (1.0, 0.0, 0.0, 0.0))
             length = float(np.linalg.norm(quat))
             return RotationMatrix(Quaternion(quat / length)) if length else RotationMatrix()
         if "axisangle" in given:
             *axis, angle = given.vector("axisangle", (0.0, 0.0, 1.0, 0.0))
-            return _turn(np.array(axis), self.angle(angle))
+            return _rotation_about_axis(np.array(axis), self.angle_in_rad(angle))
         if "euler" in given:
             rotation = RotationMatrix()
             sequence = self.compiler.get("eulerseq", "xyz")
             for letter, angle in zip(sequence, given.vector("euler", (0.0,) * 3), strict=False):
-                turn = _turn(np.eye(3)["xyz".find(letter.lower())], self.angle(angle))
+                turn = _rotation_about_axis(
+                    np.eye(3)["xyz".find(letter.lower())], self.angle_in_rad(angle)
+                )
                 rotation = rotation @ turn if letter.islower() else turn @ rotation
             return rotation
         if "xyaxes" in given:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
             if np.linalg.norm(z) < MIN_LENGTH:
-                self.report.refuse(f"{given.label}: its xyaxes are parallel")
+                self.report.add_fault(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
             return RotationMatrix(columns / np.linalg.norm(columns, axis=0))
@@ -153,7 +157,6 @@ class Mjcf:
     def _insert_includes(
         self, element: Element, path: Path, included: set[Path], depth: int
     ) -> None:
-        """Replace each `include` by the content of its file; a file may be included once."""
         if depth > _MAX_DEPTH:
             what = f"its elements are nested more than {_MAX_DEPTH} deep"
             raise DrakeTeleopError(what, where=str(self.path))
@@ -168,9 +171,9 @@ class Mjcf:
             name = child.get("file", "")
             file = self.file(child, name, "")
             if file is None:
-                self.report.refuse(f"the included file {name!r} was not found")
+                self.report.add_fault(f"the included file {name!r} was not found")
             elif file.resolve() in included:
-                self.report.refuse(f"{name} is included twice")
+                self.report.add_fault(f"{name} is included twice")
             else:
                 included.add(file.resolve())
                 root = read_xml(file)
@@ -185,24 +188,24 @@ class Mjcf:
         nested = element.findall("default")
         for child in (each for each in element if each.tag != "default"):
             kind, own = child.tag, child.attrib
-            if kind in _ACTUATORS:
+            if kind in _ACTUATOR_TAGS:
                 kind, own = "actuator", {**own, "kind": child.tag}
-            values[kind] = _merge(values.get(kind, {}), own)
+            values[kind] = _merge_defaults(values.get(kind, {}), own)
         for child in nested:
             self._read_defaults(child, child.get("class", ""), dict(values))
 
 
-def _merge(defaults: dict[str, str], own: dict[str, str]) -> dict[str, str]:
-    oriented = any(name in own for name in _ORIENTATIONS)
-    merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATIONS)}
+def _merge_defaults(defaults: dict[str, str], own: dict[str, str]) -> dict[str, str]:
+    oriented = any(name in own for name in _ORIENTATION_ATTRIBUTES)
+    merged = {k: v for k, v in defaults.items() if not (oriented and k in _ORIENTATION_ATTRIBUTES)}
     for name, text in own.items():
         words = text.split()
-        rest = merged.get(name, "").split()[len(words) :] if name in _PARTIAL else []
+        rest = merged.get(name, "").split()[len(words) :] if name in _EXTENDABLE_ATTRIBUTES else []
         merged[name] = " ".join([*words, *rest]) if rest else text
     return merged
 
 
-def _turn(axis: NDArray[np.float64], angle: float) -> RotationMatrix:
+def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> RotationMatrix:
     length = float(np.linalg.norm(axis))
     return RotationMatrix(AngleAxis(angle, axis / length)) if length else RotationMatrix()
 
@@ -211,4 +214,6 @@ def rotation_to(z: NDArray[np.float64]) -> RotationMatrix:
     """Return the smallest rotation that turns the z axis to this direction (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))
-    return _turn(axis if sine else np.array([1.0, 0.0, 0.0]), math.atan2(sine, float(z[2])))
+    return _rotation_about_axis(
+        axis if sine else np.array([1.0, 0.0, 0.0]), math.atan2(sine, float(z[2]))
+    )

@@ -21,12 +21,12 @@ class MassProperties(NamedTuple):
     centre: _Array
     inertia: _Array
 
-    def transformed(self, X_BG: RigidTransform) -> MassProperties:
+    def in_frame(self, X_BG: RigidTransform) -> MassProperties:
         """Return the properties in the frame B, for properties in G."""
         R = X_BG.rotation().matrix()
         return MassProperties(self.mass, X_BG @ self.centre, R @ self.inertia @ R.T)
 
-    def scaled(self, mass: float) -> MassProperties:
+    def with_mass(self, mass: float) -> MassProperties:
         """Return the same shape with another mass."""
         ratio = mass / self.mass if self.mass else 0.0
         return MassProperties(mass, self.centre, self.inertia * ratio)
@@ -35,7 +35,7 @@ class MassProperties(NamedTuple):
 NO_MASS = MassProperties(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
-def combined(parts: list[MassProperties]) -> MassProperties:
+def combine_properties(parts: list[MassProperties]) -> MassProperties:
     """Return the mass properties of several parts of one body."""
     mass = sum(part.mass for part in parts)
     if mass <= 0.0:
@@ -43,11 +43,11 @@ def combined(parts: list[MassProperties]) -> MassProperties:
     centre = sum((part.mass * part.centre for part in parts), np.zeros(3)) / mass
     inertia = np.zeros((3, 3))
     for part in parts:
-        inertia += part.inertia + part.mass * _squared_distance(part.centre - centre)
+        inertia += part.inertia + part.mass * _inertia_of_unit_point(part.centre - centre)
     return MassProperties(mass, centre, inertia)
 
 
-def primitive(kind: str, size: list[float]) -> MassProperties:
+def primitive_properties(kind: str, size: list[float]) -> MassProperties:
     """Return the mass properties of a shape with density 1 in its own axes."""
     a, b, c = size
     if kind == "box":
@@ -82,13 +82,15 @@ def mesh_properties(mesh: Mesh) -> MassProperties:
     area = np.linalg.norm(normal, axis=1) / 2
     centre = area @ corners.mean(axis=1) / max(float(area.sum()), 1e-300)
     if mesh.inertia == "shell":
-        return _of_simplices(corners - centre, area, centre)
+        return _properties_of_simplices(corners - centre, area, centre)
     volume = _volumes(corners - centre, mesh.inertia)
     if volume.sum() <= 0.0:
         return NO_MASS
     centre = centre + volume @ (corners - centre).sum(axis=1) / 4 / volume.sum()
     # As in MuJoCo, the volumes are computed again about the centre of mass.
-    return _of_simplices(corners - centre, _volumes(corners - centre, mesh.inertia), centre, 4)
+    return _properties_of_simplices(
+        corners - centre, _volumes(corners - centre, mesh.inertia), centre, 4
+    )
 
 
 def fitted_shape(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
@@ -118,7 +120,7 @@ def fitted_shape(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(axes), centre), size
 
 
-def _of_simplices(
+def _properties_of_simplices(
     corners: _Array, weight: _Array, centre: _Array, count: int = 3
 ) -> MassProperties:
     """Sum triangles (count 3), or tetrahedra from the centre (count 4), by weight (m,)."""
@@ -135,6 +137,6 @@ def _volumes(corners: _Array, mode: str) -> _Array:
     return np.abs(volume) if mode == "legacy" else volume
 
 
-def _squared_distance(p: _Array) -> _Array:
+def _inertia_of_unit_point(p: _Array) -> _Array:
     """Return the inertia (3, 3) of a unit point mass at p."""
     return np.asarray(p @ p * np.eye(3) - np.outer(p, p))

@@ -12,18 +12,18 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 from drake_teleop.station.slave.model.triangles import (
     Triangles,
-    checked_triangles,
+    check_triangles,
     convex_hull,
     obj_text,
     read_triangles,
 )
 
-_NOT_FOUND = "meshes were not found (--package-path, slave.package_paths)"
-_OUTSIDE = (
+_NOT_FOUND_FAULT = "meshes were not found (--package-path, slave.package_paths)"
+_OUTSIDE_FAULT = (
     "{kind} files in {folder} are outside the model's folder and its packages"
     " (name their folder: --package-path, slave.package_paths)"
 )
-_UNREADABLE = "meshes cannot be read (convert them to .obj or .stl)"
+_UNREADABLE_FAULT = "meshes cannot be read (convert them to .obj or .stl)"
 
 
 class Mesh:
@@ -40,7 +40,7 @@ class Mesh:
         self._triangles: Triangles | None = None
 
     @property
-    def is_plain(self) -> bool:
+    def is_readable_by_drake(self) -> bool:
         """Whether Drake reads the file without conversion."""
         unmoved = self._X_FM.IsExactlyIdentity() and bool((self._scale == 1.0).all())
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
@@ -51,24 +51,24 @@ class Mesh:
             if self.file is not None:
                 vertices, faces = read_triangles(self.file)
             else:
-                vertices, faces = checked_triangles(_read_inline(self._attributes))
+                vertices, faces = check_triangles(_read_inline(self._attributes))
             moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
             if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
                 faces = faces[:, ::-1]
             self._triangles = Triangles(moved, faces)
         return self._triangles
 
-    def obj(self, folder: Path) -> Path:
+    def write_obj(self, folder: Path) -> Path:
         """Return an .obj file for Drake, converted into `folder` if necessary."""
-        if self.file is not None and self.is_plain:
+        if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()
-        return self._write(self.triangles(), folder)
+        return self._write_triangles(self.triangles(), folder)
 
-    def hull(self, folder: Path) -> Path:
+    def write_hull(self, folder: Path) -> Path:
         """Return an .obj file in `folder` with the convex hull (collision shape)."""
-        return self._write(convex_hull(self.triangles().vertices), folder)
+        return self._write_triangles(convex_hull(self.triangles().vertices), folder)
 
-    def _write(self, triangles: Triangles, folder: Path) -> Path:
+    def _write_triangles(self, triangles: Triangles, folder: Path) -> Path:
         number = len(list(folder.iterdir()))
         path = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)[:40]}.obj"
         path.write_text(obj_text(triangles))
@@ -85,26 +85,26 @@ class MeshLibrary:
         for element in mjcf.children("asset"):
             label = f"{element.tag} {element.get('name') or element.get('file', '')}"
             attributes = mjcf.attributes(element, "", label)
-            file, fault = self._find(element, attributes)
+            file, fault = self._load_mesh(element, attributes)
             if element.tag == "mesh":
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
 
     def find(self, name: str) -> Mesh | str:
         """Return a mesh, or its fault as text."""
-        mesh = self._meshes.get(name, _NOT_FOUND)
-        if isinstance(mesh, Mesh) and not mesh.is_plain:
+        mesh = self._meshes.get(name, _NOT_FOUND_FAULT)
+        if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:
             try:
                 mesh.triangles()
             except ValueError:
                 suffix = f"{mesh.file.suffix} " if mesh.file is not None else ""
-                self._meshes[name] = mesh = f"{suffix}{_UNREADABLE}"
+                self._meshes[name] = mesh = f"{suffix}{_UNREADABLE_FAULT}"
         return mesh
 
-    def _find(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
+    def _load_mesh(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
         name = attributes.get("file", "")
         if not name:
-            return None, "" if "vertex" in attributes else _UNREADABLE
+            return None, "" if "vertex" in attributes else _UNREADABLE_FAULT
         compiler = self._mjcf.compiler
         if compiler.get("strippath") == "true":
             name = re.split(r"[/\\]", name)[-1]
@@ -112,7 +112,7 @@ class MeshLibrary:
         folder = compiler.get(own, compiler.get("assetdir", ""))
         file = self._mjcf.file(element, name, folder)
         if file is None:
-            return None, _NOT_FOUND
+            return None, _NOT_FOUND_FAULT
         if self._mjcf.files.may_read(file):
             try:
                 self._mjcf.files.check(file)
@@ -120,7 +120,7 @@ class MeshLibrary:
                 self.inaccessible.append(str(error))
                 return None, str(error)
         else:
-            fault = _OUTSIDE.format(kind=element.tag, folder=file.resolve().parent)
+            fault = _OUTSIDE_FAULT.format(kind=element.tag, folder=file.resolve().parent)
             self.inaccessible.append(fault)
             return None, fault
         return file, ""

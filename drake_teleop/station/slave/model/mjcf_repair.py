@@ -13,13 +13,13 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia, possible_inertia
-from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, touches
+from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, takes_part_in_contacts
 from drake_teleop.station.slave.model.mjcf_chain import (
     check_couplings,
     effort_limits,
     hold_joints,
-    read_all,
     read_arm,
+    read_world_and_bodies,
     report_couplings,
 )
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
@@ -27,13 +27,13 @@ from drake_teleop.station.slave.model.mjcf_masses import NO_MASS
 from drake_teleop.station.slave.model.mjcf_text import MjcfText
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, join_names
-from drake_teleop.station.slave.model.urdf_repair import Purpose
+from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
 _GRAVITY, _GRAVITY_TOLERANCE = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 
 
 def repair_mjcf(
-    root: Element, path: Path, files: ModelFiles, purpose: Purpose, folder: Path
+    root: Element, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
     """Return the text of an MJCF file that Drake reads, with meshes converted in `folder`.
 
@@ -43,15 +43,15 @@ def repair_mjcf(
     mjcf = Mjcf(root, path, files, report)
     reader = BodyReader(mjcf)
     if not root.get("model"):
-        report.state("the model is named after its file:", path.stem)
+        report.state_assumption("the model is named after its file:", path.stem)
     for option in root.findall("option"):
         gravity = Attributes(option.attrib, "option", report).vector("gravity", _GRAVITY)
         if np.abs(np.subtract(gravity, _GRAVITY)).max() > _GRAVITY_TOLERANCE:
-            report.state("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
+            report.state_assumption("gravity of 9.81 m/s^2 instead of", option.get("gravity", ""))
     is_complete = purpose.is_scene or purpose.in_directives
     if is_complete or not purpose.sensor:
-        world = read_all(reader)
-        chain = world.all() if is_complete else []
+        world = read_world_and_bodies(reader)
+        chain = world.with_descendants() if is_complete else []
     else:
         world = read_arm(mjcf, reader, purpose.sensor)
         chain = world.path_to(purpose.sensor)
@@ -63,48 +63,49 @@ def repair_mjcf(
         check_couplings(world, chain, [joint for _, joint in moving], mjcf)
     if purpose.is_tool and world.geoms:
         world.geoms.clear()
-        report.state("left out, because the tool does not carry them: shapes of", "the world")
+        report.state_assumption(
+            "left out, because the tool does not carry them: shapes of", "the world"
+        )
     joints = [joint for _, joint in moving if joint.kind in ("hinge", "slide")]
     _check_bodies(world, report)
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _state_lost_shapes(reader, report)
-    report.raise_causes(path)
+    report.raise_faults(path)
     text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
-    report.raise_causes(path)
-    auxiliary = frozenset(body.name for body in world.all() if body.is_auxiliary)
+    report.raise_faults(path)
+    auxiliary = frozenset(body.name for body in world.with_descendants() if body.is_auxiliary)
     return RepairedModel(text, report.assumptions, limits, auxiliary=auxiliary)
 
 
 def _check_bodies(world: Body, report: RepairReport) -> None:
-    bodies = world.all()
+    bodies = world.with_descendants()
     for body in bodies:
         for tag in body.generators:
-            report.refuse(f"{body.name} contains <{tag}>, which is not supported; expand it")
+            report.add_fault(f"{body.name} contains <{tag}>, which is not supported; expand it")
     for kind, names in (
         ("bodies", [body.name for body in bodies]),
         ("joints", [joint.name for body in bodies for joint in body.joints]),
     ):
         twice = sorted(name for name, number in Counter(names).items() if number > 1)
         if twice:
-            report.refuse(f"several {kind} are named {join_names(twice)}")
+            report.add_fault(f"several {kind} are named {join_names(twice)}")
 
 
 def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -> None:
-    """Set the masses of all bodies; `moving` are the bodies with joints of the chain, by id."""
     total = mjcf.compiler.number("settotalmass", -1.0)
-    factor = total / _file_mass(mjcf) if total > 0.0 else 1.0
+    factor = total / _total_mass_in_file(mjcf) if total > 0.0 else 1.0
 
-    def apply(body: Body, is_moved: bool) -> None:
+    def set_masses_below(body: Body, is_moved: bool) -> None:
         is_moved |= id(body) in moving
         _set_mass(body, reader, factor, mjcf.report, is_moved=is_moved)
         if id(body) in moving and body.inertial is NO_MASS and not body.is_auxiliary:
-            mjcf.report.state("no inertia of", body.name)
+            mjcf.report.state_assumption("no inertia of", body.name)
         for child in body.children:
-            apply(child, is_moved)
+            set_masses_below(child, is_moved)
 
     for body in world.children:
-        apply(body, is_moved=False)
+        set_masses_below(body, is_moved=False)
 
 
 def _set_mass(
@@ -115,10 +116,10 @@ def _set_mass(
     properties = reader.mass(body)
     if properties.mass <= 0.0:
         if is_moved and properties.inertia.any():
-            report.repair("an inertia without a mass left out of", body.name)
+            report.state_repair("an inertia without a mass left out of", body.name)
         body.inertial = NO_MASS
         return
-    properties = properties.scaled(factor * properties.mass)
+    properties = properties.with_mass(factor * properties.mass)
     inertia = (
         possible_inertia(properties.inertia, body.name, report)
         if is_moved
@@ -127,14 +128,14 @@ def _set_mass(
     body.inertial = properties._replace(inertia=inertia)
 
 
-def _file_mass(mjcf: Mjcf) -> float:
+def _total_mass_in_file(mjcf: Mjcf) -> float:
     reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
-    mass = sum(reader.mass(body).mass for body in reader.read_world().all()[1:])
+    mass = sum(reader.mass(body).mass for body in reader.read_world().with_descendants()[1:])
     return mass if mass > 0.0 else np.inf
 
 
 def _state_lost_shapes(reader: BodyReader, report: RepairReport) -> None:
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
-            if touches(shape) or not body.geoms:
-                report.repair(f"{fault}; shapes are missing of", body.name)
+            if takes_part_in_contacts(shape) or not body.geoms:
+                report.state_repair(f"{fault}; shapes are missing of", body.name)

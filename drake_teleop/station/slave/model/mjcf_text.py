@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from drake_teleop.station.slave.model.mjcf_bodies import Body, Geom, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Mjcf
 from drake_teleop.station.slave.model.mjcf_meshes import Mesh
-from drake_teleop.station.slave.model.urdf_repair import Purpose
+from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
 
 class MjcfText:
@@ -21,7 +21,7 @@ class MjcfText:
     Contact shapes are convex hulls, as in MuJoCo, except in a scene.
     """
 
-    def __init__(self, mjcf: Mjcf, purpose: Purpose, folder: Path) -> None:
+    def __init__(self, mjcf: Mjcf, purpose: ModelPurpose, folder: Path) -> None:
         self._mjcf, self._purpose, self._folder = mjcf, purpose, folder
         name = mjcf.root.get("model") or mjcf.path.stem
         self._root = Element("mujoco", model=name)
@@ -39,7 +39,7 @@ class MjcfText:
         """Return the text of a world; `moving` get actuators, which carry their rotor inertia."""
         top = SubElement(self._root, "worldbody")
         self._write_content(top, world)
-        names = {body.name for body in world.all()}
+        names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
         for each in self._mjcf.children("contact"):
             ends = {name: each.get(name, "") for name in ("body1", "body2")}
@@ -54,15 +54,15 @@ class MjcfText:
         for joint in body.joints:
             self._write_joint(element, joint)
         for geom in body.geoms if self._purpose.has_geometry else ():
-            if geom.touches or geom.visible:
+            if geom.takes_part_in_contacts or geom.is_visible:
                 self._write_geom(element, geom, body)
         for child in body.children:
-            inner = SubElement(element, "body", {"name": child.name, **_pose(child.X_PB)})
+            inner = SubElement(element, "body", {"name": child.name, **_format_pose(child.X_PB)})
             if child.inertial is not None and child.inertial.mass > 0.0:
                 mass, centre, inertia = child.inertial
                 entries = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
-                values = {"mass": repr(mass), "fullinertia": _text(entries)}
-                SubElement(inner, "inertial", {"pos": _text(centre), **values})
+                values = {"mass": repr(mass), "fullinertia": _format_numbers(entries)}
+                SubElement(inner, "inertial", {"pos": _format_numbers(centre), **values})
             if self._purpose.is_tool and body.name == "world":
                 SubElement(inner, "freejoint")
             self._write_content(inner, child)
@@ -71,53 +71,59 @@ class MjcfText:
         if joint.kind == "free":
             SubElement(element, "freejoint", name=joint.name)
             return
-        values = {"name": joint.name, "type": joint.kind, "pos": _text(joint.anchor)}
-        values |= {"axis": _text(joint.axis), "ref": repr(joint.ref), "limited": "false"}
+        values = {"name": joint.name, "type": joint.kind, "pos": _format_numbers(joint.anchor)}
+        values |= {"axis": _format_numbers(joint.axis), "ref": repr(joint.ref), "limited": "false"}
         if joint.limits is not None:
-            values |= {"limited": "true", "range": _text(joint.limits)}
+            values |= {"limited": "true", "range": _format_numbers(joint.limits)}
         damping = joint.attributes.number("damping", 0.0)
         if damping < 0.0:
-            self._mjcf.report.state("no damping, instead of a negative one, of", joint.name)
+            self._mjcf.report.state_assumption(
+                "no damping, instead of a negative one, of", joint.name
+            )
         values["damping"] = repr(max(damping, 0.0))
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)
 
     def _write_geom(self, element: Element, geom: Geom, body: Body) -> None:
-        given, values = geom.attributes, {"type": geom.kind, "mass": "0", **_pose(geom.X_BG)}
+        given, values = geom.attributes, {"type": geom.kind, "mass": "0", **_format_pose(geom.X_BG)}
         if "friction" in given:
             values["friction"] = repr(given.numbers("friction", (1.0,))[0])
         if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
             values["rgba"] = rgba
         seen, felt = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
-        if geom.mesh is None or self._purpose.is_scene or not geom.touches:
-            values |= {} if geom.touches else seen
-            values |= {} if geom.visible else felt
-            shape = {"size": _text(geom.size)} if geom.mesh is None else self._mesh(geom.mesh)
+        if geom.mesh is None or self._purpose.is_scene or not geom.takes_part_in_contacts:
+            values |= {} if geom.takes_part_in_contacts else seen
+            values |= {} if geom.is_visible else felt
+            shape = (
+                {"size": _format_numbers(geom.size)}
+                if geom.mesh is None
+                else self._mesh_asset(geom.mesh)
+            )
             SubElement(element, "geom", {**values, **shape})
             return
-        if geom.visible:
-            SubElement(element, "geom", {**values, **seen, **self._mesh(geom.mesh)})
+        if geom.is_visible:
+            SubElement(element, "geom", {**values, **seen, **self._mesh_asset(geom.mesh)})
         try:
-            hull = self._mesh(geom.mesh, hull=True)
+            hull = self._mesh_asset(geom.mesh, hull=True)
         except ValueError as error:
             fault = f"a mesh has {error}; shapes are missing of"
-            self._mjcf.report.repair(fault, body.name)
+            self._mjcf.report.state_repair(fault, body.name)
         else:
             SubElement(element, "geom", {**values, **felt, **hull})
 
-    def _mesh(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
+    def _mesh_asset(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
         key = id(mesh), hull
         if key not in self._meshes:
-            file = mesh.hull(self._folder) if hull else mesh.obj(self._folder)
+            file = mesh.write_hull(self._folder) if hull else mesh.write_obj(self._folder)
             self._meshes[key] = f"mesh_{len(self._meshes)}"
             SubElement(self._assets, "mesh", name=self._meshes[key], file=str(file))
         return {"mesh": self._meshes[key]}
 
 
-def _text(values: Iterable[float]) -> str:
+def _format_numbers(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _pose(X: RigidTransform) -> dict[str, str]:
+def _format_pose(X: RigidTransform) -> dict[str, str]:
     quaternion = X.rotation().ToQuaternion().wxyz()
-    return {"pos": _text(X.translation()), "quat": _text(quaternion)}
+    return {"pos": _format_numbers(X.translation()), "quat": _format_numbers(quaternion)}

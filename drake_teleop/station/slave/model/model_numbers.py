@@ -14,10 +14,10 @@ _LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "specular", 
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
 _QUANTITY_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
 _QUANTITY_TAGS |= {"radius", "radii", "length", "scale", "drake:rotor_inertia", "drake:gear_ratio"}
-_MOVING = ("revolute", "continuous", "prismatic")
+_MOVING_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 
 
-def number(text: str | None) -> float:
+def parse_number(text: str | None) -> float:
     """Return the number in a text, or NaN."""
     try:
         return float(text or "")
@@ -42,18 +42,18 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
             continue
         if inner.tag == "origin":
             for name, text in inner.attrib.items():
-                if len(text.split()) != 3 or any(math.isnan(number(x)) for x in text.split()):
-                    report.refuse(f"{where}: origin {name}={text!r} is no list of three numbers")
+                if len(text.split()) != 3 or any(math.isnan(parse_number(x)) for x in text.split()):
+                    report.add_fault(f"{where}: origin {name}={text!r} is no list of three numbers")
         for word in " ".join([inner.text or "", *map(str, inner.attrib.values())]).split():
-            value = number(word)
+            value = parse_number(word)
             if math.isnan(value) and word.lower().strip("+-") != "nan":
                 continue  # a name; Drake reports an invalid number
             if not abs(value) <= MAX_VALUE:
-                report.refuse(
+                report.add_fault(
                     f"{where}: {inner.tag} {word} is no finite number up to {MAX_VALUE:g}"
                 )
             if inner.tag == "drake:rotor_inertia" and value < 0.0:
-                report.refuse(f"{where}: a rotor inertia of {word} kg m^2 is negative")
+                report.add_fault(f"{where}: a rotor inertia of {word} kg m^2 is negative")
 
 
 def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_chain: bool) -> None:
@@ -63,9 +63,9 @@ def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_cha
     for end in ("parent", "child"):
         link = joint_end(joint, end)
         if not link:
-            report.refuse(f"{where} has no {end} link")
+            report.add_fault(f"{where} has no {end} link")
         elif link not in links and link != WORLD and "::" not in link and in_chain:
-            report.refuse(f"{where}: its {end} link {link!r} does not exist")
+            report.add_fault(f"{where}: its {end} link {link!r} does not exist")
     check_quantities(joint, where, report)
     if joint.get("type") == "fixed":
         for mimic in joint.findall("mimic"):
@@ -81,22 +81,22 @@ def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_cha
 
 def _check_independent(joint: Element, where: str, report: RepairReport) -> None:
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
-    if kind not in _MOVING:
+    if kind not in _MOVING_JOINT_TYPES:
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
-        report.refuse(
+        report.add_fault(
             f"{name} is a {kind} joint{between}; up to the sensor, use joints that turn about one"
             " axis or slide along it"
         )
     elif joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
-        report.refuse(
+        report.add_fault(
             f"{name} moves with another joint (mimic); remove the tag, or fix the joint by"
             " slave.hold"
         )
     axis = joint.find("axis")
     text = None if axis is None else axis.get("xyz") or axis.findtext("xyz")
-    values = [number(word) for word in (text or "1 0 0").split()]
+    values = [parse_number(word) for word in (text or "1 0 0").split()]
     if len(values) != 3 or not all(map(math.isfinite, values)) or not any(values):
-        report.refuse(f"{where}: axis {text!r} is no direction; give three numbers")
+        report.add_fault(f"{where}: axis {text!r} is no direction; give three numbers")
 
 
 def _check_limit(limit: Element, where: str, report: RepairReport) -> None:
@@ -106,30 +106,30 @@ def _check_limit(limit: Element, where: str, report: RepairReport) -> None:
         if not text:
             limit.attrib.pop(name, None)
             continue
-        values[name] = number(text)
+        values[name] = parse_number(text)
         if math.isnan(values[name]):
-            report.refuse(f"{where}: {name} limit {text.strip()!r} is not a number")
+            report.add_fault(f"{where}: {name} limit {text.strip()!r} is not a number")
         elif name in ("velocity", "effort") and values[name] < 0.0:
             # In SDF, -1 means no limit.
             if limit.get(name) is not None or values[name] != -1.0:
-                report.refuse(f"{where}: {name} limit {values[name]:g} is negative")
+                report.add_fault(f"{where}: {name} limit {values[name]:g} is negative")
         elif math.isinf(values[name]) and limit.get(name) is not None:
             del limit.attrib[name]  # the missing limit is stated
     lower, upper = values.get("lower", -math.inf), values.get("upper", math.inf)
     if lower > upper:
-        report.refuse(f"{where}: lower limit {lower:g} is above upper limit {upper:g}")
+        report.add_fault(f"{where}: lower limit {lower:g} is above upper limit {upper:g}")
 
 
 def _check_dynamics(dynamics: Element, name: str, report: RepairReport) -> None:
     damping, friction = (
-        number(dynamics.get(what) or dynamics.findtext(what) or "0")
+        parse_number(dynamics.get(what) or dynamics.findtext(what) or "0")
         for what in ("damping", "friction")
     )
     if friction != 0.0:
-        report.state("no dry friction, which the model has, of", name)
+        report.state_assumption("no dry friction, which the model has, of", name)
         dynamics.attrib.pop("friction", None)
     if not damping >= 0.0:
-        report.repair("damping 0 in place of a negative or unreadable one for", name)
+        report.state_repair("damping 0 in place of a negative or unreadable one for", name)
         dynamics.attrib.pop("damping", None)
         for inner in dynamics.findall("damping"):
             dynamics.remove(inner)

@@ -27,13 +27,28 @@ from drake_teleop.common.texts import read_yaml
 _MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
 _MAX_NAME_LENGTH = 4096
 _MAX_DEPTH = 20  # largest depth of nested includes
-_BINARY = (".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae")
-_PACKAGE = "package.xml"
-_ATTRIBUTE = re.compile(r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z")
-_ELEMENT = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
-_FOLDERS = ("meshdir", "texturedir", "assetdir")  # search folders of MJCF
-_MTL = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(.*)$", re.M)
-_OBJ = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.M)
+_BINARY_SUFFIXES = (
+    ".obj",
+    ".glb",
+    ".bin",
+    ".stl",
+    ".vtk",
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".ktx2",
+    ".dae",
+)
+_PACKAGE_FILE_NAME = "package.xml"
+_FILE_ATTRIBUTE_PATTERN = re.compile(
+    r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z"
+)
+_FILE_ELEMENT_PATTERN = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
+_FOLDER_ATTRIBUTES = ("meshdir", "texturedir", "assetdir")  # search folders of MJCF
+_MTL_REFERENCE_PATTERN = re.compile(
+    rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(.*)$", re.M
+)
+_OBJ_REFERENCE_PATTERN = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.M)
 
 
 class ModelFiles:
@@ -49,10 +64,10 @@ class ModelFiles:
             if folder.is_dir():
                 self.packages.setdefault(folder.name, folder.resolve())
         around = [self._folder, *self._folder.parents]
-        own = [folder for folder in around if os.path.isfile(folder / _PACKAGE)]
+        own = [folder for folder in around if os.path.isfile(folder / _PACKAGE_FILE_NAME)]
         text = model.read_bytes().decode("utf-8", errors="replace")
         for name in set(re.findall(r"(?:package|model)://([^/\s\"'<]+)", text)):
-            beside = [each for each in around if os.path.isfile(each / name / _PACKAGE)]
+            beside = [each for each in around if os.path.isfile(each / name / _PACKAGE_FILE_NAME)]
             inside = [self._folder] if os.path.isdir(self._folder / name) else []
             named = [each for each in own if each.name == name]
             for folder in (*(each / name for each in inside), *named, *(e / name for e in beside)):
@@ -72,7 +87,7 @@ class ModelFiles:
             known.Add(name, str(folder))
         self.packages = {n: Path(known.GetPath(n)).resolve() for n in known.GetPackageNames()}
 
-    def file(self, address: str, folder: Path | None = None) -> Path | None:
+    def find_file(self, address: str, folder: Path | None = None) -> Path | None:
         """Return the existing file or folder at an address, or None.
 
         The address is package://, model://, file:// or a path relative to `folder`, by default the
@@ -97,12 +112,11 @@ class ModelFiles:
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
             self._sizes.clear()
-            files, size = self._size(path, ())
+            files, size = self._check_and_measure(path, ())
         self._total = self._total[0] + files, self._total[1] + size
         _check_size(*self._total, self._model)
 
-    def _size(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
-        """Check a file; return the number of files and bytes that reading it takes."""
+    def _check_and_measure(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read(real):
             raise DrakeTeleopError(
@@ -123,7 +137,7 @@ class ModelFiles:
             files, size = 1, real.stat().st_size
             _check_size(files, size, path)
             for named in list(self._referenced_files(real)):
-                more = self._size(named, (*including, real))
+                more = self._check_and_measure(named, (*including, real))
                 files, size = files + more[0], size + more[1]
                 _check_size(files, size, path)
             self._sizes[real] = files, size
@@ -139,7 +153,7 @@ class ModelFiles:
                 if len(address) > _MAX_NAME_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
                     what = f"names a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
-                named = {self.file(address, folder) for folder in folders}
+                named = {self.find_file(address, folder) for folder in folders}
                 found = {file for each in named for file in _existing_paths(each)}
                 yield from (each for each in found if each != path.parent)
         except OSError as error:
@@ -156,16 +170,18 @@ class ModelFiles:
             if self._model.suffix.lower() == ".xml":  # `MeshLibrary` checks the assets
                 yield from (e.get("file", "") for e in root.iter("include"))
                 return
-            self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDERS}
+            self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDER_ATTRIBUTES}
             yield from _addresses_in_xml(
                 root, meshes=path != self._model.resolve() or kind == ".xml"
             )
         elif kind in (".yaml", ".yml"):
-            yield from added_models(read_yaml(path, tagged=True))
+            yield from addresses_in_directives(read_yaml(path, tagged=True))
         elif kind in (".gltf", ".glb"):
             yield from _addresses_in_gltf(path)
         elif kind in (".obj", ".mtl"):
-            for line in (_OBJ if kind == ".obj" else _MTL).findall(path.read_bytes()):
+            for line in (
+                _OBJ_REFERENCE_PATTERN if kind == ".obj" else _MTL_REFERENCE_PATTERN
+            ).findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
 
@@ -180,7 +196,6 @@ def _is_installed_package(folder: Path) -> bool:
 
 
 def _existing_paths(path: Path | None) -> list[Path]:
-    """Return the path as given and as Drake normalizes it (a/../b is b), where they exist."""
     try:
         both = [] if path is None else [path, Path(os.path.normpath(path))]
         return [each for each in dict.fromkeys(both) if os.path.exists(each)]
@@ -189,7 +204,7 @@ def _existing_paths(path: Path | None) -> list[Path]:
 
 
 def _check_size(files: int, size: int, path: Path) -> None:
-    most = _MAX_BYTES if files > 1 or path.suffix.lower() in _BINARY else _MAX_TEXT
+    most = _MAX_BYTES if files > 1 or path.suffix.lower() in _BINARY_SUFFIXES else _MAX_TEXT
     if files > _MAX_FILES or size > most:
         what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
         raise DrakeTeleopError(
@@ -206,10 +221,10 @@ def read_xml(path: Path) -> Element:
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
 
-    def unread(name: str | None, *_: object) -> NoReturn:
+    def reject_entity(name: str | None, *_: object) -> NoReturn:
         raise ValueError(f"the entity {name} is not in this file")
 
-    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
+    parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = reject_entity
     try:
         parser.Parse(path.read_bytes().lstrip(), True)
         return builder.close()
@@ -223,12 +238,14 @@ def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
         if element.tag in ("plugin", "script"):
             continue
         if element.tag != "mesh" or meshes:
-            yield from (x for name, x in element.items() if _ATTRIBUTE.match(name) and x)
-            texts = (e.text for e in element if _ELEMENT.match(e.tag))
+            yield from (
+                x for name, x in element.items() if _FILE_ATTRIBUTE_PATTERN.match(name) and x
+            )
+            texts = (e.text for e in element if _FILE_ELEMENT_PATTERN.match(e.tag))
             yield from (text.strip() for text in texts if text and text.strip())
 
 
-def added_models(data: Any) -> Iterator[str]:
+def addresses_in_directives(data: Any) -> Iterator[str]:
     """Yield the addresses of the files that model directives (YAML data) add."""
     directives = data.get("directives") if isinstance(data, dict) else None
     for each in directives if isinstance(directives, list) else []:
@@ -241,7 +258,7 @@ def added_models(data: Any) -> Iterator[str]:
 def _addresses_in_gltf(path: Path) -> list[str]:
     found: list[str] = []
 
-    def keep(fields: list[tuple[str, Any]]) -> None:
+    def keep_addresses(fields: list[tuple[str, Any]]) -> None:
         for name, value in fields:  # includes duplicate names
             if name == "uri" and isinstance(value, str) and not value.startswith("data:"):
                 found.extend({value, unquote(value)})
@@ -250,7 +267,7 @@ def _addresses_in_gltf(path: Path) -> list[str]:
     if path.suffix.lower() == ".glb":
         data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
     try:
-        json.loads(data, object_pairs_hook=keep)
+        json.loads(data, object_pairs_hook=keep_addresses)
     except (ValueError, RecursionError) as error:
         raise DrakeTeleopError(
             f"is not a glTF file ({error})", where=str(path), remedy="export it again"

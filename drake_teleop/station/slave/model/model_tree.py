@@ -10,8 +10,8 @@ from drake_teleop.station.slave.model.repair_report import RepairReport
 WORLD = "world"  # name in URDF and SDF
 JOINT_TAGS = ("joint", "drake:joint")
 _LOOP_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
-_NUM_ENDS = 2  # names of bodies or frames in such a constraint
-_DETACHED = ("floating", "planar")
+_NUM_CONSTRAINT_ENDS = 2  # names of bodies or frames in such a constraint
+_BASE_JOINT_TYPES = ("floating", "planar")
 
 
 def joints_of(scope: Element) -> list[Element]:
@@ -64,7 +64,7 @@ def reduce_to_chain(
     chain = _chain_to(scope, sensor_link, report)
     if chain is None:
         return None
-    chain = _without_free_base(scope, chain, report)
+    chain = _remove_free_base(scope, chain, report)
     root = joint_end(chain[0], "parent") if chain else sensor_link
     moved = _remove_unreachable(scope, root, chain, hold, report)
     in_chain = set(map(id, chain))
@@ -79,7 +79,7 @@ def fix_joint(joint: Element, report: RepairReport) -> None:
     """Make a joint that moves a fixed one, at its default position."""
     if joint.get("type") == "fixed":
         return
-    report.state("held:", joint.get("name", ""))
+    report.state_assumption("held:", joint.get("name", ""))
     joint.tag = "joint"
     joint.set("type", "fixed")
     for child in list(joint):
@@ -94,28 +94,27 @@ def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] 
     chain, passed = list[Element](), set[str]()
     while link in parents:
         if link in passed:
-            report.refuse(f"its joints form a circle through {link}; cut the loop")
+            report.add_fault(f"its joints form a circle through {link}; cut the loop")
             return None
         passed.add(link)
         if link == WORLD:
-            report.refuse(f"world is the child of {parents[link][0].get('name', '')}")
+            report.add_fault(f"world is the child of {parents[link][0].get('name', '')}")
             return None
         if len(parents[link]) > 1:
             names = " and ".join(joint.get("name", "") for joint in parents[link])
-            report.refuse(f"{link} is the child of two joints, {names}; remove one of them")
+            report.add_fault(f"{link} is the child of two joints, {names}; remove one of them")
             return None
         chain.append(parents[link][0])
         link = joint_end(chain[-1], "parent")
     return chain[::-1]
 
 
-def _without_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
-    """Remove a first joint that lets the arm's base float or drive."""
+def _remove_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
     moving = [k for k, joint in enumerate(chain) if joint.get("type") != "fixed"]
-    if not moving or chain[moving[0]].get("type") not in _DETACHED:
+    if not moving or chain[moving[0]].get("type") not in _BASE_JOINT_TYPES:
         return chain
     free = chain[moving[0]]
-    report.state("welded to the world, where it may float:", joint_end(free, "child"))
+    report.state_assumption("welded to the world, where it may float:", joint_end(free, "child"))
     scope.remove(free)
     for link in scope.findall("link"):
         if link.get("name") == WORLD:
@@ -126,7 +125,6 @@ def _without_free_base(scope: Element, chain: list[Element], report: RepairRepor
 def _remove_unreachable(
     scope: Element, root: str, chain: list[Element], hold: set[str], report: RepairReport
 ) -> dict[str, int]:
-    """Remove links and joints outside the tree of `root`; return `ModelTree.moved`."""
     links = {link.get("name", ""): link for link in scope.findall("link")}
     number_of, count = dict[int, int](), 0
     for joint in chain:
@@ -148,23 +146,22 @@ def _remove_unreachable(
     for name in links.keys() - moved.keys():
         scope.remove(links[name])
     for name in [name for name in links if name not in moved and name != WORLD]:
-        report.repair("not connected to the arm and left out:", name or "a link without name")
+        report.state_repair("not connected to the arm and left out:", name or "a link without name")
     for joint in joints_of(scope):
         if id(joint) not in kept:
             scope.remove(joint)
             if joint_end(joint, "parent") in moved:
                 what = "left out, as it closes a loop or has no child:"
-                report.repair(what, joint.get("name", ""))
+                report.state_repair(what, joint.get("name", ""))
     return moved
 
 
 def _remove_loops(scope: Element, moved: dict[str, int], report: RepairReport) -> None:
-    """Remove constraints between links that do not move relative to each other."""
     for element in [child for child in scope if child.tag in _LOOP_TAGS]:
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
         groups = {moved.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
-        if len(names) < _NUM_ENDS or len(groups) > 1:
-            report.refuse(
+        if len(names) < _NUM_CONSTRAINT_ENDS or len(groups) > 1:
+            report.add_fault(
                 f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
             )

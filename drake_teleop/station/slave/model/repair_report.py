@@ -41,18 +41,18 @@ class RepairReport:
         self._names: dict[str, dict[str, None]] = {}
         self._causes: dict[str, None] = {}
 
-    def state(self, what: str, name: str) -> None:
+    def state_assumption(self, what: str, name: str) -> None:
         """State an assumption, such as `no inertia of`, about the joint or link `name`."""
         self._names.setdefault(what, {})[name] = None
 
-    def repair(self, what: str, name: str) -> None:
+    def state_repair(self, what: str, name: str) -> None:
         """State a repair; with `strict` it is a fault."""
         if self._strict:
-            self.refuse(f"{what} {name}")
+            self.add_fault(f"{what} {name}")
         else:
-            self.state(what, name)
+            self.state_assumption(what, name)
 
-    def refuse(self, cause: str) -> None:
+    def add_fault(self, cause: str) -> None:
         """Add a fault that cannot be repaired."""
         self._causes[cause] = None
 
@@ -61,7 +61,7 @@ class RepairReport:
         """One text for each kind of repair."""
         return [f"{what} {join_names(names)}" for what, names in self._names.items()]
 
-    def raise_causes(self, file: Path) -> None:
+    def raise_faults(self, file: Path) -> None:
         """Raise one DrakeTeleopError with all faults, if there are any."""
         causes = list(self._causes)
         if len(causes) == 1:

@@ -10,16 +10,16 @@ from drake_teleop.station.slave.model.model_references import ModelFiles, read_x
 from drake_teleop.station.slave.model.model_tree import link_of_frame
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport
 from drake_teleop.station.slave.model.urdf_repair import (
-    Purpose,
+    ModelPurpose,
     finish_repair,
     repair_scope,
     repair_urdf,
 )
 
 _MODEL_CONFIG, _URDF, _SDF = "model.config", ".urdf", ".sdf"
-_URIS = ".//include/uri"
+_INCLUDE_URI_PATH = ".//include/uri"
 # Children that Drake reads; it also reads elements with its own prefix.
-_PARTS = {
+_READ_TAGS_OF = {
     "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
     "link": {"pose", "inertial", "collision", "visual"},
     "collision": {"pose", "geometry", "surface"},
@@ -28,22 +28,25 @@ _PARTS = {
 
 
 def repair_sdf(
-    root: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
+    root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
     """Return the text of an SDF that Drake reads, with meshes and included files in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
         _keep_one_model(root, file, files, purpose.sensor, report)
         for element in list(root.iter()):
-            allowed = _PARTS.get(element.tag)
+            allowed = _READ_TAGS_OF.get(element.tag)
             for child in list(element) if allowed else ():
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
     repair_scope(root, purpose, report, is_sdf=True)
     for model in root.findall("model"):
         model.set("name", model.get("name") or file.stem)
-    report.raise_causes(file)
-    inner = [_repair_included(uri, file, files, purpose, folder) for uri in root.iterfind(_URIS)]
+    report.raise_faults(file)
+    inner = [
+        _repair_included(uri, file, files, purpose, folder)
+        for uri in root.iterfind(_INCLUDE_URI_PATH)
+    ]
     own = finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
     for each in (each for each in inner if each is not None):
         own = RepairedModel(
@@ -56,7 +59,7 @@ def repair_sdf(
 
 
 def _repair_included(
-    uri: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
+    uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel | None:
     """Replace an included file by its repaired text; leave a folder to Drake."""
     address = (uri.text or "").strip()
@@ -81,10 +84,10 @@ def _repair_included(
 
 
 def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
-    found = files.file(address, file.resolve().parent) or files.file(address)
+    found = files.find_file(address, file.resolve().parent) or files.find_file(address)
     if found is not None and (found / _MODEL_CONFIG).is_file():
         named = read_xml(found / _MODEL_CONFIG).findall("sdf")
-        inner = files.file((named[0].text or "").strip(), found) if len(named) == 1 else None
+        inner = files.find_file((named[0].text or "").strip(), found) if len(named) == 1 else None
         return inner or found
     return found
 
@@ -92,7 +95,6 @@ def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
 def _keep_one_model(
     root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
 ) -> None:
-    """Reduce worlds and several models to the model with the sensor."""
     worlds = root.findall("world")
     models = [
         each for scope in (root, *worlds) for each in scope if each.tag in ("model", "include")
@@ -113,7 +115,7 @@ def _keep_one_model(
     for other in models:
         if other is not kept:
             name = other.get("name") or other.findtext("name") or other.findtext("uri") or ""
-            report.repair("models beside the arm left out:", name)
+            report.state_repair("models beside the arm left out:", name)
 
 
 def _has_frame(model: Element, file: Path, files: ModelFiles, sensor: str) -> bool:

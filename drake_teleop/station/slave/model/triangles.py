@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Triangle of a binary STL file.
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+_STL_TRIANGLE_TYPE = np.dtype(
+    [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")]
+)
 _Array = NDArray[np.float64]
 
 
@@ -26,12 +28,12 @@ def read_triangles(file: Path) -> Triangles:
     """Return the triangles of an STL, OBJ or MSH file."""
     read = {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}
     try:
-        return checked_triangles(read[file.suffix.lower()](file.read_bytes()))
+        return check_triangles(read[file.suffix.lower()](file.read_bytes()))
     except (KeyError, IndexError, OSError) as error:  # another kind, or too short
         raise ValueError(str(error)) from None
 
 
-def checked_triangles(triangles: Triangles) -> Triangles:
+def check_triangles(triangles: Triangles) -> Triangles:
     """Return the triangles; raise ValueError unless all their vertices exist and are finite."""
     vertices, faces = triangles
     if not faces.size or faces.min() < 0 or faces.max() >= len(vertices):
@@ -59,10 +61,10 @@ def convex_hull(vertices: _Array) -> Triangles:
     faces = hull.simplices.astype(np.intp)
     inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
     faces[inwards] = faces[inwards, ::-1]
-    return _merged(vertices[faces])
+    return _merge_vertices(vertices[faces])
 
 
-def _merged(corners: _Array) -> Triangles:
+def _merge_vertices(corners: _Array) -> Triangles:
     points = corners.reshape(-1, 3).astype(float)
     order = np.lexsort(points.T)
     is_new = np.ones(len(points), bool)
@@ -74,10 +76,10 @@ def _merged(corners: _Array) -> Triangles:
 
 def _read_stl(data: bytes) -> Triangles:
     count = int.from_bytes(data[80:84], "little")
-    if len(data) == 84 + count * _TRIANGLE.itemsize:
-        return _merged(np.frombuffer(data, _TRIANGLE, count, 84)["corners"])
+    if len(data) == 84 + count * _STL_TRIANGLE_TYPE.itemsize:
+        return _merge_vertices(np.frombuffer(data, _STL_TRIANGLE_TYPE, count, 84)["corners"])
     lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
-    return _merged(np.array(lines, dtype=float).reshape(-1, 3))
+    return _merge_vertices(np.array(lines, dtype=float).reshape(-1, 3))
 
 
 def _read_obj(data: bytes) -> Triangles:
@@ -94,7 +96,6 @@ def _read_obj(data: bytes) -> Triangles:
 
 
 def _read_msh(data: bytes) -> Triangles:
-    """Read MuJoCo's binary format: four counts, then vertices, normals, texture and faces."""
     n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
     if min(n, normals, texture, count) < 0:
         raise ValueError("a negative count")

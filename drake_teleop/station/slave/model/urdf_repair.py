@@ -16,7 +16,7 @@ from drake_teleop.station.slave.model.meshes import remove_unusable_shapes
 from drake_teleop.station.slave.model.model_numbers import (
     check_joint,
     check_quantities,
-    number,
+    parse_number,
     separate_by_blanks,
 )
 from drake_teleop.station.slave.model.model_references import ModelFiles
@@ -34,10 +34,10 @@ from drake_teleop.station.slave.model.repair_report import RepairedModel, Repair
 _URDF_PARTS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
 _URDF_PARTS |= {"drake:collision_filter_group"}
 _NUM_COLOURS = 4  # red, green, blue, opacity
-_DRAKE_ROTOR = ("drake:rotor_inertia", "drake:gear_ratio")
+_DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
-class Purpose(NamedTuple):
+class ModelPurpose(NamedTuple):
     """Use of a model: as arm, tool or surroundings.
 
     Attributes:
@@ -58,7 +58,7 @@ class Purpose(NamedTuple):
 
 
 def repair_urdf(
-    root: Element, file: Path, files: ModelFiles, purpose: Purpose, folder: Path
+    root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
     """Return the text of a URDF that Drake reads, with meshes converted in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
@@ -74,13 +74,15 @@ def repair_urdf(
     return finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
 
 
-def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sdf: bool) -> None:
+def repair_scope(
+    root: Element, purpose: ModelPurpose, report: RepairReport, *, is_sdf: bool
+) -> None:
     """Repair links and joints of a robot, or of a model and its nested models."""
     separate_by_blanks(root)
     scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         _name_joints(scope, report)
-    tree = _tree(scopes, purpose, report)
+    tree = _model_tree_of_scopes(scopes, purpose, report)
     chain = set() if tree is None else set(map(id, tree.chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
@@ -100,7 +102,7 @@ def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sd
             at_rest = tree is not None and tree.moved.get(name) == 0
             is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
-                report.state("no inertia of", name)
+                report.state_assumption("no inertia of", name)
 
 
 def finish_repair(
@@ -110,13 +112,13 @@ def finish_repair(
 
     Without a folder for converted meshes the text has no shapes.
     """
-    report.raise_causes(file)
+    report.raise_faults(file)
     lost = remove_unusable_shapes(root, file, files, folder)
     for fault, links in lost.items():
-        report.repair("shapes are missing of", f"{join_names(links)}: {fault}")
-    report.raise_causes(file)
+        report.state_repair("shapes are missing of", f"{join_names(links)}: {fault}")
+    report.raise_faults(file)
     limits = {
-        joint.get("name", ""): number(limit.get("effort") or limit.findtext("effort") or "0")
+        joint.get("name", ""): parse_number(limit.get("effort") or limit.findtext("effort") or "0")
         for joint in root.iter("joint")
         for limit in joint.iter("limit")
     }
@@ -137,7 +139,9 @@ def dependent_joints(root: Element) -> dict[str, str]:
     return found
 
 
-def _tree(scopes: list[Element], purpose: Purpose, report: RepairReport) -> ModelTree | None:
+def _model_tree_of_scopes(
+    scopes: list[Element], purpose: ModelPurpose, report: RepairReport
+) -> ModelTree | None:
     if purpose.is_tool:
         for joint in (joint for scope in scopes for joint in joints_of(scope)):
             fix_joint(joint, report)
@@ -149,23 +153,22 @@ def _tree(scopes: list[Element], purpose: Purpose, report: RepairReport) -> Mode
 
 
 def _name_joints(scope: Element, report: RepairReport) -> None:
-    """Give each joint a separate name, and keep one link of each name."""
     names = set[str]()
     for number_of_joint, joint in enumerate(joints_of(scope), start=1):
         name = joint.get("name", "")
         if not name or name in names:
             new = f"{name or 'joint'}_{number_of_joint}"
-            report.repair("a new name for the joint", f"{name or 'without name'} ({new})")
+            report.state_repair("a new name for the joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
     links, children = set[str](), Counter(joint_end(joint, "child") for joint in joints_of(scope))
     for link in scope.findall("link"):
         name = link.get("name", "")
         if name in links and children[name] > 1:
-            report.refuse(f"two links are named {name}; rename one of them")
+            report.add_fault(f"two links are named {name}; rename one of them")
         elif name in links:
             scope.remove(link)
-            report.repair("a second link of the same name left out:", name)
+            report.state_repair("a second link of the same name left out:", name)
         links.add(name)
 
 
@@ -191,12 +194,13 @@ def _has_colour(material: Element) -> bool:
     for texture in material.findall("texture"):
         material.remove(texture)
     colour = material.find("color")
-    values = [] if colour is None else [number(word) for word in colour.get("rgba", "").split()]
+    values = (
+        [] if colour is None else [parse_number(word) for word in colour.get("rgba", "").split()]
+    )
     return len(values) == _NUM_COLOURS and all(0.0 <= value <= 1.0 for value in values)
 
 
 def _remove_idle_parts(root: Element, report: RepairReport) -> None:
-    """Remove frames and filters of missing links, and motors without data for Drake."""
     links = {link.get("name", "") for link in root.findall("link")}
     moving = {joint.get("name", "") for joint in joints_of(root) if joint.get("type") != "fixed"}
     for frame in root.findall("frame"):
@@ -207,7 +211,7 @@ def _remove_idle_parts(root: Element, report: RepairReport) -> None:
             root.remove(group)
     for motor in root.findall("transmission"):
         names = [joint.get("name", "") for joint in motor.findall("joint")]
-        has_data = any(inner.tag in _DRAKE_ROTOR for inner in motor.iter())
+        has_data = any(inner.tag in _DRAKE_ROTOR_TAGS for inner in motor.iter())
         if len(names) != 1 or names[0] not in moving or not has_data:
             root.remove(motor)
             continue
