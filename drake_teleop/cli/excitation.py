@@ -191,7 +191,9 @@ def draw_trajectory(found: Excitation) -> Figure:
         progress.step(*found.history.T, where="post", color=BLUE)
         least = found.values.get(found.criterion, found.trajectory.period)  # --until: the period
         progress.set(
-            title=f"{found.criterion} down to {least:.4g}", xlabel="evaluations", yscale="log"
+            title=f"{found.criterion} down to {least:.4g}",
+            xlabel="evaluations",
+            yscale="log",
         )
     return figure
 
@@ -245,8 +247,8 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         console.print(part)
     if "until" in summary:
         console.print(
-            f"{summary['period_s']:.3g} s reach {summary['until']} in {summary['reliable']:.0%}"
-            " of the records, by the sensor's noise alone",
+            f"{summary['period_s']:.3g} s reach {summary['until']}"
+            f" in {summary['reliable']:.0%} of the records, by the sensor's noise alone",
             highlight=False,
             markup=False,
         )

@@ -504,7 +504,11 @@ _EXPORT_FORMATS = option.Registered(
 @option.sensor_range
 @option.out("export")
 def export(
-    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: str, **loop: Any
+    identification: Path,
+    to: str,
+    sensor_pose: tuple[float, ...] | None,
+    sign: str,
+    **loop: Any,
 ) -> None:
     """Write a load for a robot, model or controller.
 
@@ -593,7 +597,10 @@ def compare_passivity(
     from drake_teleop.lab.comparison import compare_passivity as comparison
 
     comparison.compare_command(
-        out, networks=networks or comparison.NETWORKS, methods=methods, **options
+        out,
+        networks=networks or comparison.NETWORKS,
+        methods=methods,
+        **options,
     )
 
 

@@ -143,8 +143,8 @@ def identify_load(
         raise DrakeTeleopError(
             "the load estimator is off, so it cannot identify the load",
             where="scenario:load_estimator.enabled",
-            remedy="call identified_load(scenario) of drake_teleop.lab.identified_load, or pass"
-            ' LoadScenario("identification")',
+            remedy="call identified_load(scenario) of drake_teleop.lab.identified_load, or pass "
+            'LoadScenario("identification")',
         )
     if trajectory is not None:
         expect(FourierTrajectory, trajectory, "trajectory")

@@ -152,8 +152,8 @@ def _change_text(cause: Cause) -> str:
             " tare, or a push that turns with the tool); tare the compensation too"
         )
     return (
-        f"t = {cause.start_s:.2f} s: another load, {cause.values['mass_change']:+.4g} kg;"
-        " run `calibrate` with it"
+        f"t = {cause.start_s:.2f} s: another load, {cause.values['mass_change']:+.4g} kg; run"
+        " `calibrate` with it"
     )
 
 

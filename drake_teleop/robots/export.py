@@ -64,7 +64,11 @@ class Format:
 
 
 def export_text(
-    found: Identification, to: str, *, sensor_pose: Sequence[float] | None = None, sign: int = -1
+    found: Identification,
+    to: str,
+    *,
+    sensor_pose: Sequence[float] | None = None,
+    sign: int = -1,
 ) -> tuple[str, list[str]]:
     """Return the text in the format `to`, and warnings.
 
@@ -83,10 +87,8 @@ def export_text(
         raise DrakeTeleopError(
             f"the load is not physically consistent (mass {found.mass:.4g} kg), as {to} requires",
             where="export",
-            remedy=(
-                "use `identify --method consistent`; a negative mass means that the sign of the"
-                " wrench is wrong"
-            ),
+            remedy="use `identify --method consistent`; a negative mass means"
+            " that the sign of the wrench is wrong",
         )
     load = ExportedLoad(*mass_com_inertia(phi), sign * found.offsets)
     warnings = _warnings(found, to, format)
@@ -275,10 +277,8 @@ FORMATS = Registry(
             inertia=False,
             offsets=True,
             comment="#",
-            note=(
-                f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
-                " compensated force is twice the weight, change the sign of the mass"
-            ),
+            note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+            " compensated force is twice the weight, change the sign of the mass",
         ),
         "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
         "ros2-admittance": Format(

@@ -145,7 +145,11 @@ def _wall_name(edge: float) -> str:
 
 
 def find_place(
-    arm: ArmModel, shapes: PostureShapes | None = None, *, plane: float = 0.0, axis: str = "z"
+    arm: ArmModel,
+    shapes: PostureShapes | None = None,
+    *,
+    plane: float = 0.0,
+    axis: str = "z",
 ) -> Place:
     """Find a start with the tool down.
 
@@ -177,8 +181,8 @@ def find_place(
             best = max(cubes, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
-            f"no posture found in which {axis}_S points down and the arm can move in all"
-            f" directions ({_describe_removals(region, len(postures.q))})",
+            f"no posture found in which {axis}_S points down and the arm can move in all directions"
+            f" ({_describe_removals(region, len(postures.q))})",
             where="new",
             remedy="check joint limits and the orientation of sensor_frame",
         )

@@ -203,16 +203,16 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
     return {
         "Seed": str(seed),
         "Rates": (
-            f"wrist sensor {rates.sensor_hz:g} Hz, hand and channel {rates.hand_hz:g} Hz, joint"
-            f" control {rates.joint_control_hz:g} Hz, load estimator {rates.estimator_hz:g} Hz"
+            f"wrist sensor {rates.sensor_hz:g} Hz, hand and channel {rates.hand_hz:g} Hz, joint "
+            f"control {rates.joint_control_hz:g} Hz, load estimator {rates.estimator_hz:g} Hz"
         ),
         "Plant": (
-            f"continuous, {scenario.simulation.integrator}, no step longer than a period of the"
-            " joint control; the sensor samples inside the steps"
+            f"continuous, {scenario.simulation.integrator}, no step longer than a period of the "
+            "joint control; the sensor samples inside the steps"
         ),
         "Excitation": (
-            f"one period of {load.trajectory.period:g} s, {load.trajectory.rho.shape[1]}"
-            f" harmonics, condition number {load.kappa_w10:.1f}"
+            f"one period of {load.trajectory.period:g} s, {load.trajectory.rho.shape[1]} "
+            f"harmonics, condition number {load.kappa_w10:.1f}"
         ),
         "Force scale": f"1/{1 / scale:g}, slave to master",
     }
@@ -221,8 +221,8 @@ def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> 
 def _markdown(rows: list[Comparison]) -> str:
     lines = ["| What | Paper | This run | | Accepted | Verdict |", "|---|---|---|---|---|---|"]
     lines += [
-        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} |"
-        f" {row.accepted or '–'} | {row.verdict} |"
+        f"| {row.what.replace('|', '&#124;')} | {row.paper} | {row.ours} | {row.origin} "
+        f"| {row.accepted or '–'} | {row.verdict} |"
         for row in rows
     ]
     return "\n".join(lines) + "\n"
