@@ -149,7 +149,7 @@ class LiveHand(Operator):
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
         self._scratch, self._mass = np.empty(_INTENTION_SIZE), config.hand.mass
 
-    def _declare_intention(self) -> set[DependencyTicket]:
+    def _declare_intended_motion(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH)
         path[_HELD], path[_POLES], path[_TARGET:_OFFSET] = 1.0, _TRANSLATION_POLE, self._intent[1]
         self._path = self.DeclareNumericParameter(BasicVector(path))

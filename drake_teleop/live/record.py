@@ -118,7 +118,7 @@ class BackgroundLog(LogOnDisk):
     def finish(self) -> None:
         self._writing.result()
 
-    def _write(self, part: SimulationResult) -> None:
+    def _write_part(self, part: SimulationResult) -> None:
         self.finish()
         self._writing = self._thread.submit(part.write_part, self._folder, self._rows)
 
