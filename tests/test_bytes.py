@@ -42,10 +42,10 @@ def benchmark() -> ModuleType:
 # Painting takes longest; the benchmark does it.
 NO_PICTURES = """
 from matplotlib.figure import Figure
-from drake_teleop.station.film import Film
+from drake_teleop.station.film import ReplayFile
 painted = Figure.savefig
 Figure.savefig = lambda _, path, **options: painted(Figure(figsize=(0.1, 0.1)), path, **options)
-Film._record_scene = lambda self, make_scene: "<body></body>"
+ReplayFile._record_scene = lambda self, make_scene: "<body></body>"
 """
 
 
