@@ -21,7 +21,8 @@ assert figures_of_run(short, model).stable and not figures_of_run(long, model).s
 assert created[0.05] > 1.0 and created[0.002] < 0.05
 assert passive.least_energy_sum(ACTUAL) >= 0.0
 assert over_internet.keys() == over_300_ms.keys() == set(METHODS)
-found = [{m: figures_of_run(r, model) for m, r in runs.items()} for runs in (over_internet, over_300_ms)]
+both_runs = (over_internet, over_300_ms)
+found = [{m: figures_of_run(r, model) for m, r in runs.items()} for runs in both_runs]
 assert not found[0]["none"].stable and not found[1]["none"].stable
 assert found[0]["ledger"].stable and abs(found[0]["ledger"].force_error) < 0.01
 assert found[1]["wave"].stable and abs(found[1]["wave"].force_error) < 0.01

@@ -251,7 +251,11 @@ def test_released_hand_only_dissipates(driven):
 @pytest.mark.slow
 def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeypatch):
     folder, _ = driven
-    for painted in ("station.replay.write_replay", "lab.run.write_picture", "lab.run.draw_overview"):
+    for painted in (
+        "station.replay.write_replay",
+        "lab.run.write_picture",
+        "lab.run.draw_overview",
+    ):
         monkeypatch.setattr(f"drake_teleop.{painted}", lambda *_: None)
     with pytest.raises(SystemExit) as end:
         main(["run", "--inputs", str(folder), "--out", str(tmp_path / "again"), "--quiet"])
