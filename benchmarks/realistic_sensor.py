@@ -66,7 +66,7 @@ LATE = 1e-3
 
 
 def true_motions() -> tuple[Array, Array, FourierTrajectory]:
-    """What is true at 8 kHz (N, 15 + n), see `sensor_chain_constants`: identification and swing."""
+    """Return the true values at 8 kHz (N, 15 + n), see `sensor_chain_constants`: both motions."""
     ideal = {"wrist_sensor__ideal": True, "rates__log_hz": RATE}
     found = identify_load(scenarios.replace(IDENTIFICATION, **ideal))
     swing = scenarios.replace(SWING, **ideal)
