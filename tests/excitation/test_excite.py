@@ -21,6 +21,7 @@ from drake_teleop.cli.excitation import draw_trajectory
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
+from drake_teleop.lab.excitation import excite as excite_module
 from drake_teleop.lab.excitation.check import check_motion, check_trajectory
 from drake_teleop.lab.excitation.excite import excite, sensor_motion
 from drake_teleop.lab.excitation.limits import (
@@ -30,6 +31,7 @@ from drake_teleop.lab.excitation.limits import (
     write_sensor_motion,
 )
 from drake_teleop.lab.excitation.motion_film import write_motion_film
+from drake_teleop.lab.excitation.optimizer import Iterate
 from drake_teleop.lab.excitation.prediction import predicted_deviations, sensor_noise
 from drake_teleop.lab.excitation.robot import Robot, RobotFromModel, RobotFromScenario
 from drake_teleop.lab.identification import identify_load
@@ -714,6 +716,19 @@ def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
     assert found.mass == pytest.approx(mass, rel=2e-3)
     np.testing.assert_allclose(found.com, com, atol=3e-4)
     np.testing.assert_allclose(found.inertia_com, inertia, atol=0.05 * np.trace(inertia) / 2)
+
+
+@pytest.mark.parametrize("found", ["none", "far from the start"])
+def test_small_motions_about_the_start_replace_designs_that_fail(slave, short, monkeypatch, found):
+    """No design at all, and one whose posture is beyond the joint limits."""
+    high = slave.limits.q_middle + 1.5 * slave.limits.q_half
+    bad = Iterate(1.0, 10, 0, 3.0, dataclasses.replace(short.trajectory, q0=high))
+    designs = [] if found == "none" else [bad]
+    monkeypatch.setattr(excite_module, "minimise_criterion", lambda *_, **__: designs)
+    small = excite(slave, period=2.4, harmonics=2, progress=False)
+    np.testing.assert_array_equal(small.trajectory.q0, slave.home)
+    assert small.uses[0].share <= 1.0 and small.history.shape == (len(designs), 2)
+    assert np.isfinite(small.deviations[:10]).all()
 
 
 def test_picture_of_a_shortest_motion_states_its_period(short):

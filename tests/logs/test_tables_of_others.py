@@ -436,6 +436,39 @@ def test_numbered_quaternions_are_drafted(
     assert draft["pose"]["position"]["columns"] == ["x", "y", "z"] and left == []
 
 
+@pytest.mark.parametrize("push", [0.0, 12.0])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_order_of_quaternions_and_sign_are_found_together(
+    tmp_path: Path, sign: int, push: float
+) -> None:
+    """Also where contact leaves more than the share of the variance of a valid description."""
+    frame = table(sign=float(sign))
+    touched = np.abs(frame["t"].to_numpy() - 2.0) < 0.35
+    frame = frame.with_columns(pl.col(FORCE[1]) + pl.Series(push * touched))
+    arrays = {"wrench": [*FORCE, *TORQUE], "eef_pos": POSITION}
+    arrays |= {"eef_quat": [*QUATERNION[1:], QUATERNION[0]]}
+    lists = {name: frame.select(x).to_numpy().tolist() for name, x in arrays.items()}
+    pl.DataFrame({"timestamp": frame["t"]} | lists).write_parquet(tmp_path / "run.parquet")
+    draft, _ = drafted(tmp_path / "run.parquet")
+    assert draft["pose"]["orientation"]["form"] == "quaternion_xyzw"
+    assert draft["wrench"]["sign"] == sign
+
+
+@pytest.mark.parametrize(
+    ("name", "form"), [("xyzw", "quaternion_xyzw"), ("wxyz", "quaternion_wxyz")]
+)
+    ("name", "form"), [("xyzw", "quaternion_xyzw"), ("wxyz", "quaternion_wxyz")]
+)
+def test_name_of_an_array_states_the_order_of_its_quaternions(
+    tmp_path: Path, name: str, form: str
+) -> None:
+    columns = {"t": np.arange(30) * 0.01, f"quaternion_{name}": [[0.5, 0.5, 0.5, 0.5]] * 30}
+    columns |= {"force": [[1.0, 2.0, 3.0]] * 30, "torque": [[0.1, 0.2, 0.3]] * 30}
+    pl.DataFrame(columns).write_parquet(tmp_path / "x.parquet")
+    pose = draft_description(read_table(tmp_path / "x.parquet"), tmp_path).streams["pose"]
+    assert pose["orientation"] == {"columns": [f"quaternion_{name}"], "form": form}
+
+
 def test_four_joint_angles_are_no_quaternion(tmp_path: Path) -> None:
     frame = table()
     columns = dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], strict=True))
