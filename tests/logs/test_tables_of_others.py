@@ -457,8 +457,6 @@ def test_order_of_quaternions_and_sign_are_found_together(
 @pytest.mark.parametrize(
     ("name", "form"), [("xyzw", "quaternion_xyzw"), ("wxyz", "quaternion_wxyz")]
 )
-    ("name", "form"), [("xyzw", "quaternion_xyzw"), ("wxyz", "quaternion_wxyz")]
-)
 def test_name_of_an_array_states_the_order_of_its_quaternions(
     tmp_path: Path, name: str, form: str
 ) -> None:
