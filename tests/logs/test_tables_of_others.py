@@ -17,10 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.rotations import EULER_AXES, rotation_matrices
+from drake_teleop.logs.check.corrections import pose_edits, with_opposite_sign
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.clocks import join_episodes
+from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.table_files import read_table
 
@@ -436,7 +438,7 @@ def test_numbered_quaternions_are_drafted(
     assert draft["pose"]["position"]["columns"] == ["x", "y", "z"] and left == []
 
 
-@pytest.mark.parametrize("push", [0.0, 12.0])
+@pytest.mark.parametrize("push", [0.0, 50.0])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_order_of_quaternions_and_sign_are_found_together(
     tmp_path: Path, sign: int, push: float
@@ -452,6 +454,15 @@ def test_order_of_quaternions_and_sign_are_found_together(
     draft, _ = drafted(tmp_path / "run.parquet")
     assert draft["pose"]["orientation"]["form"] == "quaternion_xyzw"
     assert draft["wrench"]["sign"] == sign
+
+
+def test_a_correction_with_the_opposite_sign_states_both(tmp_path: Path) -> None:
+    description = load_description(described(tmp_path, table()))
+    finding, edited = next(x for x in pose_edits(description) if x[0].name == "quaternion order")
+    both, changed = with_opposite_sign(finding, edited)
+    assert both.fields == {"pose.orientation.form": "quaternion_xyzw", "wrench.sign": -1}
+    assert changed.wrench is not None and changed.wrench.sign == -1
+    assert changed.pose == edited.pose and both.message.endswith("and wrench.sign: -1")
 
 
 @pytest.mark.parametrize(

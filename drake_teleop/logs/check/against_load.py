@@ -196,8 +196,7 @@ def _better_edits(
         if fit is not None and fit.mass > 0:
             positive.append((fit, finding, edited))
         elif fit is not None and finding is not None and finding.name not in _ALREADY_SIGNED:
-            both = with_opposite_sign(finding, edited)
-            negative.append((replace(fit, mass=-fit.mass), *both))
+            negative.append((fit, *with_opposite_sign(finding, edited)))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     valid, decisive = VALID_SHARE + given.noise, given.unexplained / min_reduction_factor(given)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
