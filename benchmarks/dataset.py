@@ -63,7 +63,10 @@ def late(frames: int) -> Fault:
 
 def tared(share: float) -> Fault:
     def fault(x: SampleEpisode, phi: np.ndarray) -> SampleEpisode:
-        free = [k for k in range(12, len(x.t) - 12) if not x.contact_wrench[k - 4 : k + 4].any()]
+        fps = (len(x.t) - 1) / (x.t[-1] - x.t[0])
+        end, near = round(0.4 * fps), max(1, round(0.13 * fps))
+        rows = range(end, len(x.t) - end)
+        free = [k for k in rows if not x.contact_wrench[k - near : k + near].any()]
         k = min(free, key=lambda row: abs(row - share * len(x.t)))
         wrench = x.wrench.copy()
         wrench[k:] -= wrench[k]
@@ -113,13 +116,19 @@ FAULTS: dict[str, tuple[set[str], Fault]] = {
 }
 
 
-def planted(folder: Path, fps: float, phi: np.ndarray, clean: int) -> dict[str, Any]:
+def planted(folder: Path, fps: float, tool: int, clean: int) -> dict[str, Any]:
+    phi = TOOLS[tool]
     changes = {k: {"phi": phi} for k in range(clean + len(FAULTS))}
     order = {clean + k: name for k, name in enumerate(FAULTS)}
     faults = {k: lambda x, f=FAULTS[n][1]: f(x, phi) for k, n in order.items()}
     changes |= {k: {"phi": OTHER} for k, name in order.items() if name == "other tool"}
     made = write_sample_dataset(
-        folder / "in", episodes=clean + len(FAULTS), fps=fps, faults=faults, changes=changes
+        folder / "in",
+        episodes=clean + len(FAULTS),
+        fps=fps,
+        seed=tool,
+        faults=faults,
+        changes=changes,
     )
     started = time.process_time()
     summary = dataset_command(folder / "in", folder / "out", identify=True, quiet=True)
@@ -161,15 +170,36 @@ def main() -> None:
     report: dict[str, Any] = {"cells": []}
     with tempfile.TemporaryDirectory() as name:
         for fps in given.rates:
-            for k, phi in enumerate(TOOLS[: given.tools]):
-                cell = planted(Path(name) / f"{fps}_{k}", fps, phi, given.episodes)
+            for k in range(given.tools):
+                cell = planted(Path(name) / f"{fps}_{k}", fps, k, given.episodes)
                 report["cells"].append(cell)
                 print(cell, flush=True)
         if given.frames:
             report["long"] = long_dataset(Path(name) / "long", given.frames)
             print(report["long"])
+    for fps in given.rates if report["cells"] else ():
+        report[f"{fps:g} fps"] = summary = summarized(report["cells"], fps)
+        print(fps, summary)
     if given.json:
         given.json.write_text(json.dumps(report, indent=2) + "\n")
+
+
+def summarized(cells: list[dict[str, Any]], fps: float) -> dict[str, float]:
+    """Return the figures of all tools at one rate."""
+    some = [cell for cell in cells if cell["rate_hz"] == fps]
+    planted = sum(cell["planted"] for cell in some)
+    return {
+        "planted": planted,
+        "named_percent": 100.0 * (1.0 - sum(len(cell["missed"]) for cell in some) / planted),
+        "clean": sum(cell["clean"] for cell in some),
+        "false": sum(cell["false"] for cell in some),
+        "largest_residual_of_noise": max(max(cell["residual_of_noise"]) for cell in some),
+        "median_residual_of_noise": float(
+            np.median([cell["residual_of_noise"] for cell in some], axis=0).max()
+        ),
+        "least_contact_f1": min(cell["contact_f1"] for cell in some),
+        "median_contact_f1": float(np.median([cell["contact_f1"] for cell in some])),
+    }
 
 
 def long_dataset(folder: Path, frames: int) -> dict[str, float]:

@@ -13,6 +13,7 @@ from drake_teleop.common.files import write_json, write_table
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.sample import SampleEpisode, sample_episode
 
+TASK = "Touch the table."
 Fault = Callable[[SampleEpisode], SampleEpisode]
 
 
@@ -64,10 +65,17 @@ def write_sample_dataset(
     ends = np.cumsum(lengths)
     index = {
         "episode_index": np.arange(episodes),
+        "tasks": [[TASK]] * episodes,
         "length": lengths,
+        "data/chunk_index": np.zeros(episodes, int),
+        "data/file_index": np.zeros(episodes, int),
         "dataset_from_index": ends - lengths,
         "dataset_to_index": ends,
+        "meta/episodes/chunk_index": np.zeros(episodes, int),
+        "meta/episodes/file_index": np.zeros(episodes, int),
     }
+    tasks = pl.DataFrame({"task_index": [0], "task": [TASK]})
+    write_table(folder / "meta/tasks.parquet", tasks)
     write_table(folder / "meta/episodes/chunk-000/file-000.parquet", pl.DataFrame(index))
     _write_meta(folder, whole, episodes, fps)
     return made
@@ -96,6 +104,7 @@ def _write_meta(folder: Path, whole: Any, episodes: int, fps: float) -> None:
         "robot_type": "ur5e",
         "total_episodes": episodes,
         "total_frames": len(whole),
+        "total_tasks": 1,
         "fps": round(fps),
         "splits": {"train": f"0:{episodes}"},
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",

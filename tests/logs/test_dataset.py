@@ -47,7 +47,7 @@ def log_of(x: SampleEpisode) -> Log:
 
 def verdict(x: SampleEpisode) -> set[str]:
     fps = 1.0 / (x.t[1] - x.t[0])
-    signals = EpisodeSignals(log_of(x), max(2.0, 0.12 * fps))
+    signals = EpisodeSignals(log_of(x))
     predict = signals.reading_predictor(TRUE_PHI)
     found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD)
     names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturated_channels(x.wrench)}
@@ -113,7 +113,7 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
     squares = []
     for number in range(6):
         x = sample_episode(number, phi=phi, contacts=0)
-        reading, load_wrench = EpisodeSignals(log_of(x), 4.0).reading_predictor(phi)("sensor", 0.0)
+        reading, load_wrench = EpisodeSignals(log_of(x)).reading_predictor(phi)("sensor", 0.0)
         rest = reading - load_wrench
         squares.append(((rest - np.median(rest, axis=0)) / NOISE_STD) ** 2)
     assert np.sqrt(np.mean(squares)) < 1.2
@@ -129,7 +129,7 @@ def test_any_large_rotation_of_the_wrench_is_found(
     axis = np.array(axis) + 1e-3
     R = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     x = mapped(R)(sample_episode(number, contacts=1))
-    signals = EpisodeSignals(log_of(x), 3.6)
+    signals = EpisodeSignals(log_of(x))
     found = find_hypothesis(
         signals.reading_predictor(TRUE_PHI), signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD
     )

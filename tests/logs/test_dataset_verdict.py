@@ -135,7 +135,7 @@ def test_frames_at_an_end_of_the_range_are_counted(rows, saturated, side):
 @pytest.mark.parametrize("lag", [0.0, 2.5, -3.0, 0.37])
 def test_signals_of_an_episode_have_the_lag_and_the_axes_of_their_kind(lag):
     x = sample_episode(3)
-    signals = EpisodeSignals(log_of(x), 3.6)
+    signals = EpisodeSignals(log_of(x))
     at = signals.motion(x.t + lag * (x.t[1] - x.t[0]))
     w = signals.reading_predictor(TRUE_PHI)("sensor", lag)
     np.testing.assert_array_equal(w[0], x.wrench)

@@ -63,7 +63,7 @@ from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.reading import read_description
 
 _MAX_CALIBRATION_EPISODES = 24  # episodes that determine load, lag and noise
-_MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS, _DRAFT_SPACING = 3, 5, 3.0
+_MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
 _STREAMS = ("wrench", "imu", "pose")
 _MAX_EXCESS_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
 _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES = (
@@ -191,7 +191,7 @@ def _choose_quaternion_order_and_sign(
         for episode in episodes:
             with suppress(DrakeTeleopError):
                 log, _ = _episode_log(dataset, tried, episode)
-                loads.append(load_of_episode(EpisodeSignals(log, _DRAFT_SPACING)))
+                loads.append(load_of_episode(EpisodeSignals(log)))
         if loads:
             spread = float(np.median([x.spread.sum() for x in loads]))
             mass = float(np.median([x.phi[0] for x in loads if x.phi is not None]))
@@ -325,7 +325,7 @@ def _read_columns(path: Path) -> NewColumns:
 def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, Any], NewColumns]:
     shared = task.shared
     log, at = _episode_log(task.dataset, task.streams, episode)
-    signals = EpisodeSignals(log, shared.spacing)
+    signals = EpisodeSignals(log)
     predict = signals.reading_predictor(shared.phi)
     found = find_hypothesis(predict, signals.regressor_at_lag, shared.lag, shared.typical)
     residual = unexplained_reading(found, predict, signals.regressor_at_lag)
@@ -393,7 +393,6 @@ def _dataset_summary(
         "faults": dict(sorted((k, n) for k, n in names.items() if k != "ok")),
         "lag_frames": shared.lag,
         "noise": shared.typical / HALF_WIDTH_OF_NORMAL,
-        "spline_frames": shared.spacing,
         "contact_threshold": shared.threshold,
         **load_figures(shared.identification),
     }

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.numeric import Array, narrowest_half
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
 from drake_teleop.load.regressor import non_contact_wrench, regressor
-from drake_teleop.logs.pose_motion.splines import PoseSplines
+from drake_teleop.logs.pose_motion.splines import MIN_POSES_PER_KNOT, PoseSplines
 from drake_teleop.logs.read.canonical import Log
 
 LAG_STEPS_PER_FRAME = 8
@@ -366,15 +366,14 @@ class EpisodeSignals:
 
     Args:
         log: with orientation; not low-passed.
-        spacing: knot distance of the splines of the poses [frames].
     """
 
-    def __init__(self, log: Log, spacing: float) -> None:
+    def __init__(self, log: Log) -> None:
         self.log = log
         self._splines = None
         if log.posed is not None:
             poses = log.posed.poses
-            self._splines = PoseSplines(poses, spacing / poses.rate, limit_ends=True)
+            self._splines = PoseSplines(poses, MIN_POSES_PER_KNOT / poses.rate, smooth=True)
         grid = (
             np.arange(
                 -_MARGIN_FRAMES * LAG_STEPS_PER_FRAME,

@@ -26,8 +26,6 @@ from drake_teleop.logs.dataset.episode_verdict import (
 from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.canonical import Log
 
-_TRIED_KNOT_SPACINGS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # knot distances [frames]
-_LARGEST_SPACING_S = 0.25
 _SMALLEST_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
 _LARGEST_EXCESS, _MEMBER_EXCESS = 6.0, 2.0  # log spread beyond that of an episode's own load
 _LAG_STEP, _MAX_LAG = 0.5, 3.0  # frames
@@ -44,7 +42,6 @@ class SharedLoad:
 
     Attributes:
         phi: (10,) load that is removed.
-        spacing: knot distance of the splines [frames].
         lag: usual delay of the motion behind the wrench [frames].
         typical: (6,) usual half widths of the residual [N, N m].
         floor, threshold: of the contact detection.
@@ -52,7 +49,6 @@ class SharedLoad:
 
     identification: Identification
     phi: Array
-    spacing: float
     lag: float
     typical: Array
     floor: NoiseFloor
@@ -64,8 +60,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
 
     Episodes with another load or wrong axes, and contact, have no influence if they are few.
     """
-    spacing = _best_knot_spacing(logs)
-    episodes = [EpisodeSignals(log, spacing) for log in logs]
+    episodes = [EpisodeSignals(log) for log in logs]
     own = [load_of_episode(signals) for signals in episodes]
     if load is None:
         candidates = [x.phi for x in own if x.phi is not None and x.phi[0] > 0.0]
@@ -102,24 +97,7 @@ def find_shared_load(logs: Sequence[Log], load: Identification | None) -> Shared
     pooled = DetectorSamples(*(np.concatenate(parts) for parts in zip(*free, strict=True)))
     floor = fit_noise_floor(*pooled, limit_covariance(phi, load.covariance, tared=True), fade=0.0)
     threshold = max(MAX_NOISE_LEVEL, _THRESHOLD_MARGIN * float(floor.reached[0]))
-    return SharedLoad(load, phi, spacing, lag, typical, floor, threshold)
-
-
-def _best_knot_spacing(logs: Sequence[Log]) -> float:
-    frame = float(np.median([log.dt for log in logs]))
-    choices = [
-        h
-        for h in _TRIED_KNOT_SPACINGS
-        if h == _TRIED_KNOT_SPACINGS[0] or h * frame <= _LARGEST_SPACING_S
-    ]
-    some = logs[:: max(1, len(logs) // 6)]
-
-    def residual_cost_at(spacing: float) -> float:
-        return float(
-            np.median([load_of_episode(EpisodeSignals(log, spacing)).spread.sum() for log in some])
-        )
-
-    return min(choices, key=residual_cost_at)
+    return SharedLoad(load, phi, lag, typical, floor, threshold)
 
 
 def load_of_episode(signals: EpisodeSignals) -> Hypothesis:

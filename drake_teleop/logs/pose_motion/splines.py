@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.linalg import solveh_banded
-from scipy.sparse import diags_array, eye_array
+from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
+from scipy.optimize import minimize_scalar
+from scipy.sparse import csr_array, diags_array, eye_array
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.poses import Poses
@@ -23,6 +24,7 @@ GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
 # Frequency times h where the residual is noise: just above the passed frequencies.
 _NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _CHUNK_ROWS = 2**17
+_MIN_SMOOTH_HZ = 0.05  # lowest cutoff frequency of the smoothed splines
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +80,9 @@ class PoseSplines:
     """Least-squares splines of poses of a frame P, with knots every `spacing` [s].
 
     Args:
-        limit_ends: expect second and higher derivatives at the ends as large as inside. Poses on
-            one side alone determine them with a several times larger error.
+        smooth: penalize the fifth derivative, with the weight of largest marginal likelihood, and
+            expect second and higher derivatives at the ends as large as inside. Poses on one side
+            alone determine these with a several times larger error.
     """
 
     def __init__(
@@ -88,10 +91,10 @@ class PoseSplines:
         spacing: float,
         imu_rows: ImuSplineRows | None = None,
         *,
-        limit_ends: bool = False,
+        smooth: bool = False,
     ) -> None:
         self.poses, self.spacing, self.rate, self.imu_rows = poses, spacing, poses.rate, imu_rows
-        self._limit_ends = limit_ends
+        self._smooth = smooth
         self._start = float(poses.t[0])
         t = poses.t - self._start
         self._blocks = _row_blocks(len(t))
@@ -109,8 +112,9 @@ class PoseSplines:
             zip(times, values, strict=True), knots, SPLINE_DEGREE, 7
         )
         if imu_rows is None:
-            spline = BSpline(knots, solveh_banded(gram, right), SPLINE_DEGREE)
-            return self._with_limited_ends(spline, gram, right) if self._limit_ends else spline
+            if self._smooth:
+                return self._fit_smooth(t, knots, gram, right)
+            return BSpline(knots, solveh_banded(gram, right), SPLINE_DEGREE)
         columns = []
         shifted_t = imu_rows.t - self._start
         inside = (shifted_t >= knots[0]) & (shifted_t <= knots[-1])
@@ -132,28 +136,50 @@ class PoseSplines:
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), SPLINE_DEGREE)
 
-    def _with_limited_ends(self, spline: BSpline, gram: Array, right: Array) -> BSpline:
-        t, count = self.poses.t - self._start, SPLINE_DEGREE + 1
-        inside = t[
-            (t > t[0] + SPLINE_DEGREE * self.spacing) & (t < t[-1] - SPLINE_DEGREE * self.spacing)
-        ]
-        if not len(inside):
-            return spline
+    def _fit_smooth(self, t: Array, knots: Array, gram: Array, right: Array) -> BSpline:
         values = np.hstack([self.poses.position, self.poses.quaternion])
-        noise = np.square(spline(t) - values).sum(axis=0) / max(len(t) - gram.shape[1], 1)
+        A = BSpline.design_matrix(t, knots, SPLINE_DEGREE)
+        root = diags_array(np.sqrt(np.diff(knots[SPLINE_DEGREE:-SPLINE_DEGREE])))
+        root = root @ _derivative_map(knots, SPLINE_DEGREE)
+        penalty = _band((root.T @ root).tocsr())
         coefficients = np.empty_like(right)
         for part in (slice(0, 3), slice(3, 7)):
-            band = gram.copy()
-            for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
-                basis = BSpline(spline.t, np.eye(gram.shape[1])[:, columns], SPLINE_DEGREE)
-                for order in range(2, count):
-                    power = np.square(spline(inside, order)[:, part]).mean() + 1e-300
-                    x = basis(at, order)
-                    outer = noise[part].mean() / power * np.multiply.outer(x, x)
-                    for k in range(count):
-                        band[SPLINE_DEGREE - k, columns][k:] += np.diag(outer, k)
+
+            def penalized(log_frequency: float, part: slice = part) -> tuple[Array, float, float]:
+                """Return band and noise variance of a weight, and the cost -2 log likelihood."""
+                weight = self.rate / (2 * np.pi * np.exp(log_frequency)) ** (2 * SPLINE_DEGREE)
+                band = gram + weight * penalty
+                factor = cholesky_banded(band)
+                c = cho_solve_banded((factor, False), right[:, part])
+                misfit = np.square(values[:, part] - A @ c).sum()
+                misfit += weight * np.square(root @ c).sum() + 1e-300
+                poses, rank = len(t) - SPLINE_DEGREE, len(c) - SPLINE_DEGREE
+                cost = poses * np.log(misfit) + 2 * np.log(factor[-1]).sum() - rank * np.log(weight)
+                return band, misfit / (poses * c.shape[1]), cost
+
+            bounds = np.log([_MIN_SMOOTH_HZ, self.rate])
+            best = minimize_scalar(
+                lambda x: penalized(x)[2], bounds=bounds, method="bounded", options={"xatol": 0.05}
+            )
+            band, noise, _ = penalized(best.x)
+            spline = BSpline(knots, solveh_banded(band, right[:, part]), SPLINE_DEGREE)
+            self._limit_ends(band, spline, t, noise)
             coefficients[:, part] = solveh_banded(band, right[:, part])
-        return BSpline(spline.t, coefficients, SPLINE_DEGREE)
+        return BSpline(knots, coefficients, SPLINE_DEGREE)
+
+    def _limit_ends(self, band: Array, spline: BSpline, t: Array, noise: float) -> None:
+        count, margin = SPLINE_DEGREE + 1, SPLINE_DEGREE * self.spacing
+        inside = t[(t > t[0] + margin) & (t < t[-1] - margin)]
+        if not len(inside):
+            return
+        powers = {k: np.square(spline(inside, k)).mean() + 1e-300 for k in range(2, count)}
+        for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
+            basis = BSpline(spline.t, np.eye(band.shape[1])[:, columns], SPLINE_DEGREE)
+            for order, power in powers.items():
+                x = basis(at, order)
+                outer = noise / power * np.multiply.outer(x, x)
+                for k in range(count):
+                    band[SPLINE_DEGREE - k, columns][k:] += np.diag(outer, k)
 
     def quaternion(self, t: Array) -> Array:
         """Return quaternions (N, 4) [w, x, y, z] of R_WP at times t, nearly of unit length."""
@@ -312,24 +338,34 @@ def _spline_normal_equations(
 
 
 def _normal_equations_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
-    change = eye_array(len(knots) - SPLINE_DEGREE - 1, format="csr")
-    for k in range(order):  # maps coefficients of a spline to those of its derivative
-        inner, degree = knots[k : len(knots) - k], SPLINE_DEGREE - k
-        span = inner[degree + 1 : -1] - inner[1 : -degree - 1]
-        n = len(span)
-        step = diags_array([-degree / span, degree / span], offsets=[0, 1], shape=(n, n + 1))
-        change = step @ change
+    change = _derivative_map(knots, order)
     degree, parts = SPLINE_DEGREE - order, _row_blocks(len(t))
     inner = knots[order : len(knots) - order]
     band, right = _spline_normal_equations(((t[p], x[p]) for p in parts), inner, degree, x.shape[1])
     upper = diags_array(
         [band[degree - k, k:] for k in range(degree + 1)], offsets=list(range(degree + 1))
     ).tocsr()
-    gram = (change.T @ (upper + upper.T - diags_array(band[degree])) @ change).tocsr()
+    gram = change.T @ (upper + upper.T - diags_array(band[degree])) @ change
+    return _band(gram.tocsr()), change.T @ right
+
+
+def _derivative_map(knots: Array, order: int) -> csr_array:
+    """Return the matrix from coefficients of a spline to those of its derivative."""
+    change = eye_array(len(knots) - SPLINE_DEGREE - 1, format="csr")
+    for k in range(order):
+        inner, degree = knots[k : len(knots) - k], SPLINE_DEGREE - k
+        span = inner[degree + 1 : -1] - inner[1 : -degree - 1]
+        n = len(span)
+        step = diags_array([-degree / span, degree / span], offsets=[0, 1], shape=(n, n + 1))
+        change = step @ change
+    return change
+
+
+def _band(gram: csr_array) -> Array:
     out = np.zeros((SPLINE_DEGREE + 1, gram.shape[0]))
     for k in range(SPLINE_DEGREE + 1):
         out[SPLINE_DEGREE - k, k:] = gram.diagonal(k)
-    return out, change.T @ right
+    return out
 
 
 def _vector_part_of_relative_quaternion(q: Array, p: Array) -> Array:
