@@ -1,14 +1,19 @@
 """How many planted faults of a dataset are named, and how good are wrench and contacts?
 
 Usage: python benchmarks/dataset.py [EPISODES] [FRAMES] [--rates HZ ...] [--tools N] [--json FILE]
-EPISODES are the clean ones of each dataset; FRAMES are for the CPU time (0: not measured).
+EPISODES are the clean ones of each dataset; FRAMES are for the CPU time, followed by a run that is
+killed six times (0: neither).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import random
 import resource
+import signal
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -176,7 +181,8 @@ def main() -> None:
                 print(cell, flush=True)
         if given.frames:
             report["long"] = long_dataset(Path(name) / "long", given.frames)
-            print(report["long"])
+            report["killed"] = killed_dataset(Path(name) / "killed")
+            print(report["long"], report["killed"])
     for fps in given.rates if report["cells"] else ():
         report[f"{fps:g} fps"] = summary = summarized(report["cells"], fps)
         print(fps, summary)
@@ -209,6 +215,29 @@ def long_dataset(folder: Path, frames: int) -> dict[str, float]:
     dataset_command(folder / "in", folder / "out", identify=True, quiet=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return {"frames": frames, "cpu_s": time.process_time() - started, "peak_GB": peak}
+
+
+def killed_dataset(folder: Path, whole_s: float = 40.0, kills: int = 6) -> dict[str, float]:
+    """Kill the command at random times; compare the copy with that of an undisturbed run."""
+    write_sample_dataset(folder / "in", episodes=100)
+    start = "from drake_teleop.cli.main import main; main()"
+    words = [sys.executable, "-c", start, "dataset", str(folder / "in"), "--identify", "--quiet"]
+    subprocess.run([*words, "--out", str(folder / "whole")], check=True)
+    pauses, killed = random.Random(52), 0
+    while killed < kills:
+        process = subprocess.Popen([*words, "--out", str(folder / "killed")])
+        try:
+            process.wait(timeout=pauses.uniform(1.0, whole_s / kills))
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            killed += process.wait() == -signal.SIGKILL
+    subprocess.run([*words, "--out", str(folder / "killed")], check=True)
+    copies = [
+        {str(file.relative_to(copy)): file.read_bytes() for file in copy.rglob("*.*")}
+        for copy in (folder / "whole" / "in", folder / "killed" / "in")
+    ]
+    return {"kills": killed, "same_bytes": float(copies[0] == copies[1]), "files": len(copies[0])}
 
 
 if __name__ == "__main__":

@@ -376,6 +376,11 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
         *(lambda f: f["long"]["peak_GB"], "GB", 0.0, 1.0),
     ),
     Claim(
+        *(LOGS, "A dataset whose command was killed six times has the same bytes"),
+        *("100 episodes; copies compared (1: equal)", "robot-learning.md", "dataset_long"),
+        *(lambda f: f["killed"]["same_bytes"] * (f["killed"]["kills"] == 6), "", 1.0, 1.0),
+    ),
+    Claim(
         *(LOGS, "Planted faults that `dataset` names beside four published checkers"),
         "20 kinds, 30 fps; they report none, except three outliers",
         *("robot-learning.md", "dataset_checkers", lambda f: f["named_by_ours"], "", 19.0, 20.0),

@@ -24,6 +24,7 @@ GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
 # Frequency times h where the residual is noise: just above the passed frequencies.
 _NOISE_BAND_OVER_KNOT_RATE = (0.7, 1.5)
 _CHUNK_ROWS = 2**17
+_LIMITED_ORDERS = range(1, 5)  # of derivatives at the ends
 _MIN_SMOOTH_HZ = 0.05  # lowest cutoff frequency of the smoothed splines
 
 
@@ -81,8 +82,8 @@ class PoseSplines:
 
     Args:
         smooth: penalize the fifth derivative, with the weight of largest marginal likelihood, and
-            expect second and higher derivatives at the ends as large as inside. Poses on one side
-            alone determine these with a several times larger error.
+            expect derivatives at the ends as large as inside, with the same correlations. Poses on
+            one side alone determine these with a several times larger error.
     """
 
     def __init__(
@@ -172,14 +173,17 @@ class PoseSplines:
         inside = t[(t > t[0] + margin) & (t < t[-1] - margin)]
         if not len(inside):
             return
-        powers = {k: np.square(spline(inside, k)).mean() + 1e-300 for k in range(2, count)}
+        x = np.stack([spline(inside, order) for order in _LIMITED_ORDERS])
+        covariance = np.einsum("inc,jnc->ij", x, x) / (x.shape[1] * x.shape[2])
+        std = np.sqrt(np.diag(covariance)) + 1e-150
+        correlation = covariance / np.outer(std, std) + 1e-6 * np.eye(len(std))
+        weight = noise * np.linalg.inv(correlation) / np.outer(std, std)
         for at, columns in ((t[0], slice(count)), (t[-1], slice(-count, None))):
             basis = BSpline(spline.t, np.eye(band.shape[1])[:, columns], SPLINE_DEGREE)
-            for order, power in powers.items():
-                x = basis(at, order)
-                outer = noise / power * np.multiply.outer(x, x)
-                for k in range(count):
-                    band[SPLINE_DEGREE - k, columns][k:] += np.diag(outer, k)
+            values = np.stack([basis(at, order) for order in _LIMITED_ORDERS])
+            limit = values.T @ weight @ values
+            for k in range(count):
+                band[SPLINE_DEGREE - k, columns][k:] += np.diag(limit, k)
 
     def quaternion(self, t: Array) -> Array:
         """Return quaternions (N, 4) [w, x, y, z] of R_WP at times t, nearly of unit length."""
