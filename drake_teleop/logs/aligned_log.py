@@ -140,7 +140,7 @@ class AlignedLog:
     edge: NDArray[np.bool_]
 
 
-def aligned_log(
+def read_aligned_log(
     path: str | Path,
     phi: Array,
     usual_s: float,

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
 _ROOT_OF_2, _ROOT_4_OF_3 = math.sqrt(2.0), 3.0**0.25
-MODES = ("delayed", "predicted")
+CAUSAL_MODES = ("delayed", "predicted")
 
 
 @dataclass(frozen=True)
@@ -91,9 +91,9 @@ def causal_wrenches(
     The delay of the motion behind the wrench, `delay_s`, is rounded up to full samples. The mode
     "delayed" keeps the lag of the wrenches (N, 6), "predicted" extrapolates over it.
     """
-    if mode not in MODES:
+    if mode not in CAUSAL_MODES:
         raise DrakeTeleopError(
-            f"{mode!r} is not a causal mode", where="causal", remedy=f"give one of {MODES}"
+            f"{mode!r} is not a causal mode", where="causal", remedy=f"give one of {CAUSAL_MODES}"
         )
     wait = max(0, math.ceil(delay_s / dt - 1e-6))
     lag = wait * dt + filter_lag(dt, cutoff_hz)

@@ -33,9 +33,8 @@ MIN_REPEATED_SHARE = 0.05
 MIN_REPEATED_BLOCK = 5
 _MAX_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
-_CANONICAL = {"f_x", "tau_x"}
-_CANONICAL = {"f_x", "tau_x"}
-_QUANTITIES = (
+_WRENCH_NAMES = {"f_x", "tau_x"}
+_QUANTITY_NAMES = (
     *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
     *("orientation", "position", "gravity"),
 )
@@ -54,7 +53,7 @@ def inspect_command(
     make_folder(out)
     if not others and log.suffix.lower() in (".yaml", ".yml"):
         _inspect_described_log(load_description(log), str(log), {}, summary)
-    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _CANONICAL:
+    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _WRENCH_NAMES:
         summary["kind"] = "canonical"
         _inspect_described_log(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
@@ -93,12 +92,12 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         )
     summary["kind"] = "unknown"
     table = read_table(path)
-    header = not _are_numbers(list(table.columns))
+    header = not _are_names_numbers(list(table.columns))
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
 
-def _are_numbers(names: Sequence[str]) -> bool:
+def _are_names_numbers(names: Sequence[str]) -> bool:
     with suppress(ValueError):
         for name in names:  # polars adds a suffix to repeated names
             float(name.partition("_duplicated_")[0])
@@ -179,7 +178,7 @@ def _inspect_stream(
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
         str(column)
-        for field in _QUANTITIES
+        for field in _QUANTITY_NAMES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
     values = table.raw_side_by_side(columns, f"{source}:{name}")

@@ -64,11 +64,11 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         yield from _axis_permutation_candidates(state)
     if data.gravity_W is not None:
         if "gravity" not in model.parts:
-            yield from _fit_part(
+            yield from _fit_extension(
                 state, "gravity", [start_of_tilt_fit(state), None], _is_tilt_significant
             )
         if "weight" not in model.parts and data.accelerates_enough:
-            yield from _fit_part(state, "weight", [None], _is_weight_significant)
+            yield from _fit_extension(state, "weight", [None], _is_weight_significant)
     if "torque factor" not in model.parts and data.accelerates_enough:
         yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
@@ -76,7 +76,7 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         if found is not None:
             yield _scored_candidate(kind, state, found, times=1)
     if not {"linear drift", "drift"} & set(model.parts):
-        yield from _fit_part(state, "linear drift", [None], _is_drift_significant)
+        yield from _fit_extension(state, "linear drift", [None], _is_drift_significant)
     for c in range(6):
         if c not in model.gains:
             larger = state.refit(replace(model, gains=(*model.gains, c)))
@@ -87,12 +87,12 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
             ):
                 yield _scored_candidate("gain", state, larger)
     if "frame" not in model.parts and data.accelerates_enough:
-        yield from _fit_part(
+        yield from _fit_extension(
             state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _SMALLEST_SHIFT_M
         )
     if first and not model.parts:
         angle = np.radians(_SMALLEST_ROTATION_DEG)
-        yield from _fit_part(
+        yield from _fit_extension(
             state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
         )
     spans = find_contact_spans(state)
@@ -101,9 +101,9 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)
     if data.positions and "cable" not in model.parts and data.accelerates_enough:
-        yield from _fit_part(state, "cable", [None], lambda _: True)
+        yield from _fit_extension(state, "cable", [None], lambda _: True)
     if "drift" not in model.parts and "linear drift" not in model.parts:
-        yield from _fit_part(state, "drift", [None], _is_drift_significant)
+        yield from _fit_extension(state, "drift", [None], _is_drift_significant)
 
 
 def _scored_candidate(
@@ -117,7 +117,7 @@ def _scored_candidate(
     return Candidate(name, larger, float(score))
 
 
-def _fit_part(
+def _fit_extension(
     state: State, name: str, starts: list[Array | None], is_significant: Callable[[State], bool]
 ) -> Iterator[Candidate]:
     model = state.model.with_extension(name)

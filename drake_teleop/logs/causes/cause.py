@@ -15,7 +15,7 @@ from drake_teleop.logs.causes.candidates import fits_with_similar_torque_factors
 from drake_teleop.logs.causes.state import State
 
 _HAND_DISTANCE_S, _HAND_CONTACT_S = 0.8, 1.2
-CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGE_CAUSES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
 TEMPORARY_CAUSES = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
@@ -172,9 +172,9 @@ def _gain_error_cause(state: State, c: int) -> Cause:
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
     return Cause(
         "gain",
-        f"{CHANNELS[c]} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other"
+        f"{CHANNEL_NAMES[c]} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other"
         " channels allow; calibrate the sensor",
-        values={"channel": CHANNELS[c], "gain": 1.0 + float(value[0])},
+        values={"channel": CHANNEL_NAMES[c], "gain": 1.0 + float(value[0])},
     )
 
 

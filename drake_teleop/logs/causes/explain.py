@@ -31,10 +31,10 @@ from drake_teleop.logs.causes.changes import (
 from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     block_deviations,
-    covariance_of,
-    factor_covariance,
     gain_covariance,
+    load_covariance,
     misfit_deviations,
+    torque_unit_covariance,
 )
 from drake_teleop.logs.causes.model import DELAY_PARAMETER, LOAD_PARAMETERS, Model
 from drake_teleop.logs.causes.state import State
@@ -283,7 +283,7 @@ class Explanation:
     given: tuple[str, ...] = ()
 
     @property
-    def misfit(self) -> bool:
+    def is_misfit(self) -> bool:
         return not self.explained and is_clear_misfit(self.state)
 
     @property
@@ -294,7 +294,7 @@ class Explanation:
         return len(model.gains) > 1 or bool(model.gains and others)
 
 
-def explain(
+def explain_misfit(
     data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
@@ -305,14 +305,14 @@ def explain(
     with one_blas_thread():
         state, delay_s, rejected = search_causes(data, with_delay, given)
         blocks = block_deviations(state)
-        gains = gain_covariance(state) + factor_covariance(state)
-        covariance = covariance_of(state, rejected, blocks, gains)
+        gains = gain_covariance(state) + torque_unit_covariance(state)
+        covariance = load_covariance(state, rejected, blocks, gains)
         causes = causes_of_fit(state, given)
         only_noise = residual_is_noise(state)
         if (
             not causes
             and (only_noise or may_be_coloured_noise(state))
-            and _is_no_load(state, covariance)
+            and _is_load_absent(state, covariance)
         ):
             causes = [_no_load_cause(state, covariance)]
         removed = None
@@ -332,7 +332,7 @@ def explain(
         )
 
 
-def _is_no_load(state: State, covariance: Array) -> bool:
+def _is_load_absent(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SIGNIFICANT * deviation))
     return bool(mass < least and deviation < 0.1)

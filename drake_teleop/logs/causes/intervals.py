@@ -13,7 +13,7 @@ from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_similar_torque_factors
 from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
 from drake_teleop.logs.causes.model import LOAD_PARAMETERS
-from drake_teleop.logs.causes.state import Rows, State, regularized_inverse
+from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
 
 _NUM_JACKKNIFE_PARTS = 12
 _TOLERATED_RESIDUAL_RATIO, _USUAL_RESIDUAL_RATIO = 1.5, 1.15
@@ -31,7 +31,7 @@ _GAIN_ERRORS, _MIN_GAIN_LIKELIHOOD, _MIN_GAIN_SHARE = np.geomspace(1e-4, 0.1, 31
 _LARGEST_GAIN_ERROR = 0.025
 
 
-def covariance_of(
+def load_covariance(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
@@ -108,7 +108,7 @@ def gain_covariance(state: State) -> Array:
     return np.asarray(effects @ effects.T)
 
 
-def factor_covariance(state: State) -> Array:
+def torque_unit_covariance(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in fits_with_similar_torque_factors(state):
@@ -152,7 +152,7 @@ def block_deviations(state: State) -> Array:
     for part in at:
         used = np.zeros(len(rows.used), bool)
         used[part] = True
-        few = Rows(rows.data, used, rows.times, rows.columns)
+        few = UsedRows(rows.data, used, rows.times, rows.columns)
         gram, pull = replace(state.fit, rows=few).normal_equations(state.model, state.x)
         moves.append((regularized_inverse(whole - gram) @ (right - pull))[LOAD_PARAMETERS])
     spread = np.array(moves) - np.mean(moves, axis=0)

@@ -16,7 +16,7 @@ from drake_teleop.logs.causes.instants import (
     ALPHA,
     CONSTANT_COLUMN,
     FORCES,
-    MOTION,
+    MOTION_COLUMNS,
     NUM_SIGNALS,
     PRODUCTS,
     RATES,
@@ -41,16 +41,16 @@ _EXTENSION_SIZES = {
 }
 _EXTENSION_LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
-_R_OF_STEP = slice(16, 25)
-_LARGEST_DELAY = 0.03  # s, in an iteration
-_ROTATION_STEP = 1e-4  # rad, step of the numerical derivative
+_STEP_ROTATION_COLUMNS = slice(16, 25)
+_MAX_DELAY_STEP_S = 0.03  # s, in an iteration
+_ROTATION_STEP_RAD = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
 _SYMMETRIC_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
-class Step:
+class StepChange:
     """Change of the offsets (6 parameters) or of the load (10 parameters) at `time` [s]."""
 
     kind: str
@@ -75,7 +75,7 @@ class Model:
 
     parts: tuple[str, ...] = ()
     gains: tuple[int, ...] = ()
-    steps: tuple[Step, ...] = ()
+    steps: tuple[StepChange, ...] = ()
     axes: Array = field(default_factory=lambda: np.eye(3))
     factor: float = 1.0
 
@@ -102,18 +102,18 @@ class Model:
     def columns(self) -> NDArray[np.intp]:
         """Indices (k,) of the signals in y that the model uses."""
         wide = bool({"gravity", "cable"} & set(self.parts))
-        kept = np.ones(NUM_SIGNALS + len(MOTION) * len(self.steps), bool)
+        kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
         if not wide:
             kept[R], kept[RP] = False, False
             for i in range(len(self.steps)):
-                kept[_columns_of_step(i)][_R_OF_STEP] = False
+                kept[_columns_of_step(i)][_STEP_ROTATION_COLUMNS] = False
         return np.flatnonzero(kept)
 
     @cached_property
     def limits(self) -> Array:
         """Largest change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
-        out[DELAY_PARAMETER] = _LARGEST_DELAY
+        out[DELAY_PARAMETER] = _MAX_DELAY_STEP_S
         for name, where in self.slices.items():
             out[where] = _EXTENSION_LIMITS.get(
                 name.split(" ")[0] if "gain" in name else name, np.inf
@@ -135,14 +135,14 @@ class Model:
 
     def wrench_coefficients(self, x: Array) -> Array:
         """Return the wrench's coefficients (B, 6, W) in the signals, for parameters x (B, size)."""
-        width, parts = NUM_SIGNALS + len(MOTION) * len(self.steps), self.slices
+        width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.slices
         motion = self._motion_coefficients(x)
         out = np.zeros((len(x), 6, width))
         out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
                 out[..., _columns_of_step(i)] = (
-                    _load_coefficients(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
+                    _load_coefficients(x[:, parts[f"step {i}"]]) @ motion[..., MOTION_COLUMNS]
                 )
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
@@ -197,7 +197,7 @@ class Model:
         """Return the derivative (size, 6, k) of the wrench's coefficients by parameters x."""
         steps = np.ones(self.size)
         if "rotation" in self.slices:
-            steps[self.slices["rotation"]] = _ROTATION_STEP
+            steps[self.slices["rotation"]] = _ROTATION_STEP_RAD
         moves = np.diag(steps)
         both = self.wrench_coefficients(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]
@@ -211,7 +211,7 @@ class Model:
 
 
 def _columns_of_step(i: int) -> slice:
-    return slice(NUM_SIGNALS + len(MOTION) * i, NUM_SIGNALS + len(MOTION) * (i + 1))
+    return slice(NUM_SIGNALS + len(MOTION_COLUMNS) * i, NUM_SIGNALS + len(MOTION_COLUMNS) * (i + 1))
 
 
 def _load_coefficients(phi: Array) -> Array:

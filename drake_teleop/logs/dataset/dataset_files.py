@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, whole_file, write_table
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.array_files import import_optional, read_hdf5, read_zarr
+from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.table_files import columns_with_nested, read_table
@@ -127,7 +127,7 @@ def _open_lerobot(path: Path) -> Dataset:
 def _open_hdf5(path: Path) -> Dataset:
     names: list[str] = []
     settings: dict[str, Any] = {}
-    with import_optional("h5py", path).File(path, "r") as file:
+    with import_optional_module("h5py", path).File(path, "r") as file:
         if "data" in file:
             data = file["data"]
             names = sorted(data, key=lambda name: (len(name), name))
@@ -253,7 +253,7 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
 
 
 def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> None:
-    h5py = import_optional("h5py", dataset.path)
+    h5py = import_optional_module("h5py", dataset.path)
     make_folder(out.parent)
     with whole_file(out) as temporary:
         shutil.copyfile(dataset.path, temporary)
@@ -268,7 +268,7 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> N
 
 
 def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
-    zarr = import_optional("zarr", out)
+    zarr = import_optional_module("zarr", out)
     group, new = zarr.open_group(out / "data", mode="r+"), _join_columns(columns)
     for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
         array = values.astype(np.float32 if values.ndim == 2 else bool)

@@ -37,7 +37,7 @@ _COST_PER_DEVIATION, _COST_FRAMES = (
     40.0,
 )  # required reduction of the log spread, for each deviation
 _NUM_START_PARTS = 4
-_FLOOR_SHARE = 0.3
+_MIN_SPREAD_SHARE = 0.3
 _INLIER_DEVIATIONS, _STEP_DEVIATIONS = 5.0, 5.0
 _FEWEST_STEP_FRAMES, _STEP_SHARE, _NUM_TRIED_STEPS = 12, 0.12, 20
 _NOISE_MARGIN = 1.5
@@ -104,7 +104,7 @@ def find_hypothesis(
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = HypothesisSearch(predict, regress, usual_lag, _FLOOR_SHARE * typical)
+    search = HypothesisSearch(predict, regress, usual_lag, _MIN_SPREAD_SHARE * typical)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual

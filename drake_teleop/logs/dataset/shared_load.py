@@ -28,7 +28,7 @@ from drake_teleop.logs.read.canonical import Log
 
 _TRIED_KNOT_SPACINGS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # knot distances [frames]
 _LARGEST_SPACING_S = 0.25
-_SMALLEST_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
+_MIN_HALF_WIDTH = np.repeat([1e-3, 1e-4], 3)  # N, N m
 _LARGEST_EXCESS, _MEMBER_EXCESS = 6.0, 2.0  # log spread beyond that of an episode's own load
 _LAG_STEP, _MAX_LAG = 0.5, 3.0  # frames
 _FREE_DEVIATIONS, _CONTACT_MARGIN_FRAMES = (
@@ -125,7 +125,7 @@ def _best_knot_spacing(logs: Sequence[Log]) -> float:
 def load_of_episode(signals: EpisodeSignals) -> Hypothesis:
     """Return the load that explains an episode best, and its lag."""
     search = HypothesisSearch(
-        signals.reading_predictor(np.zeros(10)), signals.regressor_at_lag, 0.0, _SMALLEST_WIDTH
+        signals.reading_predictor(np.zeros(10)), signals.regressor_at_lag, 0.0, _MIN_HALF_WIDTH
     )
     lags = np.arange(-_MAX_LAG, _MAX_LAG + 0.1, _LAG_STEP)
     return min(
@@ -145,7 +145,7 @@ def _excess_spread(
 
 def _hypothesis_at_best_lag(signals: EpisodeSignals, phi: Array, near: float) -> Hypothesis:
     search = HypothesisSearch(
-        signals.reading_predictor(phi), signals.regressor_at_lag, near, _SMALLEST_WIDTH
+        signals.reading_predictor(phi), signals.regressor_at_lag, near, _MIN_HALF_WIDTH
     )
     lags = near + np.arange(-LAG_STEPS_PER_FRAME, LAG_STEPS_PER_FRAME + 1) / LAG_STEPS_PER_FRAME
     return min(

@@ -12,12 +12,12 @@ from drake_teleop.common.numeric import Array, parabola_minimum
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FORCE_COLUMNS,
-    Complex,
+    ComplexArray,
     FrequencyBands,
     NoiseLevels,
     WrenchGrid,
     end_taper,
-    frequency_bands,
+    make_frequency_bands,
     random_walk_shape,
     second_moments,
     shift_spectrum,
@@ -37,10 +37,10 @@ TRIED_KNOT_SPACINGS_S = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 """Knot distances that are tried first; then two between the best and its neighbours [s]."""
 MAX_DELAY_CHANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
-ROUNDING = 1e-7
+ROUNDING_SHARE = 1e-7
 """Least noise of a channel relative to the wrench."""
 _COARSE_STEP_S, _FINE_STEP_S, _FINEST_STEP_S = 0.016, 1e-3, 1e-5
-_ITERATIONS = 4
+_FIT_ITERATIONS = 4
 _SEARCH_RATE_HZ = 125.0
 _RANK_TOLERANCE, _FULL_RANK_TOLERANCE = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
@@ -101,7 +101,7 @@ def _fit_moments(
     power = np.maximum(ff / levels.sizes[:, None], floor).mean(axis=-2, keepdims=True)
     power = np.broadcast_to(power, (*zf.shape[:-2], 6))
     flat = zz.reshape(*zz.shape[:-2], -1)
-    for _ in range(_ITERATIONS):
+    for _ in range(_FIT_ITERATIONS):
         weight = 1.0 / power
         gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, *zz.shape[-2:])
         right = np.swapaxes(np.sum(zf * weight[..., None, :], axis=-3), -1, -2)
@@ -140,7 +140,7 @@ def rounding_error_power(Z: Array, sizes: Array) -> Array:
 def _rounding_power(ff: Array, sizes: Array) -> Array:
     power = ff.sum(axis=0) / sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
-    return np.maximum(ROUNDING**2 * both, 1e-60)
+    return np.maximum(ROUNDING_SHARE**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, of: FrequencyBands) -> NoiseLevels:
@@ -166,8 +166,8 @@ class Spectra:
     """
 
     of: FrequencyBands
-    wrench: Complex
-    signals: Complex
+    wrench: ComplexArray
+    signals: ComplexArray
     delay: float
     grid: WrenchGrid
     taper: Array
@@ -281,7 +281,7 @@ class FitWindow:
 
     def spectra_at_delay(self, splines: PoseSplines, delay: float) -> Spectra:
         """Return spectra of the wrench, and of the motion `delay` [s] later."""
-        of = frequency_bands(self.grid, self.taper, self.top)
+        of = make_frequency_bands(self.grid, self.taper, self.top)
         count = len(of.frequency)
         zeta = splines.signals(self.grid.t + delay, self.gravity_W)
         wrench = wrench_spectrum(self.grid, self.taper, count)
@@ -390,7 +390,7 @@ def _allowed_spacings(cache: SplineCache) -> list[float]:
 
 _MAX_CLOCK_RATE_STEPS, _MIN_LIKELIHOOD_GAIN = 3, 25.0
 # A larger change of the delay [s] is not caused by a clock.
-_MAX_CHANGE_S = 0.2
+_MAX_CLOCK_CHANGE_S = 0.2
 
 
 def estimate_clock_rate_error(
@@ -405,7 +405,7 @@ def estimate_clock_rate_error(
         trial = best + step
         if gain < _MIN_LIKELIHOOD_GAIN and best == 0.0:
             return 0.0
-        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CHANGE_S:
+        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CLOCK_CHANGE_S:
             break
         splines = PoseSplines(correct_clock_rate(cache.poses, trial, grid, delay), spacing)
         now = first.with_motion(splines, window.gravity_W, delay)

@@ -17,7 +17,7 @@ from drake_teleop.logs.pose_motion.splines import (
     passed_noise_share,
 )
 
-Complex = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]
 
 MAX_FREQUENCY_HZ = 25.0
 """Highest frequency that is used [Hz]."""
@@ -101,7 +101,7 @@ class FrequencyBands:
         return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])
 
 
-def frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
+def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
     """Return frequency bands up to `top` [Hz]; small groups are joined to the next."""
     frequency = grid.frequency[grid.frequency <= top]
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.transform_length)
@@ -145,7 +145,7 @@ def distance_to_flag(flags: NDArray[np.bool_]) -> Array:
     return np.minimum(at - before, after - at)
 
 
-def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> Complex:
+def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> ComplexArray:
     """Return the spectrum (count, 6) of the tapered wrench, scaled as those of the signals."""
     fine = np.zeros(grid.transform_length * grid.stride)
     n = len(grid.wrench)
@@ -157,7 +157,7 @@ def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> Complex:
     return out
 
 
-def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> Complex:
+def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> ComplexArray:
     """Return the spectrum (count, 16) of tapered motion signals zeta (M, 16), Eq. (T73)."""
     out = np.empty((count, zeta.shape[1]), np.complex128)
     for c, column in enumerate(zeta.T):
@@ -165,7 +165,7 @@ def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> 
     return out
 
 
-def shift_spectrum(spectrum: Complex, frequency: Array, shift: float) -> Complex:
+def shift_spectrum(spectrum: ComplexArray, frequency: Array, shift: float) -> ComplexArray:
     """Return spectra (K, 16) of zeta and taper `shift` [s] later; the constant is unchanged."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
@@ -189,7 +189,7 @@ def _filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complex
 
 
 def second_moments(
-    zeta: Complex, wrench: Complex, of: FrequencyBands, rates: Complex | None = None
+    zeta: ComplexArray, wrench: ComplexArray, of: FrequencyBands, rates: ComplexArray | None = None
 ) -> Array:
     """Return second moments (bands, 38, 38) of y = [zeta (16), F (6), d zeta/dt (16)].
 

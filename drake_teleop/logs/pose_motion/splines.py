@@ -55,7 +55,7 @@ class ImuSplineRows:
         if omega is not None:
             w, v = q[:, :1], q[:, 1:]
             real = -np.sum(v * omega, axis=1, keepdims=True)
-            rates = 0.5 * np.hstack([real, w * omega + _cross(v, omega)])
+            rates = 0.5 * np.hstack([real, w * omega + _cross_products(v, omega)])
         return replace(self, acceleration_W=acceleration, quaternion_rate=rates)
 
     def remaining_noise_shares(self, frequency: Array) -> tuple[Array, Array]:
@@ -97,11 +97,11 @@ class PoseSplines:
         self._blocks = _row_blocks(len(t))
         knots = _knots(t, spacing, with_imu=imu_rows is not None)
         try:
-            self._spline = self._fit(t, knots)
+            self._spline = self._fit_spline(t, knots)
         except np.linalg.LinAlgError:  # too few poses per knot between gaps
-            self._spline = self._fit(t, _thin_knots(knots, t))
+            self._spline = self._fit_spline(t, _thin_knots(knots, t))
 
-    def _fit(self, t: Array, knots: Array) -> BSpline:
+    def _fit_spline(self, t: Array, knots: Array) -> BSpline:
         poses, imu_rows = self.poses, self.imu_rows
         values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._blocks)
         times = (t[x] for x in self._blocks)
@@ -245,7 +245,7 @@ class SplineCache:
 
     def __init__(self, poses: Poses, imu_rows: ImuSplineRows | None = None) -> None:
         self.poses, self.imu_rows = poses, imu_rows
-        self._fit: dict[float, PoseSplines] = {}
+        self._fit_spline: dict[float, PoseSplines] = {}
 
     @property
     def rate(self) -> float:
@@ -253,9 +253,9 @@ class SplineCache:
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def splines_with_spacing(self, spacing: float) -> PoseSplines:
-        if spacing not in self._fit:
-            self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
-        return self._fit[spacing]
+        if spacing not in self._fit_spline:
+            self._fit_spline[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
+        return self._fit_spline[spacing]
 
 
 def passed_noise_share(frequency: Array, spacing: float) -> Array:
@@ -334,18 +334,18 @@ def _normal_equations_of_rates(t: Array, x: Array, knots: Array, order: int) -> 
 
 def _vector_part_of_relative_quaternion(q: Array, p: Array) -> Array:
     v, w = q[:, 1:], p[:, 1:]
-    out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)
+    out: Array = q[:, :1] * w - p[:, :1] * v - _cross_products(v, w)
     return out
 
 
 def _rotate_to_P(q: Array, n: Array, x: Array) -> Array:
     v = -q[:, 1:]
-    once = _cross(v, x)
-    out: Array = x + 2.0 * (q[:, :1] * once + _cross(v, once)) / n
+    once = _cross_products(v, x)
+    out: Array = x + 2.0 * (q[:, :1] * once + _cross_products(v, once)) / n
     return out
 
 
-def _cross(a: Array, b: Array) -> Array:
+def _cross_products(a: Array, b: Array) -> Array:
     out = np.empty(a.shape)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.subtract(a[:, j] * b[:, k], a[:, k] * b[:, j], out=out[:, i])

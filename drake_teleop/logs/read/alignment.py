@@ -16,7 +16,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
 
-_MIN_SAMPLES = 8
+_MIN_ALIGNED_SAMPLES = 8
 _CHUNK_ROWS = 2**18
 _MIN_WINDOW_SAMPLES = 9
 _POLYNOMIAL_DEGREE = 5
@@ -172,7 +172,7 @@ def remove_delay(log: Log, delay_s: float) -> Log:
         return log
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
-    if known.sum() < _MIN_SAMPLES:
+    if known.sum() < _MIN_ALIGNED_SAMPLES:
         raise DrakeTeleopError(
             f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples",
             where=log.source,
@@ -227,7 +227,7 @@ def widen_flags(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 
 DELAY_SEARCH_RANGE_S = 0.25
-_MAX_SAMPLES = 5000
+_MAX_DELAY_SAMPLES = 5000
 _MIN_DELAY_SAMPLES = 32
 
 
@@ -247,7 +247,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_DELAY_SAMPLES:
         return None
-    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES)
+    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_DELAY_SAMPLES)
     cost = _cost_of_shift(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([cost(shift) for shift in shifts])

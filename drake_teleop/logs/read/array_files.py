@@ -31,7 +31,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
     Names are relative to `group`. `transpose` reverses the axes, as for files of MATLAB. Raise
     OSError for a damaged file, ValueError for a too large array or one in another file.
     """
-    h5py, found = import_optional("h5py", path), dict[str, NDArray]()
+    h5py, found = import_optional_module("h5py", path), dict[str, NDArray]()
     with h5py.File(path, "r") as file:
 
         def add_dataset(name: str, item: Any) -> None:
@@ -47,7 +47,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
     """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
-    zarr = import_optional("zarr", path)
+    zarr = import_optional_module("zarr", path)
     group = zarr.open_group(path, mode="r")
     members = group.members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}
@@ -71,7 +71,7 @@ def _is_numeric_table(item: Any, transpose: bool) -> bool:
     return True
 
 
-def import_optional(name: str, path: Path) -> Any:
+def import_optional_module(name: str, path: Path) -> Any:
     try:
         return import_module(name)
     except ImportError:
@@ -90,7 +90,7 @@ _MAT_HEADER_BYTES, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = (
     1 << 11,
     20,
 )
-_NUMERIC_CLASSES = range(6, 16)  # numeric classes
+_MAT_NUMERIC_CLASSES = range(6, 16)  # numeric classes
 _MAT_NUMBER_TYPES = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
     12: "i8",
@@ -155,7 +155,7 @@ def _add_variable(
         raise ValueError(_DAMAGED_FILE_MESSAGE)
     (flags, *_), size = (_parse_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
-    if flags & 0xFF in _NUMERIC_CLASSES and not flags & _COMPLEX:
+    if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _COMPLEX:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
         _add_array(name, _parse_numbers(parts[3], order).reshape(size, order="F"), found)

@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.explain import explain
+from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record, delay_of_free_fit
 from drake_teleop.logs.read.alignment import remove_delay, resample
 from drake_teleop.logs.read.canonical import Log
@@ -231,7 +231,7 @@ def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     )
 
 
-_MAX_DEVIATION_DEG = 2.0
+_MAX_GRAVITY_DEVIATION_DEG = 2.0
 
 
 def estimate_auto_gravity(
@@ -240,7 +240,7 @@ def estimate_auto_gravity(
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
-    explanation = explain(
+    explanation = explain_misfit(
         block_means_of_log(log),
         lambda delay_s: block_means_of_log(remove_delay(log, delay_s)),
         ("gravity",),
@@ -252,7 +252,7 @@ def estimate_auto_gravity(
         across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
         spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
         deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
-    if not deviation < _MAX_DEVIATION_DEG:
+    if not deviation < _MAX_GRAVITY_DEVIATION_DEG:
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
             where=f"{source}:gravity",

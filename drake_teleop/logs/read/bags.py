@@ -102,7 +102,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
             for message in [reader.deserialize(raw, connection.msgtype)]
             for part in getattr(message, "transforms", [message])
         )
-        blocks = _read_blocks(pairs, child_frame, f"{path}:{topic}")
+        blocks = _read_message_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
     columns = _join_blocks(blocks)
@@ -221,7 +221,7 @@ def _limit_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def _read_blocks(
+def _read_message_blocks(
     pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
     children: set[str] = set()

@@ -26,7 +26,7 @@ ANGULAR_VELOCITY_COLUMNS = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION_COLUMNS = ("alpha_x", "alpha_y", "alpha_z")
 QUATERNION_COLUMNS = ("q_w", "q_x", "q_y", "q_z")
 POSITION_COLUMNS = ("p_x", "p_y", "p_z")
-_KINEMATICS = {
+_KINEMATIC_COLUMNS = {
     "specific_force": SPECIFIC_FORCE_COLUMNS,
     "angular_velocity": ANGULAR_VELOCITY_COLUMNS,
     "angular_acceleration": ANGULAR_ACCELERATION_COLUMNS,
@@ -193,7 +193,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
     table.numbers(WRENCH_COLUMNS, 6, str(path))
     fields: dict[str, dict[str, Any]] = {
         name: {"columns": names}
-        for name, names in _KINEMATICS.items()
+        for name, names in _KINEMATIC_COLUMNS.items()
         if are_columns_present(names)
     }
     if "orientation" in fields:

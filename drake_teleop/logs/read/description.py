@@ -40,16 +40,16 @@ from drake_teleop.logs.read.description_fields import (
     Position,
     PositionOrAuto,
     RotationOrAuto,
-    Strict,
+    StrictModel,
     Torque,
     Weight,
 )
 
-ONLY_IN_DESCRIPTION = "in a log description of this table; the canonical form has no such line"
+YAML_ONLY_NOTE = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
 
 
-class Time(Strict):
+class Time(StrictModel):
     """Time of the rows of a stream: a column of stamps or a nominal rate."""
 
     column: Column | None = None
@@ -77,7 +77,7 @@ class Time(Strict):
         return self
 
 
-class Orientation(Strict):
+class Orientation(StrictModel):
     """Orientation R_WS of S, or of the stream's frame if `frame` is a rotation."""
 
     columns: tuple[Column, ...]
@@ -118,7 +118,7 @@ _TOPIC_DEFAULTS: dict[str, dict[str, Any]] = {
 }
 
 
-class _Stream(Strict):
+class _Stream(StrictModel):
     file: Path
     header: bool = True
 
@@ -134,7 +134,7 @@ class _Stream(Strict):
         return tuple(c for quantity in quantities for c in getattr(quantity, "columns", ()))
 
 
-class _Recorded(_Stream):
+class _RecordedStream(_Stream):
     topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
     child_frame: str | None = Field(
         default=None, description="child frame of the transform in the topic"
@@ -165,7 +165,7 @@ class _Recorded(_Stream):
         return self.file.joinpath(*f"{self.topic}/{self.child_frame or ''}".split("/"))
 
 
-class Wrench(_Recorded):
+class Wrench(_RecordedStream):
     """File and columns of the force-torque sensor."""
 
     _defaults = ("force", "torque")
@@ -178,7 +178,7 @@ class Wrench(_Recorded):
     gain_std: GainStd = 0.0
 
 
-class Imu(_Recorded):
+class Imu(_RecordedStream):
     """File and columns of an IMU."""
 
     _defaults = ("specific_force", "angular_velocity")
@@ -209,7 +209,7 @@ class Imu(_Recorded):
         return self.frame == "auto" or self.position == "auto"
 
 
-class Pose(_Recorded):
+class Pose(_RecordedStream):
     """File and columns of a pose of sensor, flange or TCP."""
 
     _defaults = ("orientation", "position")
@@ -279,7 +279,7 @@ class Static(_Stream):
         return self
 
 
-class Description(Strict):
+class Description(StrictModel):
     """Description of a log: a wrench with imu, pose or both; or static poses."""
 
     gravity: Gravity = (0.0, 0.0, -STANDARD_GRAVITY)

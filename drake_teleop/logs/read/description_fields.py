@@ -155,7 +155,7 @@ RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_p
 PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]
 
 
-class Strict(BaseModel):
+class StrictModel(BaseModel):
     """Frozen model that rejects unknown fields and numbers beyond 1e12."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -169,7 +169,7 @@ class Strict(BaseModel):
         return value
 
 
-class _VectorColumns(Strict):
+class _VectorColumns(StrictModel):
     columns: tuple[Column, ...]
     scale: Scale = (1.0, 1.0, 1.0)
 

@@ -24,7 +24,7 @@ from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.tables import Table
 
 MIN_STREAM_SAMPLES = 16
-MAX_VALUES = {
+MAX_SIGNAL_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
     "specific_force": (1e6, "m/s^2"),
@@ -91,7 +91,7 @@ def specific_force_at_So(
     return s - np.cross(alpha, p_SoIo_S) - np.cross(omega, np.cross(omega, p_SoIo_S))
 
 
-class Orientations:
+class OrientationColumns:
     """Orientations of S in a table's columns, of any form."""
 
     def __init__(

@@ -73,7 +73,7 @@ def _add_canonical_names(columns: dict[str, _Column]) -> dict[str, _Column]:
     return small | columns if canonical and not _CANONICAL_NAMES.issubset(columns) else columns
 
 
-def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
+def _read_frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
     import polars as pl
 
     kind = path.suffix.lower()
@@ -220,10 +220,10 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
     return {str(k): array[:, k] for k in range(array.shape[1])}
 
 
-_Arrays = Callable[[Path], dict[str, NDArray]]
+_ArrayReader = Callable[[Path], dict[str, NDArray]]
 
 
-def _columns_reader(read: _Arrays) -> _Arrays:
+def _columns_reader(read: _ArrayReader) -> _ArrayReader:
     return lambda path: array_columns(read(path))
 
 
@@ -232,7 +232,7 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
     {
         **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
         **dict.fromkeys(
-            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _frame_columns
+            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _read_frame_columns
         ),
         ".npz": _columns_reader(_read_npz),
         ".npy": _columns_reader(_read_npy),
