@@ -21,7 +21,7 @@ class CausalWrench:
 
     Attributes:
         mode: "delayed", or "predicted" (extrapolated over the lag).
-        lag_s: delay of a slow contact without prediction [s].
+        lag_s: delay of a slowly changing contact force, if not predicted [s].
         contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma V phi [N, N m].
         offsets: (6,) subtracted sensor offsets [N, N m].
     """
@@ -62,7 +62,10 @@ def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> 
 
 @njit(cache=True)
 def design_low_pass(dt, tangent, ahead_s, low_pass):
-    """Write the low-pass for `tangent` = tan(pi cutoff dt) to the coefficients `low_pass` (7,)."""
+    """Write filter coefficients b (3), a (2) and settled state (2) to `low_pass` (7,), Eq. (T11).
+
+    `tangent` is tan(pi cutoff dt).
+    """
     k = 2.0 / dt
     w = k * tangent / _ROOT_4_OF_3
     square, damping = w * w, _ROOT_OF_2 * w * k

@@ -52,7 +52,7 @@ class Detection:
     Attributes:
         floor: noise floor of the free motion.
         statistic, threshold: name of the used statistic, and its threshold.
-        statistics: (N, 3) all statistics; 0 at the ends, which are not judged.
+        statistics: (N, 3) values of all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
         free_s: duration of the free motion [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
@@ -260,7 +260,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 
 def noise_floor(contact: Array) -> Array:
-    """Return the noise (6,) of a contact wrench (N, 6), at least half contact-free, Eq. (T12)."""
+    """Return the RMS noise (6,) of a contact wrench (N, 6), half free of contact, Eq. (T12)."""
     floor = narrowest_half(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):

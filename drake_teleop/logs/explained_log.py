@@ -1,4 +1,4 @@
-"""Causes of a misfit in a log, the lines that correct them, and the resulting load."""
+"""Causes of a misfit in a log, corrected lines of its description, and the resulting load."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Return which units to correct for a mass above 1000 kg, or None for a smaller one."""
+    """Return a message on wrong units for a mass above 1000 kg, None for a smaller one."""
     if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
@@ -282,7 +282,7 @@ def _acceleration_noise(splines: PoseSplines) -> float:
 
 
 def explained_load(load: Identification, why: Explanation) -> Identification:
-    """Return the load of the model with causes; without any, `load` with wider intervals."""
+    """Return the load fitted with the causes; without causes, `load` with wider intervals."""
     load = _load_with_wider_intervals(load, why)
     if why.state.data.gravity_W is not None:
         return load

@@ -41,7 +41,7 @@ class PosedFit:
 
     Attributes:
         log: used samples with the motion of splines, low-passed.
-        source: of the delay: "given", "estimated", or "undetermined" (0 was used).
+        source: origin of the delay: "given", "estimated", or "undetermined" (0 was used).
     """
 
     log: Log

@@ -196,7 +196,7 @@ def _random_motion(number: int) -> _SensorMotion:
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link S."""
+    """Return specific force, omega, alpha, R_WS and p_WS of the last link, frame S."""
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
     s = p + np.array([0.0, 0.0, STANDARD_GRAVITY])

@@ -44,7 +44,7 @@ _DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Fitted model with one more extension.
+    """Fitted load model with one more extension, such as drift: a possible cause of a misfit.
 
     `score` is twice the gain in log likelihood, minus a cost of the added parameters.
     """
@@ -55,9 +55,9 @@ class Candidate:
 
 
 def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
-    """Fit the possible extensions of a model and yield those with sufficient effect.
+    """Fit a model with each further extension, and yield those with sufficient effect.
 
-    `first` is True if the model is the rigid load alone.
+    `first` is True in the first round of the search.
     """
     model, data = state.model, state.data
     if first:
@@ -146,7 +146,6 @@ def has_negative_inertia(state: State) -> bool:
 
 
 def is_plausible(state: State) -> bool:
-    """Return whether all fitted parameters are physically plausible."""
     if has_negative_inertia(state):
         return False
     parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
@@ -182,7 +181,7 @@ def _is_tilt_significant(state: State) -> bool:
 
 
 def start_of_tilt_fit(state: State) -> Array | None:
-    """Return start parameters for a fit of a large tilt of gravity, from the force, or None."""
+    """Return start parameters for fitting a very wrong direction of gravity; None if unknown."""
     y = state.data.select_rows(state.rows.used).y
     sums = y.T @ y
     width = len(sums)

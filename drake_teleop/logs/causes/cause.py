@@ -31,7 +31,7 @@ class Cause:
         message: cause, value with its interval, and remedy.
         start_s, stop_s: time span since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.
-        fields: fields of the description and their corrected values, as in YAML.
+        fields: corrected values of fields of the log description, as in YAML.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class RecordPartWithLoad:
-    """Part of a record with one load phi (10,), and covariance (16, 16) of [offsets; phi]."""
+    """Part of a record with constant load phi (10,); `covariance` (16, 16) of [offsets; phi]."""
 
     start_s: float
     stop_s: float
@@ -81,7 +81,7 @@ def causes_of_fit(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 
 
 def loads_between_changes(state: State, covariance: Array) -> list[RecordPartWithLoad]:
-    """Return the parts of a record between changes of the load; none without a change."""
+    """Return the parts of a record between load changes, with their loads; [] without a change."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []

@@ -1,4 +1,4 @@
-"""Changes of offsets or load within a record, and contacts, by trimmed least squares."""
+"""Detection of contacts, and of changes of offsets or load, within a record."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _likely_step_times(state: State, kind: str) -> list[float]:
 
 
 class _StepScan:
-    """Gain of twice the log likelihood by a change at any instant, for white noise."""
+    """Likelihood gain by a change of offsets or load at any instant, for white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
         power = np.maximum(state.rows.residual_rms(state.fit.residual), 1e-12)
@@ -109,7 +109,7 @@ def fit_with_ramps(
     spans: TimeSpans,
     widths: Sequence[float] | None = None,
 ) -> State:
-    """Fit gradual changes of `kinds` near `times` [s], without the rows within `widths` [s]."""
+    """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
     widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
     steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
@@ -126,7 +126,7 @@ def fit_with_ramps(
 
 
 def remove_small_steps(state: State) -> State:
-    """Remove insignificant changes one by one, the least significant first."""
+    """Remove insignificant changes of offsets or load one by one, and refit the model."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
@@ -209,7 +209,7 @@ _LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
 
 
 def find_contact_spans(state: State) -> TimeSpans:
-    """Return time spans (start, stop) [s] whose residual far exceeds that of calm parts."""
+    """Return time spans (start, stop) [s] of contact, whose residual far exceeds the usual one."""
     blocks = _ResidualBlocks(state)
     contact_blocks = blocks.find_contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
@@ -221,7 +221,7 @@ def find_contact_spans(state: State) -> TimeSpans:
 
 
 def replace_contacts_by_steps(larger: State) -> State | None:
-    """Explain long contacts by changes of load and offsets; return None if impossible."""
+    """Return a model with changes of load and offsets instead of contacts; None for a bad fit."""
     blocks = _ResidualBlocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_LOADS):
@@ -278,7 +278,10 @@ class _ResidualBlocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return True for blocks with a residual far above the calmest; None for few blocks."""
+        """Return True for blocks of `among` with a far larger residual than the calmest ones.
+
+        Return None for too few blocks.
+        """
         found = self._fit_calmest(np.flatnonzero(among))
         if found is None:
             return None
@@ -384,7 +387,7 @@ def replace_steps_by_contact(state: State) -> State:
 
 
 def shrink_contacts(state: State) -> State:
-    """Shorten the time spans of contacts to the rows with a large residual."""
+    """Return a fit whose time spans of contact are shortened to rows with a large residual."""
     dt = state.data.dt
     spans = [_shrunk_contact_span(state, span) for span in state.spans]
     return State.fit_record(

@@ -1,4 +1,4 @@
-"""Search for causes of a misfit, and the resulting load (docs/theory.md)."""
+"""Search for causes why a rigid load does not explain a wrench (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -84,9 +84,9 @@ SearchResult = tuple[State, float, list[Candidate]]
 def search_causes(
     data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
 ) -> SearchResult:
-    """Return the model that explains a record, additional delay [s], and rejected candidates.
+    """Return the fitted model that explains a record, its delay [s], and rejected causes.
 
-    The model contains the extensions `given` from the start.
+    Arguments are as for `explain_misfit`.
     """
     plain = Model(parts=given)
     found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
@@ -118,7 +118,7 @@ def search_causes(
 
 
 def may_be_coloured_noise(state: State) -> bool:
-    """Return whether the residual may be coloured noise, which smooth signals do not explain."""
+    """Return whether the residual may be coloured noise: smooth signals do not explain it."""
     return (
         state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
     )
@@ -259,16 +259,16 @@ _NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Causes why a rigid load does not explain a wrench, and the load of the model with causes.
+    """Causes why a rigid load does not explain a wrench, and the load fitted with these causes.
 
     Attributes:
         explained: whether the residual is sensor noise.
         theta, covariance: [offsets; phi] (16,) in the first part of the record [SI]; (16, 16).
         deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
-        loads: parts of a record whose load changes.
+        loads: parts of the record with different loads, if the load changes.
         removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
-        given: extensions of the model that are no causes.
+        given: quantities that are always estimated, such as "gravity", and are no causes.
     """
 
     causes: tuple[Cause, ...]
@@ -288,7 +288,7 @@ class Explanation:
 
     @property
     def several_gains(self) -> bool:
-        """Whether gain errors of single channels approximate those of a whole gain matrix."""
+        """Whether several gain errors were found, which only approximate a full gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)

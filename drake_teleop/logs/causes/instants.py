@@ -51,11 +51,11 @@ class Instants:
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, WIDTH) signals of the module docstring; 0 in unused rows.
+        y: (M, 67) signals of the module docstring; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
         white: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
-        acceleration_noise: in a block mean [m/s^2].
+        acceleration_noise: standard deviation in a block mean [m/s^2].
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
 
@@ -84,7 +84,7 @@ class Instants:
 
     @cached_property
     def rows_per_block(self) -> int:
-        """Number of rows in a block, the time resolution of the search for contacts and changes."""
+        """Number of rows per block in the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
@@ -92,7 +92,7 @@ class Instants:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
-        """Return y and copies of its motion from each time on, (M, WIDTH + 25 len(times))."""
+        """Return y, and for each time [s] its 25 motion columns, set to 0 before that time."""
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
@@ -100,7 +100,7 @@ class Instants:
         return np.hstack(parts)
 
     def lagged_products(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
-        """Return sums of lagged products of y (M, W) over blocks, (blocks, lags, W, W)."""
+        """Return sums over blocks of products of y (M, W) with earlier y, (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))

@@ -47,7 +47,7 @@ def load_covariance(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return standard deviations (16,) of [offsets; phi] for a misfit without a found cause."""
+    """Return standard deviations (16,) of [offsets; phi] if no cause of a misfit was found."""
     if state.smooth_misfit > (
         _CLEAR_SMOOTH_MISFIT
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
@@ -129,7 +129,7 @@ def attenuation_bias(state: State) -> Array:
 
 
 def misfit_factor(state: State, blocks: Array) -> float:
-    """Return the factor that widens all standard deviations; 1 for stationary noise."""
+    """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD_PARAMETERS])
     shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0

@@ -1,4 +1,4 @@
-"""Rigid load with further causes: the wrench as a function of few parameters, Eq. (T25)."""
+"""Model of the wrench: rigid load with extensions for causes of a misfit, Eq. (T25)."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ class Model:
 
     Attributes:
         parts: names of extensions, such as "gravity" or "drift".
-        gains: channels with a free gain.
+        gains: numbers of the wrench channels whose gain is estimated.
         steps: changes of offsets or load.
         axes: (3, 3) signed permutation of the wrench's axes.
-        factor: torque unit; the extension "torque factor" multiplies it.
+        factor: given factor on the torque; the extension "torque factor" corrects it.
     """
 
     parts: tuple[str, ...] = ()
@@ -100,7 +100,7 @@ class Model:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Indices (k,) of the signals in y that the model uses."""
+        """Indices (k,) of the signals that the model uses, in `append_step_signals`."""
         wide = bool({"gravity", "cable"} & set(self.parts))
         kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
         if not wide:
@@ -125,7 +125,7 @@ class Model:
         return tuple(step.time for step in self.steps)
 
     def start_parameters(self, x: Array, of: Model) -> Array:
-        """Return parameters (size,) from parameters x of the model `of`; new ones are 0."""
+        """Return parameters (size,) from those of another model, x of `of`; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY_PARAMETER + 1] = x[: DELAY_PARAMETER + 1]
         for name, where in self.slices.items():
@@ -134,7 +134,7 @@ class Model:
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
-        """Return the wrench's coefficients (B, 6, W) in the signals, for parameters x (B, size)."""
+        """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
         width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.slices
         motion = self._motion_coefficients(x)
         out = np.zeros((len(x), 6, width))
@@ -194,7 +194,7 @@ class Model:
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
 
     def wrench_derivative(self, x: Array) -> Array:
-        """Return the derivative (size, 6, k) of the wrench's coefficients by parameters x."""
+        """Return the derivative (size, 6, k) of the coefficients of k signals by parameters x."""
         steps = np.ones(self.size)
         if "rotation" in self.slices:
             steps[self.slices["rotation"]] = _ROTATION_STEP_RAD
@@ -204,7 +204,7 @@ class Model:
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
     def residual_coefficients(self, x: Array) -> Array:
-        """Return coefficients (6, k) of the residual in the signals, for parameters x (size,)."""
+        """Return coefficients (6, k) of k signals in the residual, for parameters x (size,)."""
         out = -self.wrench_coefficients(x[None])[0]
         out[np.arange(6), FORCES.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])

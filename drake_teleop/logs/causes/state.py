@@ -20,7 +20,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True, eq=False)
 class UsedRows:
-    """Rows of a record that are used (M,), and the columns of its signals that a model needs."""
+    """Rows of a record with `used` (M,) True, and the columns of its signals that a model needs."""
 
     data: Instants
     used: NDArray[np.bool_]
@@ -36,7 +36,7 @@ class UsedRows:
 
     @cached_property
     def lagged_product_sums(self) -> Array:
-        """Sums (5, W, W) of products of the signals at lags 0 to 4."""
+        """Sums (5, W, W) of products of W signals at lags of 0 to 4 rows."""
         return np.asarray(self.data.lagged_products(self.y, rows=len(self.y))[0])
 
     @cached_property
@@ -60,7 +60,7 @@ class UsedRows:
         return np.asarray(y[at])
 
     def whitened_products(self, filters: Array) -> Array:
-        """Return sums of products (6, n, n) of n signals, after each channel's 5-tap filter."""
+        """Return sums of products (6, n, n) of n signals, whitened by 5-tap filters (6, 5)."""
         width = self.y.shape[1]
         taps = [
             (filters[:, : MAX_NOISE_LAG + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)
@@ -73,7 +73,7 @@ class UsedRows:
     def noise_filters_and_power(
         self, residual: Array, floor: Array, order: int = MAX_NOISE_LAG
     ) -> tuple[Array, Array]:
-        """Return whitening filters (6, 5) and noise power (6,) for the residual (6, W)."""
+        """Return whitening filters (6, 5) and noise power (6,) for coefficients of the residual."""
         e = self.y @ residual.T
         filters = np.zeros((6, MAX_NOISE_LAG + 1))
         filters[:, 0] = 1.0
@@ -266,7 +266,7 @@ class State:
 
     @cached_property
     def smooth_gain(self) -> tuple[float, int]:
-        """Gain of twice the log likelihood by generic smooth signals, and their number."""
+        """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
         y = self.data.y
         part = np.linspace(0.0, _NUM_SMOOTH_SEGMENTS, len(y), endpoint=False).astype(int)
         columns = np.hstack(
@@ -299,7 +299,10 @@ class State:
 
 
 def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
-    """Return right^T gram^-1 right and the rank; diagonals below `least` count as rounding."""
+    """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram.
+
+    Rows with a diagonal below `least` are omitted as rounding errors.
+    """
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
     if not used.any():

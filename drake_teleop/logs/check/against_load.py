@@ -73,7 +73,7 @@ class LoadFit:
 
 
 def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
-    """Fit a load and offsets to the share of a log that fits best, after a low-pass of 15 Hz."""
+    """Fit load and offsets to the best fitting share of a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_pass_log(log, cutoff).select_rows(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
@@ -188,7 +188,7 @@ def _better_edits(
 ) -> list[tuple[LoadFit, Finding | None, Description]]:
     """Return the edits with which a load of positive mass explains the wrench far better.
 
-    If there is none, each is tried with the opposite sign of the wrench.
+    If there are none, each edit is tried with the opposite sign of the wrench.
     """
     positive, negative = [], []
     for finding, edited in edits:

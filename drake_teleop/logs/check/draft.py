@@ -98,7 +98,7 @@ _NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {r
 
 
 class Draft(NamedTuple):
-    """Streams of a log description, and comment lines about them."""
+    """Draft of a log description: its streams as in YAML, and its comment lines (`head`)."""
 
     streams: dict[str, Any]
     head: list[str]
@@ -224,7 +224,6 @@ def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
 
 
 def _split_name_and_unit(name: str) -> tuple[str, str]:
-    """Return the words of a column's name, and its unit: `Fx [N]`, `Fx (N)` or `Fx_N`."""
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
     if unit is None and suffix is not None and suffix[1].lower() in _UNIT_NAMES:

@@ -133,7 +133,10 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
 
 
 def _windowed_specific_forces(log: Log, P: Array) -> Array:
-    """Return specific forces (2, n, 3) in Hann windows, and half a window later [m/s^2]."""
+    """Return mean specific forces (2, n, 3) in n Hann windows, and half a window later.
+
+    The gyroscope, with axes permuted by P, rotates them to the axes at the window's start.
+    """
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)

@@ -1,4 +1,4 @@
-"""Tables of a log, whole and thinned to 100 Hz, for repeated reading, and checks of channels."""
+"""Tables of a log in memory, and checks of its channels."""
 
 from __future__ import annotations
 

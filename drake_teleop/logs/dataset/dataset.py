@@ -74,7 +74,7 @@ _WORK_FOLDER_NAME = "unfinished"
 
 
 class EpisodeTask(NamedTuple):
-    """Input for the verdict of an episode."""
+    """Data that the verdicts of all episodes share."""
 
     dataset: Dataset
     streams: dict[str, Any]

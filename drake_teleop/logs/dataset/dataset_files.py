@@ -32,7 +32,7 @@ _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 class Episode(NamedTuple):
-    """Rows of one episode in a file; `group` is that of an HDF5 file."""
+    """Episode: file, first row, number of rows (0: the whole file), and group in an HDF5 file."""
 
     name: str
     file: Path
@@ -57,7 +57,6 @@ class Dataset(NamedTuple):
     fps: float
 
     def read_episode(self, episode: Episode) -> Table:
-        """Return the columns of an episode."""
         if self.kind == "tables":
             return read_table(episode.file)
         rows = slice(episode.first, episode.first + episode.rows)
@@ -86,7 +85,6 @@ def _with_element_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Return the episodes of a dataset."""
     if not path.exists():
         raise DrakeTeleopError("no such file or folder", where=str(path), remedy="check the path")
     with wrap_read_errors(path, "check that the dataset is complete"):

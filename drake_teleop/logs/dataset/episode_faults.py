@@ -30,9 +30,9 @@ class EpisodeFault(NamedTuple):
 
 
 def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> list[EpisodeFault]:
-    """Return the deviations of a hypothesis from the usual description by name.
+    """Return the faults of an episode that a hypothesis contains.
 
-    `known` (10,) is the known load.
+    `usual_lag` [frames] is that of other episodes, `known` (10,) the usual load.
     """
     if x.phi is not None:
         mass = float(x.phi[0])

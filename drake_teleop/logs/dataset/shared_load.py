@@ -47,7 +47,7 @@ class SharedLoad:
         spacing: knot distance of the splines [frames].
         lag: usual delay of the motion behind the wrench [frames].
         typical: (6,) usual half widths of the residual [N, N m].
-        floor, threshold: of the contact detection.
+        floor, threshold: noise floor and threshold of contact detection.
     """
 
     identification: Identification

@@ -70,7 +70,7 @@ class PoseFrame:
         p_SoPo_S: (3,) origin of P from So, in S [m].
         R_SP: (3, 3) rotation from axes of P to those of S.
         position_deviations: (3,) standard deviations of the origin [m]; inf if undetermined.
-        turn_deviations_deg: (3,) those of rotations about the axes of S [deg].
+        turn_deviations_deg: (3,) standard deviations of R_SP about the axes of S [deg].
         shifted, turned: whether origin, axes differ significantly from the description.
     """
 
@@ -95,7 +95,7 @@ class PoseMotion:
     """Motion from splines of poses, with knots and delay that fit a wrench best.
 
     Attributes:
-        splines: on the wrench's clock.
+        splines: splines of the poses, on the wrench's clock.
         delay_s, delay_deviation: delay of the motion behind the wrench, and its standard deviation
             [s]; inf if undetermined.
         clock_rate: relative rate error of the poses' clock, such as 5e-5; 0 if insignificant.
@@ -220,7 +220,7 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: ImuData | None = None,
 ) -> PoseMotion:
-    """Return the motion from poses of S with which an identified load fits a wrench best."""
+    """Return the motion from poses of S with which a load (6, 16), Eq. (T73), fits best."""
     with one_blas_thread():
         motion, last, _ = _find_motion(
             *(t, wrench, poses, gravity_W, delay, lost, imu),

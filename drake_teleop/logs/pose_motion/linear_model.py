@@ -144,7 +144,7 @@ def _rounding_power(ff: Array, sizes: Array) -> Array:
 
 
 def fit_noise_levels(Z: Array, of: FrequencyBands) -> NoiseLevels:
-    """Return noise levels with the drift of lowest cost in each wrench channel, Eq. (T74)."""
+    """Return noise levels with the drift spectrum that fits each wrench channel best, Eq. (T74)."""
     levels = NoiseLevels.white_within_groups(of)
     least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
     for corner in _TRIED_DRIFT_CORNERS_HZ:
@@ -162,7 +162,7 @@ class Spectra:
     Attributes:
         grid, taper: instants of the record, and their weights (M,).
         delay: delay of the signals [s].
-        zeta: (M, 16) signals in time.
+        zeta: (M, 16) motion signals over time.
     """
 
     of: FrequencyBands
@@ -175,7 +175,6 @@ class Spectra:
 
     @property
     def max_delay_change_s(self) -> float:
-        """Largest change of the delay in a search [s]."""
         return min(MAX_DELAY_CHANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
 
     @cached_property
@@ -292,7 +291,7 @@ class FitWindow:
 def best_delay(
     spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
 ) -> tuple[float, float]:
-    """Return the delay of lowest cost within `reach`, to the step `finest` [s], and this cost."""
+    """Return the delay [s] of highest likelihood within +-`reach`, and its cost, Eq. (T75)."""
     step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs_at_delays(at)
@@ -321,7 +320,7 @@ def delay_deviation(spectra: Spectra) -> float:
 def guess_knot_spacing(
     window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
-    """Return knot distance [s] and delay [s] of lowest cost on a coarse grid.
+    """Return knot distance [s] and delay [s] of highest likelihood on a coarse grid.
 
     The delay is not changed if `known`.
     """
@@ -340,9 +339,9 @@ def guess_knot_spacing(
 def choose_knot_spacing(
     window: FitWindow, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return splines, knot distance [s] and delay [s] of about lowest cost.
+    """Return splines, knot distance [s] and delay [s] of about the highest likelihood.
 
-    Knots are 8 or 16 % closer than at lowest cost. The delay is not changed if `known`.
+    Knots are 8 or 16 % closer than at the highest likelihood. The delay is not changed if `known`.
     """
     start = window.spectra_at_delay(
         choices[0].splines_with_spacing(TRIED_KNOT_SPACINGS_S[0]), delay

@@ -58,7 +58,7 @@ class RigidFit:
         misfit, degrees: twice the log likelihood ratio to the linear model, and its degrees of
             freedom.
         misfit_of_gains: expected increase of the misfit by the stated gain errors.
-        one_weight: whether all bands had one weight.
+        one_weight: whether all frequency bands had the same weight.
     """
 
     state: RigidParameters
@@ -362,7 +362,7 @@ class UnitsAndAxes:
     Attributes:
         kappa: unit error of position; 1e-3 for mm described as m.
         kappa_deviation: its standard deviation; inf if undetermined.
-        deviation: largest standard deviation of M_g (3, 3), force over minus gravity [kg].
+        deviation: largest standard deviation of M_g (3, 3) [kg], force over minus gravity.
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         masses: (3,) singular values of M_g [kg].
     """
@@ -375,7 +375,7 @@ class UnitsAndAxes:
 
     @property
     def is_usable(self) -> bool:
-        """Whether M_g is known to 5 % of the mass."""
+        """Whether M_g, force over minus gravity, is known to 5 % of the mass."""
         return bool(self.deviation < 0.05 * self.masses.mean())
 
     @property

@@ -77,7 +77,7 @@ class FrequencyBands:
 
     Attributes:
         frequency, band: (K,) used frequencies [Hz], and their bands.
-        weight: (K,) half the independent numbers of each frequency.
+        weight: (K,) half the number of independent values at each frequency.
         group: (count,) group of each band.
     """
 
@@ -92,7 +92,7 @@ class FrequencyBands:
 
     @cached_property
     def sizes(self) -> Array:
-        """Half the independent numbers (count,) of each band."""
+        """Half the number of independent values (count,) in each band."""
         return np.asarray(np.bincount(self.band, self.weight), np.float64)
 
     def sums_over_bands(self, values: Array) -> Array:
@@ -166,7 +166,7 @@ def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> 
 
 
 def shift_spectrum(spectrum: ComplexArray, frequency: Array, shift: float) -> ComplexArray:
-    """Return spectra (K, 16) of zeta and taper `shift` [s] later; the constant is unchanged."""
+    """Return spectra (K, 16) of tapered signals `shift` [s] later; that of constant 1 is kept."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
     return out
@@ -215,7 +215,7 @@ class NoiseLevels:
     """Noise of the wrench, with one level for each group of bands and channel.
 
     Attributes:
-        sizes, group: (bands,) half the independent numbers of each band, and its group.
+        sizes, group: (bands,) half the number of independent values in each band, and its group.
         shape: (bands, 6) power relative to the level.
     """
 
@@ -242,7 +242,6 @@ class NoiseLevels:
         return np.asarray(level[..., self.group, :] * self.shape)
 
     def sums_over_groups(self, x: Array) -> Array:
-        """Return the sums (groups, ...) of x (bands, ...) over the bands of each group."""
         return np.asarray(np.add.reduceat(x, self._first_bands_of_groups, axis=0))
 
     @cached_property
@@ -273,7 +272,7 @@ def noise_moments(
     of: FrequencyBands,
     noise: tuple[float, float],
 ) -> Array:
-    """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `Spectra.moments`.
+    """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `second_moments`.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """

@@ -46,7 +46,7 @@ class ImuSplineRows:
     def from_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
-        """Return the rows of specific force s and omega (K, 3) in S, oriented by `splines`."""
+        """Return rows with specific force s and omega (K, 3), rotated from S by `splines`."""
         q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -59,7 +59,7 @@ class ImuSplineRows:
         return replace(self, acceleration_W=acceleration, quaternion_rate=rates)
 
     def remaining_noise_shares(self, frequency: Array) -> tuple[Array, Array]:
-        """Return the shares (K,) of position and rotation noise that remain, Eq. (T83)."""
+        """Return the shares (K,) of position and rotation noise that an IMU leaves, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
         for pose, own, order, rows in zip(
@@ -259,7 +259,7 @@ class SplineCache:
 
 
 def passed_noise_share(frequency: Array, spacing: float) -> Array:
-    """Return the share (K,) of white noise's power that splines pass at a frequency, Eq. (T72)."""
+    """Return the share (K,) of noise power that splines pass at frequencies [Hz], Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (SPLINE_DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)

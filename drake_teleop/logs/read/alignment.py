@@ -25,7 +25,6 @@ SMOOTHER_WINDOW_OVER_PERIOD = 1.8
 
 
 def mean_time_step(t: Array) -> float:
-    """Return the mean step of times `t` (N,) [s]."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 

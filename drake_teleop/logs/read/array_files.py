@@ -101,10 +101,7 @@ _DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
 
 def read_mat(path: Path) -> dict[str, NDArray]:
-    """Return the numeric arrays of a MATLAB file by name; fields are named `structure.field`.
-
-    Raise ValueError if the file is invalid or has no arrays.
-    """
+    """Return the numeric arrays of a MATLAB file by name; fields are named `structure.field`."""
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version
 

@@ -67,8 +67,8 @@ class Log:
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        free: "gravity" and "weight" if these are estimated from the data.
-        resolution: step of force and torque of static poses [N, N m].
+        free: those of "gravity" and "weight" that are estimated from the data.
+        resolution: quantization step of force and torque, for static poses [N, N m].
 
     Raises:
         DrakeTeleopError: for wrong shapes, values that are not finite, or decreasing `t`.

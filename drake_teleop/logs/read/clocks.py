@@ -34,8 +34,8 @@ class Clock:
 
     Attributes:
         rows: (N,) row of the table for each time.
-        total: number of stamps before removal.
-        notes: corrections.
+        total: number of the table's rows, with removed ones.
+        notes: sentences about corrections.
         episodes: number of times at which the clock starts.
     """
 

@@ -247,7 +247,7 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
 
 
 def are_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """Return (3,) True for axes along which the motion far exceeds its noise."""
+    """Return (3,) True for axes along which the motion K determines a lever arm."""
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
     noise = above.var(axis=0) / 7

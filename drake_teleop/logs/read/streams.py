@@ -92,7 +92,7 @@ def specific_force_at_So(
 
 
 class OrientationColumns:
-    """Orientations of S in a table's columns, of any form."""
+    """Columns of a table that contain orientations of S in any form."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class OrientationColumns:
             self._columns *= description.si_value(orientation.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
-        """Return memory (count, 4) for quaternions of increasing rows; it may be the columns'."""
+        """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:

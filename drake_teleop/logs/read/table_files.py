@@ -36,7 +36,7 @@ _MAX_CELLS_IN_MEMORY = 2**24
 
 
 def read_table(path: Path, *, header: bool = True) -> Table:
-    """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
+    """Read a file with a suffix in `TABLE_READERS`; raise an error if it is invalid.
 
     The columns of a text file without header are named from "0" on.
     """
@@ -93,7 +93,7 @@ def _read_frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
 
 
 def columns_with_nested(frame: pl.LazyFrame) -> dict[str, NDArray]:
-    """Return the columns of a frame by name, and elements of lists and structures as columns.
+    """Return columns of a Polars frame by name, and elements of lists and structures as columns.
 
     Columns of text and binary data, such as images, are omitted.
     """
@@ -151,7 +151,7 @@ def _expand_nested_column(
 
 
 class _LazyColumns(UserDict[str, Any]):
-    """Columns of a frame, each read on access to limit memory."""
+    """Columns of a Polars frame, each read on access to limit memory."""
 
     def __init__(self, frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> None:
         super().__init__(columns)
