@@ -41,9 +41,9 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
             raise DrakeTeleopError(
-                "a prediction needs a low-pass",
+                "causal mode `predicted` needs a low-pass below half the rate of the log",
                 where="cutoff",
-                remedy="give a cut-off below half the rate of the log, or causal mode `delayed`",
+                remedy="give a lower cut-off, or causal mode `delayed`",
             )
         return x
     from scipy.signal import lfilter

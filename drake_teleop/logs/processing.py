@@ -381,7 +381,7 @@ def eliminate_log(
     )
     if untouched_s is not None and not tare:
         raise DrakeTeleopError(
-            "determines the offsets, which are taken from the load file",
+            "determines the offsets, but these are requested from the load file (tare=False)",
             where="untouched",
             remedy="leave one of the two out",
         )
@@ -426,7 +426,7 @@ def _eliminate_read_log(
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
-            "applies only to wrenches as in a control loop (`causal`)",
+            "requires `causal`, the mode of wrenches as in a control loop",
             where="causal_tare_s",
             remedy="give causal as well, or remove it",
         )
@@ -444,7 +444,7 @@ def _eliminate_read_log(
     log, delay_s, source = aligned.log, aligned.delay_s, aligned.source
     if log.static and causal is not None:
         raise DrakeTeleopError(
-            "poses at rest have no order in time", where="causal", remedy="leave it out"
+            "poses at rest have no times for a causal filter", where="causal", remedy="leave it out"
         )
     known = far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
@@ -523,9 +523,9 @@ def _eliminate_read_log(
 def _rows_between(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
-        what = "poses at rest have no time" if log.static else f"has {rows.sum()} samples"
+        found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
         raise DrakeTeleopError(
-            f"the span from {start_s:g} to {stop_s:g} s {what}",
+            f"the span from {start_s:g} to {stop_s:g} s has {found}",
             where="untouched",
             remedy=f"give a span without contact of {_MIN_TARE_SAMPLES} samples or more, in"
             f" seconds after the first sample; the record has {log.t[-1] - log.t[0]:.4g} s",
@@ -537,7 +537,7 @@ def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> 
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
-            f"the first {length_s:g} s are {rows.sum()} of {len(log)} samples",
+            f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples",
             where="causal_tare_s",
             remedy=f"give a start of {_MIN_TARE_SAMPLES} samples or more, less than the record",
         )
@@ -613,7 +613,7 @@ def _check_scales(
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
     if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
         raise DrakeTeleopError(
-            "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
+            "eta cannot be combined with other scales: it implies sigma = 0, gamma = 1 (Eq. 14)",
             where="eta",
             remedy="remove all scales except eta",
         )

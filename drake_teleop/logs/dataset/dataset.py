@@ -103,13 +103,13 @@ def dataset_command(
     """
     if (load is None) != identify:
         raise DrakeTeleopError(
-            "needs one of --load and --identify", where="dataset", remedy="give one of them"
+            "exactly one of --load and --identify is required", where="dataset", remedy="give one"
         )
     known = None if load is None else Identification.load(load)
     dataset, copied = open_dataset(path), out / path.resolve().name
     if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
         raise DrakeTeleopError(
-            "is in the dataset, which is never changed", where=str(out), remedy="give another --out"
+            "is in the dataset, which must not change", where=str(out), remedy="give another --out"
         )
     make_folder(out)
     with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
@@ -140,7 +140,7 @@ def _described_or_drafted_streams(dataset: Dataset, description: Path | None) ->
     data = read_yaml(description)
     if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
         raise DrakeTeleopError(
-            "has no wrench", where=str(description), remedy="see docs/log-description.md"
+            "describes no wrench", where=str(description), remedy="see docs/log-description.md"
         )
     for name in _STREAM_NAMES:
         if isinstance(data.get(name), dict):
@@ -249,7 +249,7 @@ def _read_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tu
     log = read_description(described, source, tables=tables, differentiate=False)
     if log.posed is None and log.R_WS is None:
         raise DrakeTeleopError(
-            "has no orientation", where=source, remedy="describe a pose with an orientation"
+            "the episode has no orientation", where=source, remedy="describe pose.orientation"
         )
     assert described.wrench is not None
     clock = read_clock(described.wrench.time, table, described.wrench.columns, source)

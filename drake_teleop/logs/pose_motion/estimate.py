@@ -249,10 +249,11 @@ def _find_motion(
     grid, poses = WrenchGrid.from_samples(t, wrench, load), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
     taper = _base_taper(grid, poses, lost, guess)
-    if (taper > 0.5).sum() < fewest:
+    usable = int((taper > 0.5).sum())
+    if usable < fewest:
         raise DrakeTeleopError(
-            "wrench and poses have too little in common",
-            remedy="record longer, without interruptions",
+            f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart ({fewest} required)",
+            remedy="record both at the same time, longer, without interruptions",
         )
     top = min(
         MAX_FREQUENCY_HZ,

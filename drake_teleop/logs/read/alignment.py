@@ -175,7 +175,7 @@ def remove_delay(log: Log, delay_s: float) -> Log:
         raise DrakeTeleopError(
             f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples",
             where=log.source,
-            remedy="give a shorter one, or auto",
+            remedy="give a shorter delay, or `auto`",
         )
     s, omega, alpha = (resample(at[known], log.t, x) for x in log.motion)
     gravity, R_WS = (

@@ -37,7 +37,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
         def add_dataset(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset) and _is_numeric_table(item, transpose):
                 if item.external is not None or item.is_virtual:
-                    raise ValueError(f"{name} is in another file")
+                    raise ValueError(f"the array {name} is in another file, which is not read")
                 array = np.asarray(item[()])
                 found[name.replace("/", ".")] = array.T if transpose else array
 
@@ -67,7 +67,7 @@ def _is_numeric_table(item: Any, transpose: bool) -> bool:
     ):
         return False
     if math.prod(shape) > _MAX_VALUES:
-        raise ValueError(f"an array of {math.prod(shape):.2g} numbers is too large")
+        raise ValueError(f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_VALUES:.2g})")
     return True
 
 
@@ -76,7 +76,7 @@ def import_optional_module(name: str, path: Path) -> Any:
         return import_module(name)
     except ImportError:
         raise DrakeTeleopError(
-            f"reading {path.suffix} files needs {name}",
+            f"reading {path.suffix} files requires the Python package {name}",
             where=str(path),
             remedy=remedy_to_install_extra("formats"),
         ) from None
@@ -120,7 +120,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
             if isinstance(value, np.ndarray):
                 _add_array(name, value, found)
     if not found:
-        raise ValueError("it has no arrays; save tables and timeseries as arrays")
+        raise ValueError("it has no arrays of numbers; save tables and timeseries as arrays")
     return found
 
 

@@ -170,7 +170,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise DrakeTeleopError(
-            "bags are read by the library rosbags, which is not installed",
+            "reading bags requires the Python package rosbags, which is not installed",
             where=str(path),
             remedy=remedy_to_install_extra("ros"),
         ) from error

@@ -106,7 +106,7 @@ class Log:
                 )
             if not np.isfinite(value).all():
                 raise DrakeTeleopError(
-                    "holds NaN or infinity",
+                    "holds NaN or infinity (numbers must be finite)",
                     where=f"{self.source}:{name}",
                     remedy="cut or repair these samples",
                 )
@@ -166,7 +166,7 @@ def write_log(log: Log, path: str | Path) -> None:
         raise DrakeTeleopError(
             f"format {path.suffix!r} is not known",
             where=str(path),
-            remedy="name it .csv or .parquet",
+            remedy="write to a .csv or .parquet file",
         )
     write_table(path, frame)
 

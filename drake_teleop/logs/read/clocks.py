@@ -105,7 +105,7 @@ def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
         raise DrakeTeleopError(
             "the column holds dates or times of day, which have no unit",
             where=f"{where}.unit",
-            remedy="leave it out",
+            remedy="leave `unit` out",
         )
     columns = whole.raw_side_by_side(names, f"{where}.column")
     t = columns[:, 0] * SI_VALUE_OF_UNIT[time.unit]
@@ -260,7 +260,8 @@ def _check_rate(t: Array, time: Time, where: str) -> None:
     if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"
     raise DrakeTeleopError(
-        f"the median step of the time stamps is {step:.3g} s, a rate of {1 / step:.3g} Hz",
+        f"the median step of the time stamps is {step:.3g} s ({1 / MAX_RATE_HZ:g} to"
+        f" {1 / MIN_RATE_HZ:g} s are plausible), a rate of {1 / step:.3g} Hz",
         where=f"{where}.unit",
         remedy=remedy,
     )
@@ -274,7 +275,8 @@ def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where
     row = table.line_in_file(rows[longest + 1])
     raise DrakeTeleopError(
         f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
-        f" {steps.mean():.3g} s, longest {steps[longest]:.3g} s to row {row} of {table.path.name}",
+        f" {steps.mean():.3g} s (at most {_MAX_STEP_RATIO:g} times that), longest"
+        f" {steps[longest]:.3g} s to row {row} of {table.path.name}",
         where=where,
         remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",
     )

@@ -71,9 +71,9 @@ class Time(StrictModel):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Time:
         if (self.column is None) == (self.rate is None):
-            raise ValueError("give either column or rate")
+            raise ValueError("needs exactly one of column and rate: give either column or rate")
         if self.nanoseconds is not None and (self.column is None or self.unit != "s"):
-            raise ValueError("nanoseconds are added to a column of seconds: give column, unit s")
+            raise ValueError("nanoseconds require a column of seconds: give column, with unit s")
         return self
 
 
@@ -197,10 +197,10 @@ class Imu(_RecordedStream):
     @model_validator(mode="after")
     def _check_signals(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
-            raise ValueError("give specific_force, angular_velocity, or both")
+            raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         if self.is_mounting_auto and not self.specific_force:
             raise ValueError(
-                "auto: frame and position are found from specific_force; give it, or them"
+                "auto is estimated from specific_force: give it, or values of frame and position"
             )
         return self
 
@@ -229,13 +229,13 @@ class Pose(_RecordedStream):
     @model_validator(mode="after")
     def _check_frame(self) -> Pose:
         if self.frame == "base":
-            raise ValueError("frame must be sensor, or the rotation from the posed frame to S")
+            raise ValueError("frame must be sensor, or a rotation matrix from the posed frame to S")
         if self.frame != "sensor" and self.rotation_in_sensor is not None:
-            raise ValueError("frame and rotation_in_sensor are the same: give one of them")
+            raise ValueError("frame and rotation_in_sensor mean the same: give one of them")
         shifted = self.position_in_sensor == "auto" or any(self.position_in_sensor)
         if self.position is None and (shifted or self.rotation_in_sensor == "auto"):
             raise ValueError(
-                "position_in_sensor and auto need positions: give pose.position, or remove them"
+                "position_in_sensor and auto require positions: give pose.position, or remove them"
             )
         return self
 
@@ -270,7 +270,7 @@ class Static(_Stream):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
-            raise ValueError("give one of gravity (in S), specific_force (in S), orientation")
+            raise ValueError("give one of gravity (in S), specific_force (in S), orientation alone")
         if self.weight == "removed":
             raise ValueError(
                 "weight: removed cannot be used with static poses: record the load in motion,"
@@ -291,9 +291,9 @@ class Description(StrictModel):
     @model_validator(mode="after")
     def _check_streams(self) -> Description:
         if np.abs(self.gravity_W).max() > _MAX_GRAVITY:
-            raise ValueError(f"gravity exceeds {_MAX_GRAVITY:g} m/s^2")
+            raise ValueError(f"gravity exceeds {_MAX_GRAVITY:g} m/s^2: give it in m/s^2")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
-            raise ValueError("gravity: auto is found from a wrench with a pose and no imu")
+            raise ValueError("gravity: auto is found from a pose alone: add pose, and remove imu")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
                 raise ValueError("static poses cannot be combined with wrench, imu or pose")
@@ -315,7 +315,7 @@ class Description(StrictModel):
 
     def _check_weight(self, wrench: Wrench) -> None:
         if wrench.weight is not None and self.pose is None:
-            raise ValueError("wrench.weight follows from the orientation: add pose")
+            raise ValueError("wrench.weight requires an orientation: add pose")
         pose = self.pose is not None and self.pose.is_frame_auto
         kinds = {"pose: auto": pose, "gravity: auto": self.gravity == "auto"}
         kinds["wrench.weight"] = wrench.weight is not None

@@ -74,13 +74,13 @@ def _parse_imu_frame(value: Any) -> Any:
 
 def _parse_rotation(value: Any) -> Any:
     if value in ("sensor", "base"):
-        raise ValueError("must be a 3x3 rotation matrix from the posed frame to S, or auto")
+        raise ValueError("must be a 3x3 rotation matrix from posed frame to S, or the word auto")
     return value if value is None else _parse_imu_frame(value)
 
 
 def _parse_position(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
-        raise ValueError("must be three numbers [m], or auto")
+        raise ValueError("must be three numbers [m], or the word auto")
     return value
 
 
@@ -90,7 +90,7 @@ def _is_number(value: Any) -> bool:
 
 def _parse_gravity(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
-        raise ValueError("must be a number, three numbers [m/s^2], or auto")
+        raise ValueError("must be a number, three numbers [m/s^2], or the word auto")
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
@@ -103,7 +103,7 @@ def _parse_scale(value: Any) -> Any:
 
 def _parse_weight(value: Any) -> Any:
     if value is not None and value != "removed" and not isinstance(value, (list, tuple)):
-        raise ValueError("must be removed, or four numbers [m, m c_x, m c_y, m c_z] [kg, kg m]")
+        raise ValueError("must be the word removed, or [m, m c_x, m c_y, m c_z] in kg and kg m")
     return value
 
 

@@ -305,7 +305,7 @@ class _LogReader:
 
     def _orientation_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         return DrakeTeleopError(
-            "base axes cannot be turned to S without an orientation",
+            "vectors in the axes of the base cannot be rotated to S without an orientation",
             where=f"{self._source}:{name}.frame",
             remedy=remedy,
         )

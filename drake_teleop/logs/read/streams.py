@@ -138,7 +138,7 @@ class OrientationColumns:
         if errors[worst] > ROTATION_TOLERANCE:
             row = self._table.line_in_file(rows[worst])
             raise DrakeTeleopError(
-                f"row {row} of {self._table.path.name} is not a rotation",
+                f"row {row} of {self._table.path.name} is not a rotation or unit quaternion",
                 where=self._where,
                 remedy=f"check the columns and their order; form is {self._orientation.form}",
             )

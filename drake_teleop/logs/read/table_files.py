@@ -63,7 +63,7 @@ def _read_text(path: Path, header: bool = True) -> Table:
 def _strip_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
-        raise ValueError("two column names differ only in spaces")
+        raise ValueError("two column names differ only in spaces at their ends")
     return stripped
 
 
@@ -216,7 +216,7 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
     if array.dtype.names is not None:
         return {name: array[name] for name in array.dtype.names}
     if array.ndim != 2:
-        raise ValueError(f"it has {array.ndim} axes; give an array of rows and columns")
+        raise ValueError(f"its array has {array.ndim} dimensions; save one of rows and columns")
     return {str(k): array[:, k] for k in range(array.shape[1])}
 
 
