@@ -29,8 +29,8 @@ from drake_teleop.logs.read.tables import Table
 BANDWIDTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_SHARE = 0.05
-"""Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK` rows."""
-MIN_REPEATED_BLOCK = 5
+"""Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK_ROWS` rows."""
+MIN_REPEATED_BLOCK_ROWS = 5
 _MAX_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
 _WRENCH_NAMES = {"f_x", "tau_x"}
@@ -234,7 +234,7 @@ def _repeated_rows_findings(
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = same.mean() > MIN_REPEATED_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK
+    enough = same.mean() > MIN_REPEATED_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK_ROWS
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
     longest = _longest_run(same)
@@ -317,7 +317,7 @@ def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
     inside, outside = _longest_run(held & ends), _longest_run(held & ~ends)
-    return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK and inside > 2 * outside else 0
+    return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0
 
 
 def _remove_nonfinite_rows(table: Table, names: Sequence[str]) -> Table:

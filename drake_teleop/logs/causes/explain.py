@@ -84,7 +84,7 @@ SearchResult = tuple[State, float, list[Candidate]]
 def search_causes(
     data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
 ) -> SearchResult:
-    """Return the fitted model that explains a record, its delay [s], and rejected causes.
+    """Return the fitted model that explains a record, additional delay [s], and rejected causes.
 
     Arguments are as for `explain_misfit`.
     """

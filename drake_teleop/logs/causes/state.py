@@ -260,7 +260,7 @@ class State:
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """Gain of `smooth_gain` per degree of freedom: about 1 or below for noise of any colour."""
+        """Gain by smooth signals per degree of freedom; at most about 1 for noise."""
         gain, freedom = self.smooth_gain
         return gain / max(1, freedom - self.model.size)
 

@@ -38,7 +38,7 @@ from drake_teleop.logs.read.tables import Table
 
 _MIN_MOTION_RMS = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
-_FEWEST_POSES = 6
+_MIN_CHECKED_POSES = 6
 """Fewest poses that allow a check of the fit."""
 _MIN_DIRECTION_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
@@ -228,7 +228,7 @@ def _merge_clock_findings(
 def _static_poses_finding(log: Log) -> Finding | None:
     if not log.static:
         return None
-    if len(log) < _FEWEST_POSES:
+    if len(log) < _MIN_CHECKED_POSES:
         return Finding(
             "static poses",
             f"{len(log)} poses at rest are too few to check the fit; record 12, turned about two"

@@ -299,12 +299,12 @@ def _weighted_number_of_deviations(x: Hypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
-    count += _weight_of_rotation(x.force) + float(not np.allclose(x.force, x.torque))
+    count += _rotation_cost(x.force) + float(not np.allclose(x.force, x.torque))
     scaled = x.gain != 1.0
     return count + float(scaled[0]) + float(scaled[1])
 
 
-def _weight_of_rotation(M: Array) -> float:
+def _rotation_cost(M: Array) -> float:
     if np.allclose(np.abs(M), np.eye(3)):
         return 0.0 if M.trace() > 2.9 else 1.0
     return 1.5 if np.allclose(np.abs(M).max(axis=0), 1.0) else 2.5

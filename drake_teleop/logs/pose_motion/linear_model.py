@@ -54,7 +54,7 @@ class LinearFit:
     """Fit of the wrench by free coefficients of 16 signals of the motion.
 
     Attributes:
-        coefficients: (6, 16); zero for constant signals.
+        coefficients: (6, 16); 0 for signals that are 0.
         covariance: (6, 16, 16) of the rows of coefficients.
         power: (bands, 6) mean noise power.
         costs: (6,) negative log likelihood of each channel.

@@ -17,15 +17,15 @@ NOTHING_REJECTED_NOTE = (
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS = 3.0, 4.5, 30
 _STD_OVER_MAD = 1.4826
 _MAX_INFORMATION_LOSS = 2.5
-_PASSED_SHARE = 0.3
+_HALF_GAIN_OVER_KNOT_RATE = 0.3
 _MIN_MARGIN_S = 0.1
 """Least margin on both sides of a rejected time span [s]."""
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
     """Return (M,) True for contact, impact or saturation, and a note for the user."""
-    # A Gaussian gain, one half at `_PASSED_SHARE` / h, does not ring.
-    gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED_SHARE) ** 2)
+    # A Gaussian gain, one half at `_HALF_GAIN_OVER_KNOT_RATE` / h, does not ring.
+    gain = 0.5 ** ((spectra.of.frequency * spacing / _HALF_GAIN_OVER_KNOT_RATE) ** 2)
     grid = spectra.grid
     x, y = (
         _spectrum_to_time_signal(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench)

@@ -249,7 +249,7 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 
 
 def _residual_derivative(state: RigidParameters) -> tuple[Array, Array]:
-    """Return B = -de/dx (6, 23, 38) and the residual e (6, 38), in coefficients of y."""
+    """Return B = -de/dx (6, 23, 38) and e (6, 38): coefficients of 38 signals in the residual."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
     B = np.zeros((6, NUM_PARAMETERS, MOMENTS_SIZE))
     B[:, LOAD_PARAMETERS] = regressor_coefficients() @ M

@@ -50,8 +50,8 @@ def estimate_auto_imu_mounting(
         lever = _choose_lever_arm(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         notes.append(
-            f"imu.position found: {_format_mm(lever)} mm, from the {lever.source}; write it into"
-            f" the description as imu.position: {_round_for_yaml(lever.p_SoIo_S)}"
+            f"imu.position found: {_format_arm_mm(lever)} mm, from the {lever.source}; write it"
+            f" into the description as imu.position: {_round_for_yaml(lever.p_SoIo_S)}"
         )
     return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
@@ -125,7 +125,7 @@ def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> Leve
         )
         raise DrakeTeleopError(
             f"the motion does not determine {axes} of the accelerometer's position"
-            f" ({_format_mm(lever)} mm, from the {lever.source})",
+            f" ({_format_arm_mm(lever)} mm, from the {lever.source})",
             where=where,
             remedy="turn faster, about more axes, or give imu.position in metres",
         )
@@ -136,7 +136,7 @@ def _round_for_yaml(x: Array) -> list:
     return list((np.round(x, 4) + 0.0).tolist())
 
 
-def _format_mm(lever: LeverArm) -> str:
+def _format_arm_mm(lever: LeverArm) -> str:
     return ", ".join(
         f"{axis} {1e3 * value:.1f} +- {1e3 * deviation:.1f}" if deviation < 1 else f"{axis} unknown"
         for axis, value, deviation in zip("xyz", lever.p_SoIo_S, lever.deviations, strict=True)

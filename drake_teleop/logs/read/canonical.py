@@ -60,7 +60,7 @@ class Log:
         gravity: (N, 3) gravity in S [m/s^2].
         static: True if the samples are separate poses at rest.
         bridged: (N,) True for samples interpolated over gaps.
-        notes: assumptions of the reader.
+        notes: assumptions made during reading.
         posed: recorded poses, if they have positions.
         gain_std: standard deviation of the sensor gains (relative).
         R_WS: (N, 3, 3) orientation of S in the world W.
@@ -166,7 +166,7 @@ def write_log(log: Log, path: str | Path) -> None:
         raise DrakeTeleopError(
             f"format {path.suffix!r} is not known",
             where=str(path),
-            remedy="write to a .csv or .parquet file",
+            remedy="name it .csv or .parquet",
         )
     write_table(path, frame)
 

@@ -58,9 +58,9 @@ class Time(StrictModel):
         default=None, description="column of nanoseconds, added to the seconds of `column`"
     )
     rate: Number | None = Field(
-        default=None, ge=1e-3, le=1e6, description="Hz, if there is no column"
+        default=None, ge=1e-3, le=1e6, description="constant rate in Hz, if there is no column"
     )
-    offset: Number = Field(default=0.0, description="s, added to the stream's clock")
+    offset: Number = Field(default=0.0, description="seconds that are added to the stream's clock")
     scale: Number = Field(
         default=1.0,
         ge=0.5,
@@ -82,13 +82,13 @@ class Orientation(StrictModel):
 
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector", "euler"]
-    unit: Literal["rad", "deg"] = Field(default="rad", description="of rotation_vector and euler")
+    unit: Literal["rad", "deg"] = Field(default="rad", description="unit of the angles")
     axes: str | None = Field(
         default=None,
         description="axes of the Euler angles, in the order of the columns: small letters for"
         " fixed axes, such as xyz (roll, pitch, yaw), capitals for moving ones, such as ZYX",
     )
-    inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
+    inverse: bool = Field(default=False, description="true if the columns hold R_SW")
 
     @model_validator(mode="after")
     def _check_axes(self) -> Orientation:
@@ -135,7 +135,7 @@ class _Stream(StrictModel):
 
 
 class _RecordedStream(_Stream):
-    topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
+    topic: str | None = Field(default=None, description="topic of a ROS bag or MCAP file")
     child_frame: str | None = Field(
         default=None, description="child frame of the transform in the topic"
     )
@@ -189,9 +189,9 @@ class Imu(_RecordedStream):
     sign: Literal[1, -1] = Field(
         default=1, description="sign of the specific force; -1 if the file has g - a"
     )
-    frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
+    frame: ImuFrame = Field(default="sensor", description="axes of the IMU; auto: estimated")
     position: PositionOrAuto = Field(
-        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: it is found"
+        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: estimated"
     )
 
     @model_validator(mode="after")
@@ -200,7 +200,7 @@ class Imu(_RecordedStream):
             raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         if self.is_mounting_auto and not self.specific_force:
             raise ValueError(
-                "auto is estimated from specific_force: give it, or values of frame and position"
+                "auto is found from specific_force: give it, or values of frame and position"
             )
         return self
 
@@ -219,11 +219,11 @@ class Pose(_RecordedStream):
     frame: Frame = "sensor"
     position_in_sensor: PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0),
-        description="p_SoPo_S of the posed frame's origin, m; auto: it is found",
+        description="origin of the posed frame in S, p_SoPo_S, m; auto: estimated",
     )
     rotation_in_sensor: RotationOrAuto = Field(
         default=None,
-        description="R_SP, from the posed frame to S, as frame has it; auto: it is found",
+        description="rotation R_SP from the posed frame to S, as in frame; auto: estimated",
     )
 
     @model_validator(mode="after")
@@ -253,14 +253,14 @@ class Pose(_RecordedStream):
 
 
 class Static(_Stream):
-    """Averages over separate poses at rest, one per row."""
+    """Wrenches averaged over separate poses at rest, one pose per row."""
 
     force: Force
     torque: Torque
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
     weight: Weight = None
-    gravity: Acceleration | None = Field(default=None, description="g_S in S")
+    gravity: Acceleration | None = Field(default=None, description="gravity in S")
     specific_force: Acceleration | None = Field(
         default=None, description="what an accelerometer reads at rest, -g_S, in S"
     )

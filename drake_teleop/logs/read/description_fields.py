@@ -118,8 +118,8 @@ GainStd = Annotated[
     Field(
         ge=0,
         le=0.2,
-        description="standard deviation of the sensor's gains, 0.01 for 1 %, as its maker or a"
-        " calibration says",
+        description="standard deviation of the sensor's gains, such as 0.01 for 1 %, from its data"
+        " sheet or a calibration",
     ),
 ]
 _NUMBER_OR_VECTOR_SCHEMA: list[dict[str, Any]] = [
@@ -128,7 +128,7 @@ _NUMBER_OR_VECTOR_SCHEMA: list[dict[str, Any]] = [
 ]
 _GRAVITY_SCHEMA = {
     "anyOf": [*_NUMBER_OR_VECTOR_SCHEMA, {"type": "string", "const": "auto"}],
-    "description": "magnitude, or the vector in the world, m/s^2; auto: the direction is found",
+    "description": "magnitude, or the vector in the world, m/s^2; auto: the direction is estimated",
 }
 Gravity = Annotated[
     Vector | Literal["auto"], BeforeValidator(_parse_gravity), WithJsonSchema(_GRAVITY_SCHEMA)
@@ -143,7 +143,7 @@ Weight = Annotated[
     Vector4 | Literal["removed"] | None,
     BeforeValidator(_parse_weight),
     Field(
-        description="that the robot has subtracted: removed if it is the load's, or that of a"
+        description="weight that the robot has subtracted: removed (that of the load), or that of a"
         " payload, [m, m c_x, m c_y, m c_z] in S, kg and kg m"
     ),
 ]
@@ -156,7 +156,7 @@ PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_posi
 
 
 class StrictModel(BaseModel):
-    """Frozen model that rejects unknown fields and numbers beyond 1e12."""
+    """Immutable Pydantic model that rejects unknown fields and numbers beyond 1e12."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -72,7 +72,7 @@ def estimate_clock_drift(
 ) -> tuple[float, float]:
     """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
 
-    `lag` [s] is a first estimate. An insignificant drift is set to 0.
+    `lag` [s] is a first estimate, from `independent` samples. An insignificant drift is 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])
@@ -168,7 +168,7 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     return np.where(unknown, np.inf, deviations)
 
 
-MAX_LEVER_DEVIATION = 0.005
+MAX_LEVER_DEVIATION_M = 0.005
 """Largest standard deviation of a determined coordinate [m]."""
 MAX_UNEXPLAINED_SHARE = 0.05
 """Largest unexplained share of the variance of a valid fit."""
@@ -197,7 +197,7 @@ class LeverArm:
     @property
     def is_determined_by_axis(self) -> NDArray[np.bool_]:
         """Booleans (3,): True where the standard deviation is below 5 mm."""
-        return self.deviations < MAX_LEVER_DEVIATION
+        return self.deviations < MAX_LEVER_DEVIATION_M
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
