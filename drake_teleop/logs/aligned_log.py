@@ -197,7 +197,7 @@ def missing_orientation_error(where: str) -> DrakeTeleopError:
 
 
 def replace_force_by_acceleration(log: Log) -> Log:
-    """Return the log with acceleration in place of specific force."""
+    """Return the log with acceleration in place of specific force, by adding gravity."""
     if log.gravity is None:
         raise missing_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)

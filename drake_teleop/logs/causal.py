@@ -21,7 +21,7 @@ class CausalWrench:
 
     Attributes:
         mode: "delayed", or "predicted" (extrapolated over the lag).
-        lag_s: delay of a slowly changing contact force, if not predicted [s].
+        lag_s: delay of slow changes of the contact force, before prediction [s].
         contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma (load's wrench).
         offsets: (6,) subtracted sensor offsets [N, N m].
     """

@@ -54,7 +54,7 @@ class Detection:
         statistic, threshold: name of the used statistic, and its threshold.
         statistics: (N, 3) values of all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
-        free_s: duration of the free motion [s].
+        free_s: duration of the free motion that determined the floor [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
     """
 

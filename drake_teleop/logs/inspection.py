@@ -86,7 +86,7 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         return Draft(*draft_of_bag(path, topics, out))
     if path.suffix.lower() in (".yaml", ".yml"):
         raise DrakeTeleopError(
-            "is a log description, which already names all files of a recording",
+            "a log description names all files of a recording, so that no others can be added",
             where=str(path),
             remedy="inspect it alone, or give only tables and bags",
         )

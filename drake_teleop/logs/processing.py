@@ -381,7 +381,7 @@ def eliminate_log(
     )
     if untouched_s is not None and not tare:
         raise DrakeTeleopError(
-            "determines the offsets, but these are requested from the load file (tare=False)",
+            "a span without contact determines the offsets, but those of the load are requested",
             where="untouched",
             remedy="leave one of the two out",
         )
@@ -426,7 +426,7 @@ def _eliminate_read_log(
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
-            "requires `causal`, the mode of wrenches as in a control loop",
+            "a contact-free start requires `causal`, the mode of wrenches as in a control loop",
             where="causal_tare_s",
             remedy="give causal as well, or remove it",
         )
@@ -525,10 +525,10 @@ def _rows_between(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
         found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
         raise DrakeTeleopError(
-            f"the span from {start_s:g} to {stop_s:g} s has {found}",
+            f"the span from {start_s:g} to {stop_s:g} s has {found} ({_MIN_TARE_SAMPLES} required)",
             where="untouched",
-            remedy=f"give a span without contact of {_MIN_TARE_SAMPLES} samples or more, in"
-            f" seconds after the first sample; the record has {log.t[-1] - log.t[0]:.4g} s",
+            remedy="give a longer span without contact, in seconds after the first sample; the"
+            f" record has {log.t[-1] - log.t[0]:.4g} s",
         )
     return rows
 
@@ -537,9 +537,10 @@ def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> 
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
-            f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples",
+            f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples"
+            f" ({_MIN_TARE_SAMPLES} or more are required, but not all)",
             where="causal_tare_s",
-            remedy=f"give a start of {_MIN_TARE_SAMPLES} samples or more, less than the record",
+            remedy="give another contact-free start",
         )
     return wrench[rows]
 
@@ -613,7 +614,7 @@ def _check_scales(
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
     if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
         raise DrakeTeleopError(
-            "eta cannot be combined with other scales: it implies sigma = 0, gamma = 1 (Eq. 14)",
+            "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)",
             where="eta",
             remedy="remove all scales except eta",
         )

@@ -278,10 +278,7 @@ class _ResidualBlocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return True for blocks of `among` with a far larger residual than the calmest ones.
-
-        Return None for too few blocks.
-        """
+        """Return True for blocks `among` with a residual far above the calmest; None for few."""
         found = self._fit_calmest(np.flatnonzero(among))
         if found is None:
             return None

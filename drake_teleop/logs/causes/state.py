@@ -299,10 +299,7 @@ class State:
 
 
 def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
-    """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram.
-
-    Rows with a diagonal below `least` are omitted as rounding errors.
-    """
+    """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
     if not used.any():

@@ -1,4 +1,4 @@
-"""Errors of convention in a log description, found by the laws of motion."""
+"""Wrong units, signs, axes and clocks in a log description, found by the laws of motion."""
 
 from __future__ import annotations
 

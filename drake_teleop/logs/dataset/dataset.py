@@ -109,7 +109,9 @@ def dataset_command(
     dataset, copied = open_dataset(path), out / path.resolve().name
     if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
         raise DrakeTeleopError(
-            "is in the dataset, which must not change", where=str(out), remedy="give another --out"
+            "the output folder is in the dataset, which must not change",
+            where=str(out),
+            remedy="give another --out",
         )
     make_folder(out)
     with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():

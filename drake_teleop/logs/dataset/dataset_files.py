@@ -232,7 +232,7 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
     head = first - 2
     if len(rows) != len(frame) or len(frame) != len(new.in_contact) or head < 0:
         raise DrakeTeleopError(
-            "new columns require a header and one line for each row, which it does not have",
+            "columns can only be added to a file with a header and one line for each row",
             where=str(path),
             remedy="convert it to Parquet",
         )

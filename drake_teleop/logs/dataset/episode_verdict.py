@@ -124,7 +124,7 @@ def find_hypothesis(
 
 
 def unexplained_reading(x: Hypothesis, predict: PredictReading, regress: RegressorAtLag) -> Array:
-    """Return the reading (N, 6) minus that of the load in a hypothesis; offsets remain."""
+    """Return the reading (N, 6) without the load's part by a hypothesis; offsets remain."""
     wrench, load_wrench = predict(x.kind, x.lag)
     if x.phi is not None:
         return np.asarray(wrench - regress(x.lag) @ x.phi)

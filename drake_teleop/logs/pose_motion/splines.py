@@ -78,8 +78,7 @@ class PoseSplines:
     """Least-squares splines of poses of a frame P, with knots every `spacing` [s].
 
     Args:
-        limit_ends: expect second and higher derivatives at the ends as large as inside. Poses on
-            one side alone determine them with a several times larger error.
+        limit_ends: expect second and higher derivatives at the ends as large as inside.
     """
 
     def __init__(

@@ -107,7 +107,7 @@ def smooth_derivatives(
 
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
-    """Return factors (3,) of `smooth_derivatives` on white noise: [1], [1/s], [1/s^2]."""
+    """Return noise (3,) of `smooth_derivatives` over white noise of x: [1], [1/s], [1/s^2]."""
     weights = smoother_weights(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
@@ -173,7 +173,8 @@ def remove_delay(log: Log, delay_s: float) -> Log:
     known = (at >= log.t[0]) & (at <= log.t[-1])
     if known.sum() < _MIN_ALIGNED_SAMPLES:
         raise DrakeTeleopError(
-            f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples",
+            f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples"
+            f" ({_MIN_ALIGNED_SAMPLES} are required)",
             where=log.source,
             remedy="give a shorter delay, or `auto`",
         )

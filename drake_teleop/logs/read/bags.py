@@ -92,7 +92,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         if not connections:
             known = [f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())]
             raise DrakeTeleopError(
-                f"has no topic {topic!r}",
+                f"the bag has no topic {topic!r}",
                 where=str(path),
                 remedy=f"its topics are {', '.join(known)}",
             )
@@ -161,7 +161,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     if not is_bag(path):
         raise DrakeTeleopError(
-            "is not a bag",
+            "the path is not a bag",
             where=str(path),
             remedy="give a folder with metadata.yaml, or a .mcap, .db3 or .bag file",
         )
@@ -189,7 +189,9 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise DrakeTeleopError(
-            f"cannot be read: {text}", where=str(path), remedy="check it with `ros2 bag info`"
+            f"the bag cannot be read: {text}",
+            where=str(path),
+            remedy="check it with `ros2 bag info`",
         ) from error
 
 

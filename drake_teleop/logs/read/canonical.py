@@ -164,7 +164,7 @@ def write_log(log: Log, path: str | Path) -> None:
     frame = pl.DataFrame({"t": log.t} | dict(zip(names, values.T, strict=True)))
     if path.suffix not in (".csv", ".parquet"):
         raise DrakeTeleopError(
-            f"format {path.suffix!r} is not known",
+            f"logs cannot be written in the format {path.suffix!r}",
             where=str(path),
             remedy="name it .csv or .parquet",
         )

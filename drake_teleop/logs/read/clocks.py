@@ -119,7 +119,7 @@ def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
     """Return a note about the episodes of a wrench's clock; raise an error for several files."""
     if num_files > 1:
         raise DrakeTeleopError(
-            f"the clock starts {clock.episodes} times, and the streams are in several files",
+            f"the clock starts {clock.episodes} times, which requires all streams in one file",
             where=where,
             remedy="write all streams into one table, or each episode into files of its own",
         )

@@ -71,7 +71,7 @@ class Time(StrictModel):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Time:
         if (self.column is None) == (self.rate is None):
-            raise ValueError("needs exactly one of column and rate: give either column or rate")
+            raise ValueError("time needs either column or rate, not both: give one of them")
         if self.nanoseconds is not None and (self.column is None or self.unit != "s"):
             raise ValueError("nanoseconds require a column of seconds: give column, with unit s")
         return self
@@ -200,7 +200,7 @@ class Imu(_RecordedStream):
             raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         if self.is_mounting_auto and not self.specific_force:
             raise ValueError(
-                "auto is found from specific_force: give it, or values of frame and position"
+                "auto is found from specific_force: give that, or values of frame and position"
             )
         return self
 
@@ -270,7 +270,7 @@ class Static(_Stream):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
-            raise ValueError("give one of gravity (in S), specific_force (in S), orientation alone")
+            raise ValueError("static needs one of gravity, specific_force (both in S), orientation")
         if self.weight == "removed":
             raise ValueError(
                 "weight: removed cannot be used with static poses: record the load in motion,"

@@ -80,7 +80,7 @@ def _parse_rotation(value: Any) -> Any:
 
 def _parse_position(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
-        raise ValueError("must be three numbers [m], or the word auto")
+        raise ValueError("a position must be three numbers [m], or the word auto")
     return value
 
 
@@ -90,20 +90,20 @@ def _is_number(value: Any) -> bool:
 
 def _parse_gravity(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
-        raise ValueError("must be a number, three numbers [m/s^2], or the word auto")
+        raise ValueError("gravity must be a number, three numbers [m/s^2], or the word auto")
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
 def _parse_scale(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
     if any(_is_number(x) and abs(x) < _MIN_SCALE for x in factors):
-        raise ValueError(f"must have absolute values of at least {_MIN_SCALE:g}")
+        raise ValueError(f"factors must have absolute values of at least {_MIN_SCALE:g}")
     return [float(value)] * 3 if _is_number(value) else value
 
 
 def _parse_weight(value: Any) -> Any:
     if value is not None and value != "removed" and not isinstance(value, (list, tuple)):
-        raise ValueError("must be the word removed, or [m, m c_x, m c_y, m c_z] in kg and kg m")
+        raise ValueError("weight must be the word removed, or [m, m c_x, m c_y, m c_z] in kg, kg m")
     return value
 
 

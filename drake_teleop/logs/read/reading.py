@@ -73,7 +73,6 @@ def read_log(
     specific force from the accelerometer, else from the position, else it is -gravity.
 
     Args:
-        path: the file.
         bandwidth_hz: bandwidth of derivatives, see `smooth_derivatives`; None: the largest.
         differentiate: False leaves the motion zero where poses are its only source, for users of
             `Log.posed`.
@@ -336,11 +335,9 @@ class _LogReader:
         n = len(wrench)
         if n < MIN_STATIC_POSES:
             raise DrakeTeleopError(
-                f"{n} poses are too few",
+                f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)",
                 where=f"{self._source}:static",
-                remedy=(
-                    f"record at least {MIN_STATIC_POSES}, better 12, with different orientations"
-                ),
+                remedy="record 12 or more, with different orientations",
             )
         rest = np.zeros((n, 3))
         return Log(
