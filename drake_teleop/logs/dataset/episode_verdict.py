@@ -196,7 +196,7 @@ class HypothesisSearch:
     def refit_to_best_rows(self, x: Hypothesis, *, det: float, scale: bool) -> Hypothesis:
         """Return the hypothesis with rotation and factors fitted to the best rows.
 
-        The determinant of the fitted rotation is `det`; 0 keeps the rotation.
+        The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
         """
         found = [self._fit_to_rows(x, rows, det, scale) for rows in self.start_rows()]
         return min(found, key=lambda x: x.cost)

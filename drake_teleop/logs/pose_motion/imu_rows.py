@@ -73,7 +73,10 @@ def _fit_sensor(
     which: int,
     pose_noise: tuple[float, int],
 ) -> _SensorModel | None:
-    """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y."""
+    """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y.
+
+    `which` is 0 for an accelerometer, 1 for a gyroscope.
+    """
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)
     even = t[0] + dt * np.arange(place[-1] + 1)
