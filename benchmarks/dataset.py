@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.dataset.dataset import dataset_command
-from drake_teleop.logs.sample import NOISE_STD, SampleEpisode
+from drake_teleop.logs.sample import WRENCH_NOISE_STD, SampleEpisode
 
 RATES = (10.0, 15.0, 30.0, 50.0)
 TOOLS = [
@@ -148,7 +148,7 @@ def planted(folder: Path, fps: float, tool: int, clean: int) -> dict[str, Any]:
     touched = table["observation.in_contact"].to_numpy()
     true = np.hstack([x.in_contact for x in made[:clean]])
     free = ~truth.any(axis=1)
-    residual = np.sqrt(np.mean(contact[free] ** 2, axis=0)) / NOISE_STD
+    residual = np.sqrt(np.mean(contact[free] ** 2, axis=0)) / WRENCH_NOISE_STD
     f1 = 2 * (touched & true).sum() / (touched.sum() + true.sum())
     return {
         "rate_hz": fps,

@@ -1,4 +1,4 @@
-"""Motion of S at the sample times of a wrench, without delay, from splines, IMU or derivatives."""
+"""Alignment of motion and wrench of a log: removal of the delay between them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
 def estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
-    """Return motion and load of a log with poses, and the source of the delay."""
+    """Return motion and load fitted to a log with poses, and the delay's source ("given" ...)."""
     return _fit_with_delay_or_usual(
         log, delay, lambda late: _estimate_load_and_motion(log, late), 0.0, "undetermined"
     )
@@ -40,10 +40,10 @@ def estimate_motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate
 def motion_of_known_load(
     log: Log, delay: str | float, load: Array, usual_s: float
 ) -> tuple[PoseMotion, str] | None:
-    """Return the motion from poses that fits an identified load best, and the source of the delay.
+    """Return the motion from poses that fits an identified load best, and the delay's source.
 
-    The delay is `usual_s` [s] for a record that does not determine it. Return None without poses,
-    for a short record, and if the IMU disagrees with the poses.
+    `load` (6, 16) are the load's coefficients, Eq. (T73). The delay is `usual_s` [s] if the record
+    does not determine it. Return None for a short log, and without poses or if the IMU disagrees.
     """
     posed = log.posed
     if posed is None or log.static:
@@ -88,7 +88,7 @@ def _estimate_load_and_motion(log: Log, delay: float | None) -> PoseEstimate:
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log with spline motion and without delay, and (N,) True near ends and gaps."""
+    """Return the log with motion from splines of poses, and (N,) True near ends and gaps."""
     assert log.posed is not None
     moved, splines = remove_delay(log, found.delay_s), found.splines
     t, gravity_W = moved.t + found.delay_s, log.posed.gravity_W
@@ -128,7 +128,7 @@ class AlignedLog:
     Attributes:
         log: with acceleration instead of specific force if the robot had removed the weight.
         delay_s: removed delay of the motion behind the wrench [s].
-        source: of the delay: "estimated", "given", "load" (identification file) or "static".
+        source: origin of the delay: "estimated", "given", "load" (identification file) or "static".
         differentiated: log with motion by numerical differentiation, if required.
         edge: (N,) True for samples near ends and gaps, whose motion is less accurate.
     """
@@ -140,7 +140,7 @@ class AlignedLog:
     edge: NDArray[np.bool_]
 
 
-def aligned_log(
+def read_aligned_log(
     path: str | Path,
     phi: Array,
     usual_s: float,
@@ -153,7 +153,6 @@ def aligned_log(
 
     The motion is from splines of the poses, or from an IMU if the load phi (10,) then fits better.
     `delay` [s] or "auto" is removed; `usual_s` [s] is used if the record does not determine it.
-    `weight_removed` is True if the wrench does not contain the weight of the load.
     """
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=differentiate)
     weight_removed = weight_removed or "weight" in log.free
@@ -198,7 +197,7 @@ def missing_orientation_error(where: str) -> DrakeTeleopError:
 
 
 def replace_force_by_acceleration(log: Log) -> Log:
-    """Return the log with acceleration in place of specific force."""
+    """Return the log with acceleration in place of specific force, by adding gravity."""
     if log.gravity is None:
         raise missing_orientation_error(log.source)
     return replace(log, specific_force=log.specific_force + log.gravity)

@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 
 _ROOT_OF_2, _ROOT_4_OF_3 = math.sqrt(2.0), 3.0**0.25
-MODES = ("delayed", "predicted")
+CAUSAL_MODES = ("delayed", "predicted")
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class CausalWrench:
 
     Attributes:
         mode: "delayed", or "predicted" (extrapolated over the lag).
-        lag_s: delay of a slow contact without prediction [s].
-        contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma V phi [N, N m].
+        lag_s: delay of slow changes of the contact force, before prediction [s].
+        contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma (load's wrench).
         offsets: (6,) subtracted sensor offsets [N, N m].
     """
 
@@ -41,9 +41,9 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
             raise DrakeTeleopError(
-                "a prediction needs a low-pass",
+                "causal mode `predicted` needs a low-pass below half the rate of the log",
                 where="cutoff",
-                remedy="give a cut-off below half the rate of the log, or causal mode `delayed`",
+                remedy="give a lower cut-off, or causal mode `delayed`",
             )
         return x
     from scipy.signal import lfilter
@@ -62,7 +62,10 @@ def low_pass_coefficients(dt: float, cutoff_hz: float, ahead_s: float = 0.0) -> 
 
 @njit(cache=True)
 def design_low_pass(dt, tangent, ahead_s, low_pass):
-    """Write the low-pass for `tangent` = tan(pi cutoff dt) to the coefficients `low_pass` (7,)."""
+    """Write filter coefficients b (3), a (2) and settled state (2) to `low_pass` (7,), Eq. (T11).
+
+    `tangent` is tan(pi cutoff dt).
+    """
     k = 2.0 / dt
     w = k * tangent / _ROOT_4_OF_3
     square, damping = w * w, _ROOT_OF_2 * w * k
@@ -91,9 +94,9 @@ def causal_wrenches(
     The delay of the motion behind the wrench, `delay_s`, is rounded up to full samples. The mode
     "delayed" keeps the lag of the wrenches (N, 6), "predicted" extrapolates over it.
     """
-    if mode not in MODES:
+    if mode not in CAUSAL_MODES:
         raise DrakeTeleopError(
-            f"{mode!r} is not a causal mode", where="causal", remedy=f"give one of {MODES}"
+            f"{mode!r} is not a causal mode", where="causal", remedy=f"give one of {CAUSAL_MODES}"
         )
     wait = max(0, math.ceil(delay_s / dt - 1e-6))
     lag = wait * dt + filter_lag(dt, cutoff_hz)

@@ -30,7 +30,7 @@ MIN_SAMPLES = 100
 """Fewest samples for a noise floor."""
 
 # Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
-_RESOLUTION = np.repeat([1e-3, 1e-4], 3)
+_MIN_NOISE_FLOOR = np.repeat([1e-3, 1e-4], 3)
 # Without orientation, gravity is the specific force below this frequency.
 _GRAVITY_CUTOFF_HZ = 0.5
 _QUIET_DEVIATIONS = 4.0
@@ -42,7 +42,7 @@ _MAX_FLOOR_SAMPLES = 30_000  # largest number of samples for a noise floor, in s
 _GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
 _MAX_CONTACT_SHARE, _MAX_NOISE_RATIO = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
-_CONTACT_SHARE_OF_SHIFT = 0.2
+_MIN_CONTACT_SHARE_OF_SHIFT = 0.2
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Detection:
     Attributes:
         floor: noise floor of the free motion.
         statistic, threshold: name of the used statistic, and its threshold.
-        statistics: (N, 3) all statistics; 0 at the ends, which are not judged.
+        statistics: (N, 3) values of all statistics; 0 at the ends, which are not judged.
         touched: (N,) True for contact, with hysteresis.
-        free_s: duration of the free motion [s].
+        free_s: duration of the free motion that determined the floor [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
     """
 
@@ -108,7 +108,7 @@ def detect_contact(
     # A held value decays by the factor e within a period.
     if free is None:
         fade = math.exp(-dt / period)
-        floor, threshold, train = _floor_from_record(judged, dt, hold, fade, covariance, statistic)
+        floor, threshold, train = _fit_record_floor(judged, dt, hold, fade, covariance, statistic)
     else:
         train = free[0].select_rows(_select_judged_samples(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
@@ -144,7 +144,7 @@ def _select_judged_samples(
     return slice(int(at[0]), int(at[-1]) + 1) if one_piece else judged
 
 
-def _floor_from_record(
+def _fit_record_floor(
     rows: DetectorSamples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, DetectorSamples]:
     from scipy.ndimage import maximum_filter1d
@@ -220,7 +220,7 @@ def _detection_notes(
             f"{100 * touched.mean():.0f} % of the record are contact: the rest is too short to"
             f" determine the noise floor{remedy}",
         )
-    noise_ratio = float((floor.noise / np.maximum(usual, _RESOLUTION)).max())
+    noise_ratio = float((floor.noise / np.maximum(usual, _MIN_NOISE_FLOOR)).max())
     if noise_ratio > _MAX_NOISE_RATIO:
         return (
             f"the noise floor at rest is {noise_ratio:.0f} times the residual of the"
@@ -233,7 +233,7 @@ def _detection_notes(
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
     """Return a note if most of a record seems to be contact, which shifts its offsets, else ()."""
     force = float(np.linalg.norm(shift[:3]))
-    if force <= found.force_threshold or found.touched.mean() < _CONTACT_SHARE_OF_SHIFT:
+    if force <= found.force_threshold or found.touched.mean() < _MIN_CONTACT_SHARE_OF_SHIFT:
         return ()
     return (
         f"the offsets of the record differ by {force:.2g} N from those of the free motion: either"
@@ -260,16 +260,16 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 
 def noise_floor(contact: Array) -> Array:
-    """Return the noise (6,) of a contact wrench (N, 6), at least half contact-free, Eq. (T12)."""
+    """Return the RMS noise (6,) of a contact wrench (N, 6), half free of contact, Eq. (T12)."""
     floor = narrowest_half(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
         before = quiet
-        quiet = _is_below_noise_limit(contact, np.maximum(floor, _RESOLUTION))
+        quiet = _is_below_noise_limit(contact, np.maximum(floor, _MIN_NOISE_FLOOR))
         if np.array_equal(before, quiet) or not quiet.any():
             break
         floor = np.sqrt(np.mean(contact[quiet] ** 2, axis=0))
-    return np.maximum(floor, _RESOLUTION)
+    return np.maximum(floor, _MIN_NOISE_FLOOR)
 
 
 def _is_below_noise_limit(contact: Array, floor: Array) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Causes of a misfit in a log, the lines that correct them, and the resulting load."""
+"""Causes of a misfit in a log, corrected lines of its description, and the resulting load."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import parse_yaml
 from drake_teleop.load.identification import Identification, is_precise_enough
-from drake_teleop.logs.causes.cause import CHANNELS, Cause
-from drake_teleop.logs.causes.explain import Explanation, explain
+from drake_teleop.logs.causes.cause import CHANNEL_NAMES, Cause
+from drake_teleop.logs.causes.explain import Explanation, explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record
 from drake_teleop.logs.causes.intervals import attenuation_bias
 from drake_teleop.logs.check.corrections import Finding
@@ -24,7 +24,7 @@ from drake_teleop.logs.pose_motion.splines import PoseSplines, passed_noise_shar
 from drake_teleop.logs.read.alignment import remove_delay
 from drake_teleop.logs.read.auto_frames import block_means_of_log
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION, Description
+from drake_teleop.logs.read.description import YAML_ONLY_NOTE, Description
 from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.table_files import TABLE_READERS
 
@@ -42,11 +42,11 @@ _FORCE_UNIT_FIELD, _TORQUE_UNIT_FIELD = "wrench.force.unit", "wrench.torque.unit
 # Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
 _FORCE_UNITS = ("N", "kgf", "lbf")
 _TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
-_SAME_RATIO = 1e-3
+_UNIT_RATIO_TOLERANCE = 1e-3
 _POSITION_FIELDS = ("pose.position_in_sensor", "imu.position")
 _ROTATION_FIELDS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
-_DIGITS = {_GRAVITY_FIELD: 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
-_OTHER_REMEDIES = {
+_DECIMALS_OF_FIELD = {_GRAVITY_FIELD: 4, _POSITION_FIELDS[0]: 5, _POSITION_FIELDS[1]: 5}
+_REMEDY_WITHOUT_FIELD = {
     "axes": "correct the columns of wrench.force and wrench.torque",
     "sensor rotation": "correct the mounting or the frame of the pose",
     "pose frame": "add the position to pose, or an accelerometer",
@@ -63,7 +63,7 @@ def add_description_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Return which units to correct for a mass above 1000 kg, or None for a smaller one."""
+    """Return a message on wrong units for a mass above 1000 kg, None for a smaller one."""
     if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
@@ -74,7 +74,7 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
         f" {log.described.wrench.force.unit}; set {_FORCE_SCALE_FIELD} to the value of one unit of"
         " the file (a power of ten that gives a load of a few kg:"
         f" {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE_SCALE_FIELD} to {text} times that{_no_yaml_note(log)}"
+        f" and {_TORQUE_SCALE_FIELD} to {text} times that{_note_for_table(log)}"
     )
 
 
@@ -82,15 +82,15 @@ def _correct_fields(
     causes: Sequence[Cause], log: Log, by_pose: bool
 ) -> tuple[DescriptionFields, list[str], list[DescriptionFields]]:
     assert log.described is not None
-    fields = _described_fields(log.described, by_pose)
+    fields = _correctable_fields(log.described, by_pose)
     column = _column_of_each_axis(fields[_FRAME_FIELD])
     touched: list[list[str]] = []
     for cause in causes:
         before = {name: _yaml_value(name, value) for name, value in fields.items()}
         if cause.name == "gain":
             _correct_gain(fields, cause.values, column)
-        elif cause.name in _CORRECTIONS:
-            _CORRECTIONS[cause.name](fields, cause.values)
+        elif cause.name in _CORRECTION_OF_CAUSE:
+            _CORRECTION_OF_CAUSE[cause.name](fields, cause.values)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
     texts, corrected = [], []
     for cause, names in zip(causes, touched, strict=True):
@@ -98,16 +98,16 @@ def _correct_fields(
             {name: parse_yaml(_yaml_value(name, fields[name]), name) for name in names}
         )
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
-        otherwise = _OTHER_REMEDIES.get(cause.name, "")
-        texts.append(f"set {lines}{_no_yaml_note(log)}" if lines else otherwise)
+        otherwise = _REMEDY_WITHOUT_FIELD.get(cause.name, "")
+        texts.append(f"set {lines}{_note_for_table(log)}" if lines else otherwise)
     return fields, texts, corrected
 
 
-def _no_yaml_note(log: Log) -> str:
-    return f" ({ONLY_IN_DESCRIPTION})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
+def _note_for_table(log: Log) -> str:
+    return f" ({YAML_ONLY_NOTE})" if Path(log.source).suffix.lower() in TABLE_READERS else ""
 
 
-def _described_fields(description: Description, by_pose: bool) -> DescriptionFields:
+def _correctable_fields(description: Description, by_pose: bool) -> DescriptionFields:
     wrench, imu, pose = description.wrench, description.imu, description.pose
     assert wrench is not None
     frame: Any = np.eye(3) if wrench.frame == "sensor" else wrench.frame
@@ -150,7 +150,7 @@ def _yaml_value(name: str, value: Any) -> str:
     if name in (_FORCE_SCALE_FIELD, _TORQUE_SCALE_FIELD):
         factors = [f"{x:.6g}" for x in value]
         return factors[0] if len(set(factors)) == 1 else f"[{', '.join(factors)}]"
-    exact = np.round(value, _DIGITS.get(name, 6)) + 0.0
+    exact = np.round(value, _DECIMALS_OF_FIELD.get(name, 6)) + 0.0
     return str((exact.astype(int) if (exact == np.round(exact)).all() else exact).tolist())
 
 
@@ -188,7 +188,7 @@ def _correct_units(fields: DescriptionFields, values: dict[str, Any]) -> None:
     ratios = [(torque / SI_VALUE_OF_UNIT[unit], _TORQUE_UNIT_FIELD, unit) for unit in _TORQUE_UNITS]
     ratios += [(SI_VALUE_OF_UNIT[unit] / force, _FORCE_UNIT_FIELD, unit) for unit in _FORCE_UNITS]
     for ratio, name, unit in ratios:
-        if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _SAME_RATIO:
+        if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _UNIT_RATIO_TOLERANCE:
             fields[name] = unit
             return
     fields[_TORQUE_SCALE_FIELD] = fields[_TORQUE_SCALE_FIELD] / values["factor"]
@@ -199,7 +199,7 @@ def _correct_gain(
 ) -> None:
     if column is None:
         return
-    c = CHANNELS.index(values["channel"])
+    c = CHANNEL_NAMES.index(values["channel"])
     scale = fields[_FORCE_SCALE_FIELD if c < 3 else _TORQUE_SCALE_FIELD] = fields[
         _FORCE_SCALE_FIELD if c < 3 else _TORQUE_SCALE_FIELD
     ].copy()
@@ -212,7 +212,7 @@ def _correct_pose_frame(fields: DescriptionFields, values: dict[str, Any]) -> No
             fields[name] = fields[name] + values["position_in_sensor"]
 
 
-_CORRECTIONS: dict[str, Callable[[DescriptionFields, dict[str, Any]], None]] = {
+_CORRECTION_OF_CAUSE: dict[str, Callable[[DescriptionFields, dict[str, Any]], None]] = {
     "axes": _correct_axes,
     "sensor rotation": _correct_sensor_rotation,
     "gravity direction": _correct_gravity,
@@ -223,7 +223,7 @@ _CORRECTIONS: dict[str, Callable[[DescriptionFields, dict[str, Any]], None]] = {
 }
 
 
-_MARGIN_KNOTS = 2.0  # knots, at either end
+_MARGIN_IN_KNOTS = 2.0  # knots, at either end
 _MIN_ROWS = 100
 _MAX_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
 _BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
@@ -241,7 +241,7 @@ def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> 
     data = instants_at_delay(0.0)
     if data.used.sum() < _MIN_ROWS:
         return None
-    why = explain(data, instants_at_delay, log.free)
+    why = explain_misfit(data, instants_at_delay, log.free)
     if log.described is None:
         return why
     causes = add_description_lines(why.causes, log, by_pose=found is not None)
@@ -259,7 +259,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
         p = splines.position(t + late) - middle
         return *splines.motion(t + late, gravity), rotation_matrices(q, "quaternion_wxyz"), p
 
-    stamps, margin = splines.poses.t, _MARGIN_KNOTS * splines.spacing
+    stamps, margin = splines.poses.t, _MARGIN_IN_KNOTS * splines.spacing
     at = log.t + late
     lost = (at < stamps[0] + margin) | (at > stamps[-1] - margin)
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
@@ -282,7 +282,7 @@ def _acceleration_noise(splines: PoseSplines) -> float:
 
 
 def explained_load(load: Identification, why: Explanation) -> Identification:
-    """Return the load of the model with causes; without any, `load` with wider intervals."""
+    """Return the load fitted with the causes; without causes, `load` with wider intervals."""
     load = _load_with_wider_intervals(load, why)
     if why.state.data.gravity_W is not None:
         return load

@@ -29,13 +29,12 @@ from drake_teleop.logs.read.tables import Table
 BANDWIDTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_SHARE = 0.05
-"""Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK` rows."""
-MIN_REPEATED_BLOCK = 5
+"""Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK_ROWS` rows."""
+MIN_REPEATED_BLOCK_ROWS = 5
 _MAX_CORRECTIONS = 5
 """Largest number of corrections of a draft by its data."""
-_CANONICAL = {"f_x", "tau_x"}
-_CANONICAL = {"f_x", "tau_x"}
-_QUANTITIES = (
+_WRENCH_NAMES = {"f_x", "tau_x"}
+_QUANTITY_NAMES = (
     *("force", "torque", "specific_force", "angular_velocity", "angular_acceleration"),
     *("orientation", "position", "gravity"),
 )
@@ -54,7 +53,7 @@ def inspect_command(
     make_folder(out)
     if not others and log.suffix.lower() in (".yaml", ".yml"):
         _inspect_described_log(load_description(log), str(log), {}, summary)
-    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _CANONICAL:
+    elif not (others or is_bag(log)) and (table := read_table(log)).columns.keys() >= _WRENCH_NAMES:
         summary["kind"] = "canonical"
         _inspect_described_log(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
@@ -87,18 +86,18 @@ def _draft_of_recording(path: Path, out: Path, summary: dict[str, Any]) -> Draft
         return Draft(*draft_of_bag(path, topics, out))
     if path.suffix.lower() in (".yaml", ".yml"):
         raise DrakeTeleopError(
-            "is a log description, which already names all files of a recording",
+            "a log description names all files of a recording, so that no others can be added",
             where=str(path),
             remedy="inspect it alone, or give only tables and bags",
         )
     summary["kind"] = "unknown"
     table = read_table(path)
-    header = not _are_numbers(list(table.columns))
+    header = not _are_names_numbers(list(table.columns))
     table = table if header else read_table(path, header=False)
     return draft_description(table, out, header=header)
 
 
-def _are_numbers(names: Sequence[str]) -> bool:
+def _are_names_numbers(names: Sequence[str]) -> bool:
     with suppress(ValueError):
         for name in names:  # polars adds a suffix to repeated names
             float(name.partition("_duplicated_")[0])
@@ -179,7 +178,7 @@ def _inspect_stream(
 ) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
     columns = [
         str(column)
-        for field in _QUANTITIES
+        for field in _QUANTITY_NAMES
         for column in getattr(getattr(stream, field, None), "columns", ())
     ]
     values = table.raw_side_by_side(columns, f"{source}:{name}")
@@ -235,7 +234,7 @@ def _repeated_rows_findings(
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = same.mean() > MIN_REPEATED_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK
+    enough = same.mean() > MIN_REPEATED_SHARE or _longest_run(same) >= MIN_REPEATED_BLOCK_ROWS
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
     longest = _longest_run(same)
@@ -318,7 +317,7 @@ def _count_saturated_samples(x: Array, same: NDArray[np.bool_]) -> int:
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
     inside, outside = _longest_run(held & ends), _longest_run(held & ~ends)
-    return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK and inside > 2 * outside else 0
+    return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK_ROWS and inside > 2 * outside else 0
 
 
 def _remove_nonfinite_rows(table: Table, names: Sequence[str]) -> Table:

@@ -32,7 +32,7 @@ from drake_teleop.logs.processing import DetectedLog, EliminatedLog, IdentifiedL
 from drake_teleop.logs.read.canonical import Log
 
 _CHANNELS = ("$f_x$", "$f_y$", "$f_z$", r"$\tau_x$", r"$\tau_y$", r"$\tau_z$")
-_SYMBOLS = (
+_PARAMETER_SYMBOLS = (
     *(rf"$f_{{o{a}}}$" for a in "xyz"),
     *(rf"$\tau_{{o{a}}}$" for a in "xyz"),
     *("$m$", "$m c_x$", "$m c_y$", "$m c_z$"),
@@ -63,7 +63,7 @@ def draw_spectrum_and_intervals(found: IdentifiedLog) -> Figure:
     """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
     with plot_style():
         figure = Picture(figsize=(10, 7.4))
-        _draw_knowledge_into(figure, found)
+        _draw_intervals_into(figure, found)
     return figure
 
 
@@ -107,7 +107,7 @@ def _draw_fit_into(figure: Any, found: IdentifiedLog) -> None:
     _add_labels_and_title(figure, axes, title, log, result.delay_s)
 
 
-def _draw_knowledge_into(figure: Any, found: IdentifiedLog) -> None:
+def _draw_intervals_into(figure: Any, found: IdentifiedLog) -> None:
     log, result = found.log, found.identification
     residual = log.wrench - found.predicted
     if log.static:
@@ -142,7 +142,7 @@ def _draw_parameters(figure: Any, result: Identification) -> None:
     rows = np.arange(16)
     colours = [VERDICT_COLOURS[verdict] for verdict in result.verdicts]
     left, right = figure.subplots(1, 2, sharey=True)
-    left.set_yticks(rows, [_SYMBOLS[i] for i in rows])
+    left.set_yticks(rows, [_PARAMETER_SYMBOLS[i] for i in rows])
     left.invert_yaxis()
     shown = np.abs(theta[np.isfinite(deviations) & result.identifiable])
     limit = 1.25 * max(1.0, float(shown.max()) if len(shown) else 1.0)

@@ -24,12 +24,12 @@ from drake_teleop.logs.check.pose_checks import has_usable_poses, pose_finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import far_from_gaps, low_pass, low_pass_log, widen_flags
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION
+from drake_teleop.logs.read.description import YAML_ONLY_NOTE
 from drake_teleop.logs.read.table_files import TABLE_READERS
 
 METHODS_WITH_SPLINES = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
-_SMALLEST_NOISE = 1e-9
+_MIN_NOISE_SHARE = 1e-9
 # Fewest kept samples, and their rate over the cut-off of the low-pass.
 _MIN_KEPT_SAMPLES, _RATE_OVER_CUTOFF = 400_000, 0.25
 _CHUNK, _FILTER_NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
@@ -41,7 +41,7 @@ class PosedFit:
 
     Attributes:
         log: used samples with the motion of splines, low-passed.
-        source: of the delay: "given", "estimated", or "undetermined" (0 was used).
+        source: origin of the delay: "given", "estimated", or "undetermined" (0 was used).
     """
 
     log: Log
@@ -79,7 +79,7 @@ def fit_posed(
     if finding is not None:
         fit = replace(fit, note="")
         if Path(log.source).suffix.lower() in TABLE_READERS:
-            finding = replace(finding, message=f"{finding.message} ({ONLY_IN_DESCRIPTION})")
+            finding = replace(finding, message=f"{finding.message} ({YAML_ONLY_NOTE})")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 
@@ -104,11 +104,11 @@ def _batch_result_of_estimate(
     log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
 ) -> BatchResult:
     kept = ~rejected
-    theta = _make_consistent(found) if method == "consistent" else found.theta
+    theta = _consistent_parameters(found) if method == "consistent" else found.theta
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    equations = NormalEquations(np.maximum(noise, _SMALLEST_NOISE * size + 1e-30))
+    equations = NormalEquations(np.maximum(noise, _MIN_NOISE_SHARE * size + 1e-30))
     equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     covariance = found.covariance.copy()
@@ -127,7 +127,7 @@ def _batch_result_of_estimate(
     return BatchResult(load, noise, rejected, _note_on_estimate(found, gain_std), equations)
 
 
-def _make_consistent(found: PoseEstimate) -> Array:
+def _consistent_parameters(found: PoseEstimate) -> Array:
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta

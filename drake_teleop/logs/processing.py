@@ -26,7 +26,7 @@ from drake_teleop.load.contact.noise_floor import limit_covariance, statistic_in
 from drake_teleop.load.identification import PARAMETER_NAMES, Identification, load_of_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.aligned_log import aligned_log
+from drake_teleop.logs.aligned_log import read_aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.causes.cause import TEMPORARY_CAUSES, Cause, RecordPartWithLoad
 from drake_teleop.logs.check.against_load import lag_finding
@@ -67,9 +67,9 @@ from drake_teleop.logs.read.reading import read_log
 
 _CAUSES_BY_GAIN_ERRORS = {"gain", "sensor rotation", "torque factor"}
 """Causes that stated gain errors can explain."""
-_CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
+_MAX_CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
-_SIGNIFICANT_DELAY = 5.0  # standard deviations
+_MIN_DELAY_DEVIATIONS = 5.0  # standard deviations
 _LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
 _SCALES_EXCLUDED_BY_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
@@ -226,7 +226,7 @@ def _identify_read_log(
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
     errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
-    if not errors and why is not None and why.causes and why.misfit:
+    if not errors and why is not None and why.causes and why.is_misfit:
         errors = findings_about_motion(check)
     if errors:
         why = None
@@ -246,7 +246,7 @@ def _identify_read_log(
         findings = errors
     elif not causes and not raw.free:
         findings = check_suspicious_load(log, result, predicted, known_delay, check) or other
-        if why is not None and why.misfit and not (findings or result.identifiable[6:].any()):
+        if why is not None and why.is_misfit and not (findings or result.identifiable[6:].any()):
             findings = (unexplained_finding(why),)
     mass_message = implausible_mass_message(result.mass, causes, raw)
     if mass_message is not None:
@@ -273,7 +273,7 @@ def _identify_read_log(
 
 def _is_explanation_possible(log: Log, by_splines: bool) -> bool:
     low, high = log.wrench.min(axis=0), log.wrench.max(axis=0)
-    if log.static or (high - low <= _CONSTANT_SHARE * np.maximum(high, -low)).any():
+    if log.static or (high - low <= _MAX_CONSTANT_SHARE * np.maximum(high, -low)).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
@@ -307,7 +307,7 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
         findings = tuple(finding for finding in findings if finding.name != "lag")
         if not findings:
             delay = own_delay
-            if abs(delay) > _SIGNIFICANT_DELAY * deviation:
+            if abs(delay) > _MIN_DELAY_DEVIATIONS * deviation:
                 findings = tuple(lag_finding(description, delay))
     return replace(checks, findings=findings, delay_s=delay)
 
@@ -381,7 +381,7 @@ def eliminate_log(
     )
     if untouched_s is not None and not tare:
         raise DrakeTeleopError(
-            "determines the offsets, which are taken from the load file",
+            "a span without contact determines the offsets, but those of the load are requested",
             where="untouched",
             remedy="leave one of the two out",
         )
@@ -426,13 +426,13 @@ def _eliminate_read_log(
 ) -> EliminatedLog:
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
-            "applies only to wrenches as in a control loop (`causal`)",
+            "a contact-free start requires `causal`, the mode of wrenches as in a control loop",
             where="causal_tare_s",
             remedy="give causal as well, or remove it",
         )
     phi, point_mass = usable_phi(identification)
     phi_object = phi - phi_gripper
-    aligned = aligned_log(
+    aligned = read_aligned_log(
         path,
         phi,
         identification.delay_s,
@@ -444,7 +444,7 @@ def _eliminate_read_log(
     log, delay_s, source = aligned.log, aligned.delay_s, aligned.source
     if log.static and causal is not None:
         raise DrakeTeleopError(
-            "poses at rest have no order in time", where="causal", remedy="leave it out"
+            "poses at rest have no times for a causal filter", where="causal", remedy="leave it out"
         )
     known = far_from_gaps(log, cutoff_hz)
     edge = aligned.edge[known]
@@ -516,19 +516,19 @@ def _eliminate_read_log(
         noise_floor=noise_floor(contact[~edge]),
         causal=causal_wrench,
         edge=edge,
-        findings=_suspected_errors(Path(path), log.wrench - offsets, contact, identification),
+        findings=_find_suspected_errors(Path(path), log.wrench - offsets, contact, identification),
     )
 
 
 def _rows_between(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
     rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
     if log.static or rows.sum() < _MIN_TARE_SAMPLES:
-        what = "poses at rest have no time" if log.static else f"has {rows.sum()} samples"
+        found = "poses at rest without times" if log.static else f"{rows.sum()} samples"
         raise DrakeTeleopError(
-            f"the span from {start_s:g} to {stop_s:g} s {what}",
+            f"the span from {start_s:g} to {stop_s:g} s has {found} ({_MIN_TARE_SAMPLES} required)",
             where="untouched",
-            remedy=f"give a span without contact of {_MIN_TARE_SAMPLES} samples or more, in"
-            f" seconds after the first sample; the record has {log.t[-1] - log.t[0]:.4g} s",
+            remedy="give a longer span without contact, in seconds after the first sample; the"
+            f" record has {log.t[-1] - log.t[0]:.4g} s",
         )
     return rows
 
@@ -537,9 +537,10 @@ def _samples_of_contact_free_start(log: Log, length_s: float, wrench: Array) -> 
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
-            f"the first {length_s:g} s are {rows.sum()} of {len(log)} samples",
+            f"the first {length_s:g} s contain {rows.sum()} of {len(log)} samples"
+            f" ({_MIN_TARE_SAMPLES} or more are required, but not all)",
             where="causal_tare_s",
-            remedy=f"give a start of {_MIN_TARE_SAMPLES} samples or more, less than the record",
+            remedy="give another contact-free start",
         )
     return wrench[rows]
 
@@ -553,7 +554,7 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     return phi, tuple(PARAMETER_NAMES[10 + i] for i in replaced)
 
 
-def _suspected_errors(
+def _find_suspected_errors(
     path: Path, wrench: Array, contact: Array, load: Identification
 ) -> tuple[Finding, ...]:
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
@@ -613,7 +614,7 @@ def _check_scales(
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
     if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _SCALES_EXCLUDED_BY_ETA):
         raise DrakeTeleopError(
-            "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
+            "eta requires sigma = 0, gamma = 1 and no other scale (Eq. 14)",
             where="eta",
             remedy="remove all scales except eta",
         )

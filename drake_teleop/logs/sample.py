@@ -25,12 +25,12 @@ TRUE_MASS_KG, TRUE_COM_S = 0.95, np.array([0.004, -0.011, 0.058])
 TRUE_INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])
 """Mass [kg], centre of mass [m] and inertia [kg m^2] of the gripper in S, similar to a Robotiq
 2F-85."""
-TIP_S = np.array([0.0, 0.0, 0.17])
+FINGERTIP_POSITION_S = np.array([0.0, 0.0, 0.17])
 TRUE_OFFSETS = np.array(
     [[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]]
 )
 """(2, 6) offsets of the sensor in the two records [N, N m], with drift between them."""
-NOISE_STD = np.repeat([0.08, 0.003], 3)
+WRENCH_NOISE_STD = np.repeat([0.08, 0.003], 3)
 POSE_DELAY_S = 0.013
 CLOCK_START_S = 48213.4
 """Time of the controller's clock at the sensor's time 0 [s]."""
@@ -83,7 +83,7 @@ FINGERTIP_PUSHES = (
 )
 """A tap, a push and a light tap, smaller than the wrench of weight and inertia."""
 
-_COMMENTS = {
+_FIELD_COMMENTS = {
     "wrench.file": "500 Hz",
     "wrench.sign": "the sensor reports what the load exerts on it, as most do",
     "pose": "of the sensor",
@@ -120,7 +120,7 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
     with output_folder(out):
         for row, (name, (touches, what)) in enumerate(records.items()):
             head = [f"A gripper on a lab arm, {what}: made by drake-teleop sample-log."]
-            text = to_yaml_text(_description_of_record(name), head=head, comments=_COMMENTS)
+            text = to_yaml_text(_description_of_record(name), head=head, comments=_FIELD_COMMENTS)
             write_text(out / f"{name}.yaml", text)
             _write_wrench(
                 out / f"{name}_wrench.csv", _random_motion(row), touches, TRUE_OFFSETS[row], random
@@ -196,7 +196,7 @@ def _random_motion(number: int) -> _SensorMotion:
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link S."""
+    """Return specific force, omega, alpha, R_WS and p_WS of the last link, frame S."""
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
     s = p + np.array([0.0, 0.0, STANDARD_GRAVITY])
@@ -239,8 +239,8 @@ def _write_wrench(
     for touch in touches:
         push_S = np.einsum("nji,nj->ni", R_WS, touch.force(t))
         # The push reduces the wrench of the sensor on the load.
-        wrench -= np.hstack([push_S, np.cross(TIP_S, push_S)])
-    wrench += NOISE_STD * random.normal(size=wrench.shape)
+        wrench -= np.hstack([push_S, np.cross(FINGERTIP_POSITION_S, push_S)])
+    wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     reading = -wrench / np.repeat([SI_VALUE_OF_UNIT["lbf"], SI_VALUE_OF_UNIT["lbf in"]], 3)
     _write_columns(path, "time Fx Fy Fz Tx Ty Tz", [1e3 * t, reading], 4)
 
@@ -261,7 +261,7 @@ def _write_columns(path: Path, names: str, columns: list[Array], digits: int) ->
     write_table(path, pl.DataFrame(table, schema=names.split()), float_precision=digits)
 
 
-_POSE_NOISE = np.repeat([5e-5, 2e-4], 3)  # m, rad
+_POSE_NOISE_STD = np.repeat([5e-5, 2e-4], 3)  # m, rad
 _EPISODE_HARMONICS, _EPISODE_REST_S = 5, 0.2
 _MIN_CONTACT_N = 0.5
 
@@ -314,12 +314,12 @@ def sample_episode(
         push *= random.uniform(5, 15) / np.linalg.norm(push)
         touch = FingertipPush(start, start + random.uniform(0.4, 0.9), tuple(push))
         f = np.einsum("nji,nj->ni", R_WS, -touch.force(t))
-        contact += np.hstack([f, np.cross(TIP_S, f)])
+        contact += np.hstack([f, np.cross(FINGERTIP_POSITION_S, f)])
     offsets = TRUE_OFFSETS[0] + random.normal(size=6) * np.repeat([0.5, 0.02], 3)
     wrench = non_contact_wrench(s, omega, alpha, phi) + contact + offsets
-    wrench += NOISE_STD * random.normal(size=wrench.shape)
+    wrench += WRENCH_NOISE_STD * random.normal(size=wrench.shape)
     *_, R_late, p_late = motion_at(t - lag_frames / fps)
-    noise = _POSE_NOISE * random.normal(size=(len(t), 6))
+    noise = _POSE_NOISE_STD * random.normal(size=(len(t), 6))
     turned = Rotation.from_matrix(R_late) * Rotation.from_rotvec(noise[:, 3:])
     quaternion = turned.as_quat()[:, [3, 0, 1, 2]]
     touched = np.linalg.norm(contact[:, :3], axis=1) > _MIN_CONTACT_N

@@ -15,9 +15,9 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.cause import CHANGE_CAUSES, Cause, causes_of_fit
-from drake_teleop.logs.causes.explain import explain
+from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import S, block_means_of_record
-from drake_teleop.logs.causes.model import Step
+from drake_teleop.logs.causes.model import StepChange
 from drake_teleop.logs.causes.state import State
 from drake_teleop.robots.compensator import JUMP_S
 from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Reading, ReadingFlag
@@ -121,7 +121,7 @@ def find_changes(rows: Array, dt: float) -> list[Report]:
         return []
     wrench, *motion = np.split(rows[at, 1:], [6, 9, 12], axis=1)
     lost = np.abs(rows[at, 0] - t) > dt
-    state = explain(block_means_of_record(t, wrench, tuple(motion), None, lost)).state
+    state = explain_misfit(block_means_of_record(t, wrench, tuple(motion), None, lost)).state
     return [
         (cause.start_s, _change_text(cause))
         for cause in causes_of_fit(state)
@@ -137,7 +137,7 @@ def _is_decisive(state: State, time: float) -> bool:
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_FORCE_STD:
         return False
     own = next(step for step in steps if step.time == time)
-    other = Step("offsets" if own.kind == "load" else "load", own.time)
+    other = StepChange("offsets" if own.kind == "load" else "load", own.time)
     model = replace(state.model, steps=(*(step for step in steps if step != own), other))
     start = np.zeros(model.size)
     start[:17] = state.x[:17]

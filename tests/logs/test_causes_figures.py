@@ -16,7 +16,7 @@ from drake_teleop.logs.causes.cause import causes_of_fit, loads_between_changes
 from drake_teleop.logs.causes.changes import find_contact_spans, fit_with_ramps
 from drake_teleop.logs.causes.explain import _remove_delay
 from drake_teleop.logs.causes.instants import block_means_of_record
-from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, Step
+from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, StepChange
 from drake_teleop.logs.causes.state import State, likelihood_gain
 
 LOAD = np.array([0.5, 0.01, -0.02, 0.03, *np.zeros(6)])
@@ -52,11 +52,11 @@ def state_of(model: Model, values: list[float], spans: tuple = ()) -> SimpleName
          {"range": [0, 0, 0, 0, 0, 1.2]}, "0 N and 1.2 N m"),
         (Model(("cable",)), [*np.zeros(3), 3.0, 0.0, 0.0, -7.0, 0.0, 5.0, *np.zeros(3)], "cable",
          {"stiffness": 7.0}, "about 7 N/m"),
-        (Model(steps=(Step("offsets", 102.5),)), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3], "zero change",
-         {"change": [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]}, "from t = 102.50 s on"),
-        (Model(steps=(Step("load", 103.0),)), LOAD.tolist(), "load change",
+        (Model(steps=(StepChange("offsets", 102.5),)), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3],
+         "zero change", {"change": [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]}, "from t = 102.50 s on"),
+        (Model(steps=(StepChange("load", 103.0),)), LOAD.tolist(), "load change",
          {"mass_change": 0.5, "com_of_change": [0.02, -0.04, 0.06]}, "[20, -40, 60] mm in S"),
-        (Model(steps=(Step("load", 103.0),)), (-LOAD).tolist(), "load change",
+        (Model(steps=(StepChange("load", 103.0),)), (-LOAD).tolist(), "load change",
          {"mass_change": -0.5}, "0.5 kg (+- 0.0083) at [20, -40, 60] mm in S are removed"),
     ],
 )  # fmt: skip
@@ -75,7 +75,7 @@ def test_a_cause_has_its_figures_with_intervals_of_95_percent(model, values, nam
     [((101.0, 101.5), True), ((102.8, 103.5), False), ((103.1, 109.0), True)],
 )
 def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
-    steps = (Step("load", 103.0), Step("offsets", 105.0))
+    steps = (StepChange("load", 103.0), StepChange("offsets", 105.0))
     values = [*LOAD, 1.0, *np.zeros(5)]
     state = state_of(Model(steps=steps), values, (span,))
     found = causes_of_fit(state)
@@ -87,7 +87,7 @@ def test_contacts_are_listed_unless_a_hand_changes_the_load(span, shown):
 
 
 def test_each_part_of_a_record_has_its_load_and_the_uncertainty_of_all_changes_before():
-    steps = (Step("load", 104.0), Step("offsets", 101.0), Step("load", 102.0))
+    steps = (StepChange("load", 104.0), StepChange("offsets", 101.0), StepChange("load", 102.0))
     values = [*(2.0 * LOAD), *np.ones(6), *LOAD]
     state = state_of(Model(steps=steps), values)
     covariance = 4.0 * state.fit.covariance[:16, :16]
@@ -152,7 +152,7 @@ def test_gradual_change_is_at_the_middle_of_its_ramp(kinds, guess):
     wrench += share * ("load" in kinds) * non_contact_wrench(s, omega, alpha, load)
     wrench += share * ("offsets" in kinds) * step
     wrench += np.repeat([1e-2, 1e-3], 3) * np.random.default_rng(0).normal(size=wrench.shape)
-    state = State.fit_record(record(wrench), Model(steps=(Step("offsets", 100.99),)))
+    state = State.fit_record(record(wrench), Model(steps=(StepChange("offsets", 100.99),)))
     found = fit_with_ramps(state, [kinds], [guess], ((100.5, 100.6),))
     assert found.spans == ((100.5, 100.6), (guess - 0.25, guess + 0.25))
     assert [x.kind for x in found.model.steps] == ["offsets", *kinds]
@@ -179,7 +179,7 @@ def test_contact_spans_cover_the_contact_and_cost_two_numbers_an_end(
     ((found_start, found_stop),) = find_contact_spans(state)
     assert max(start, T[0] - 0.02) - 0.7 < found_start <= max(start, T[0])
     assert min(stop, T[-1]) <= found_stop < min(stop, T[-1]) + 0.7
-    for name in ("_fit_part", "_torque_factor_candidates", "_axis_permutation_candidates"):
+    for name in ("_fit_extension", "_torque_factor_candidates", "_axis_permutation_candidates"):
         monkeypatch.setattr(f"drake_teleop.logs.causes.candidates.{name}", lambda *_: iter(()))
     monkeypatch.setattr("drake_teleop.logs.causes.candidates.add_step", lambda *_: None)
     monkeypatch.setattr("drake_teleop.logs.causes.candidates._SMALLEST_GAIN", 1.0)

@@ -17,8 +17,8 @@ from drake_teleop.logs.causes.instants import (
     delay_of_free_fit,
 )
 from drake_teleop.logs.causes.intervals import misfit_factor
-from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, Step
-from drake_teleop.logs.causes.state import Rows, fit_model, is_in_spans, regularized_inverse
+from drake_teleop.logs.causes.model import DELAY_PARAMETER, Model, StepChange
+from drake_teleop.logs.causes.state import UsedRows, fit_model, is_in_spans, regularized_inverse
 
 GRAVITY_W = np.array([0.4, -0.3, -9.79])
 OFFSETS = np.array([3.0, -2.0, 5.0, 0.3, -0.2, 0.1])
@@ -104,7 +104,7 @@ def test_coefficients_of_a_cause_give_the_wrench_that_the_sensor_reads(name, siz
 def test_axes_factor_and_steps_change_the_wrench_as_stated():
     """A step in the middle of a block has half its effect there."""
     load, offsets = np.arange(10.0) * 0.1, np.arange(1.0, 7.0)
-    steps = Step("load", 102.0), Step("offsets", 103.01)
+    steps = StepChange("load", 102.0), StepChange("offsets", 103.01)
     model = Model(steps=steps, axes=SWAPPED, factor=10.0)
     x = np.concatenate([OFFSETS, PHI, [0.02], load, offsets])
     s, omega, alpha, *_ = moving(T)
@@ -127,7 +127,7 @@ def test_whitened_sums_are_those_of_rows_with_four_predecessors(gaps):
     used = data.used.copy()
     used[list(gaps)] = False
     model = Model()
-    rows = Rows(data, used, (), model.columns)
+    rows = UsedRows(data, used, (), model.columns)
     whole = [n for n in range(4, len(T)) if used[n - 4 : n + 1].all()]
     np.testing.assert_array_equal(rows.rows_with_predecessors, whole)
     filters = rng.normal(size=(6, 5))
@@ -164,7 +164,7 @@ def test_fit_gives_the_cause_within_its_deviations(name, values):
     data = record(read(name, np.array(values)) + OFFSETS + noise)
     gains = (int(name[-1]),) if "gain" in name else ()
     model = Model(() if gains else (name,), gains)
-    found = fit_model(model, Rows(data, data.used, (), model.columns))
+    found = fit_model(model, UsedRows(data, data.used, (), model.columns))
     error = found.x - np.concatenate([OFFSETS, PHI, [0.0], values])
     deviations = np.sqrt(np.diag(found.covariance))
     assert np.abs(error / deviations).max() < 4.0

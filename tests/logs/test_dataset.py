@@ -28,7 +28,7 @@ from drake_teleop.logs.dataset.episode_verdict import (
 )
 from drake_teleop.logs.pose_motion.poses import Poses, PosesOfLog
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.sample import NOISE_STD, TRUE_PHI, SampleEpisode, sample_episode
+from drake_teleop.logs.sample import TRUE_PHI, WRENCH_NOISE_STD, SampleEpisode, sample_episode
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from sample_dataset import write_sample_dataset
@@ -49,7 +49,7 @@ def verdict(x: SampleEpisode) -> set[str]:
     fps = 1.0 / (x.t[1] - x.t[0])
     signals = EpisodeSignals(log_of(x))
     predict = signals.reading_predictor(TRUE_PHI)
-    found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD)
+    found = find_hypothesis(predict, signals.regressor_at_lag, 0.0, 0.8 * WRENCH_NOISE_STD)
     names = {f.name for f in name_faults(found, 0.0, TRUE_PHI, fps) + saturated_channels(x.wrench)}
     step = find_offset_step(
         unexplained_reading(found, predict, signals.regressor_at_lag), found.spread
@@ -115,7 +115,7 @@ def test_free_motion_leaves_the_noise_of_the_sensor_also_at_the_ends() -> None:
         x = sample_episode(number, phi=phi, contacts=0)
         reading, load_wrench = EpisodeSignals(log_of(x)).reading_predictor(phi)("sensor", 0.0)
         rest = reading - load_wrench
-        squares.append(((rest - np.median(rest, axis=0)) / NOISE_STD) ** 2)
+        squares.append(((rest - np.median(rest, axis=0)) / WRENCH_NOISE_STD) ** 2)
     assert np.sqrt(np.mean(squares)) < 1.2
     assert np.sqrt(np.mean([x[[0, -1]] for x in squares])) < 4.0
 
@@ -131,7 +131,7 @@ def test_any_large_rotation_of_the_wrench_is_found(
     x = mapped(R)(sample_episode(number, contacts=1))
     signals = EpisodeSignals(log_of(x))
     found = find_hypothesis(
-        signals.reading_predictor(TRUE_PHI), signals.regressor_at_lag, 0.0, 0.8 * NOISE_STD
+        signals.reading_predictor(TRUE_PHI), signals.regressor_at_lag, 0.0, 0.8 * WRENCH_NOISE_STD
     )
     assert np.degrees(Rotation.from_matrix(found.force @ R.T).magnitude()) < 3.0
 
@@ -159,7 +159,7 @@ def test_lerobot_copy_has_contact_wrenches_and_the_same_other_bytes(tmp_path: Pa
     contact = np.array(new["observation.contact_wrench"].to_list())
     truth = np.vstack([x.contact_wrench for x in episodes])
     free = ~truth.any(axis=1)
-    assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * NOISE_STD).all()
+    assert (np.sqrt(np.mean(contact[free] ** 2, axis=0)) < 1.5 * WRENCH_NOISE_STD).all()
     touched, true = (
         new["observation.in_contact"].to_numpy(),
         np.hstack([x.in_contact for x in episodes]),

@@ -320,7 +320,7 @@ def test_draft_of_a_bag_without_wrench_topic_has_a_placeholder(tmp_path: Path) -
             ["run1", "no topic is specified", "`drake-teleop inspect` drafts"],
         ),
         ("wrench", {"file": "none.mcap"}, ["none.mcap", "no such file"]),
-        ("wrench", {"file": "log.yaml"}, ["is not a bag", "metadata.yaml"]),
+        ("wrench", {"file": "log.yaml"}, ["the path is not a bag", "metadata.yaml"]),
         ("wrench", {"file": "broken.mcap"}, ["broken.mcap", "cannot be read"]),
         ("wrench", {"file": "broken.bag"}, ["broken.bag", "cannot be read"]),
         ("wrench", {"file": "broken"}, ["cannot be read"]),

@@ -59,7 +59,7 @@ def test_prediction_costs_as_much_noise_as_is_said() -> None:
 
 def test_what_cannot_be_asked_for() -> None:
     x = np.zeros((50, 6))
-    with pytest.raises(DrakeTeleopError, match="prediction needs a low-pass"):
+    with pytest.raises(DrakeTeleopError, match="`predicted` needs a low-pass"):
         causal_wrenches(x, x, DT, cutoff_hz=None, delay_s=0.005, mode="predicted")
     with pytest.raises(DrakeTeleopError, match="'soon' is not a causal mode"):
         causal_wrenches(x, x, DT, cutoff_hz=None, delay_s=0.0, mode="soon")

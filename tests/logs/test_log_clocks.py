@@ -259,5 +259,5 @@ def test_interpolated_samples_in_a_gap_are_not_used(tmp_path: Path) -> None:
 def test_unit_of_dates_raises_error() -> None:
     stamps = np.array(["2026-03-01T12:00:00.000", "2026-03-01T12:00:00.002"], "datetime64[ms]")
     table = Table(Path("x.csv"), {"t": stamps, "f": np.zeros(2)})
-    with pytest.raises(DrakeTeleopError, match=r"here\.unit.*no unit; leave it out"):
+    with pytest.raises(DrakeTeleopError, match=r"here\.unit.*no unit; leave `unit` out"):
         read_clock(Time(column="t", unit="ms"), table, ["f"], "here")

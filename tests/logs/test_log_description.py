@@ -60,7 +60,7 @@ BASE = yaml.safe_load(THREE_INSTRUMENTS)
         (("imu", "frame"), [[2, 0, 0], [0, 1, 0], [0, 0, 1]], ["imu.frame", "not a rotation"]),
         (("imu", "position"), [0.1, 0.2], ["imu.position"]),
         (("imu", "position"), [0.1, 0.2, float("nan")], ["imu.position", "finite"]),
-        (("imu", "position"), "somewhere", ["imu.position", "three numbers [m], or auto"]),
+        (("imu", "position"), "somewhere", ["imu.position", "three numbers [m], or the word auto"]),
         (("wrench", "frame"), "auto", ["wrench.frame", "3x3 rotation matrix"]),
         (("imu", "specific_force"), None, ["imu", "give specific_force"]),
         (("pose", "frame"), "base", ["pose", "must be sensor"]),

@@ -21,7 +21,7 @@ from drake_teleop.load.online.change import (
     initial_change_memory,
 )
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.causes.explain import explain
+from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import block_means_of_record
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
@@ -145,7 +145,7 @@ def test_utias_records_have_one_load(utias: Path) -> None:
             x + std * rng.normal(size=x.shape) for x, std in ((s, s_std), (alpha, alpha_std))
         )
         t = 0.01 * np.arange(len(s))
-        why = explain(block_means_of_record(t, wrench, (s, omega, alpha), None))
+        why = explain_misfit(block_means_of_record(t, wrench, (s, omega, alpha), None))
         assert [cause.name for cause in why.causes if cause.name != "no load"] == [], file.stem
 
 

@@ -9,7 +9,7 @@ from planted import PHI
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.against_load import LoadFit, load_fit
+from drake_teleop.logs.check.against_load import LoadFit, fit_load
 from drake_teleop.logs.read.alignment import white_noise
 from drake_teleop.logs.read.canonical import Log
 
@@ -29,7 +29,7 @@ def test_samples_that_say_something_new_are_those_of_the_pass_band(start: float)
     motion = motion_at(t - start)
     wrench = non_contact_wrench(motion.specific_force, motion.omega, motion.alpha, PHI)
     log = Log(t, wrench, motion.specific_force, motion.omega, motion.alpha)
-    fit = load_fit(log)
+    fit = fit_load(log)
     assert fit.independent == pytest.approx(2 * 15 * 4, rel=1e-3)  # at 15 Hz, of 4 s
     assert fit.unexplained < 1e-6 and fit.mass == pytest.approx(PHI[0], rel=1e-3)
 
@@ -38,11 +38,11 @@ def test_poses_at_rest_say_the_mass_and_each_says_something_new() -> None:
     s = 9.81 * Rotation.random(30, random_state=2).apply([0.0, 0.0, 1.0])
     rest = np.zeros((30, 3))
     wrench = non_contact_wrench(s, rest, rest, PHI) + 3.0
-    fit = load_fit(Log(np.arange(30.0), wrench, s, rest, rest, static=True))
-    assert fit.mass == pytest.approx(PHI[0], rel=1e-6) and fit.good
+    fit = fit_load(Log(np.arange(30.0), wrench, s, rest, rest, static=True))
+    assert fit.mass == pytest.approx(PHI[0], rel=1e-6) and fit.is_good
     assert fit.independent == 30 - 8
 
 
 def test_a_good_fit_explains_most_and_has_a_mass() -> None:
-    assert LoadFit(0.001, 1.0).good
-    assert not LoadFit(0.9, 1.0).good and not LoadFit(0.001, -1.0).good
+    assert LoadFit(0.001, 1.0).is_good
+    assert not LoadFit(0.9, 1.0).is_good and not LoadFit(0.001, -1.0).is_good

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.rotations import NUM_COLUMNS_OF_FORM, rotation_matrices
 from drake_teleop.logs.read.mounting import solve_least_squares
-from drake_teleop.logs.read.streams import Orientations
+from drake_teleop.logs.read.streams import OrientationColumns
 
 VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])
 
@@ -70,7 +70,7 @@ def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: b
         "rotation_vector": np.degrees(turns.as_rotvec()),
         "euler": turns.as_euler("ZYX", degrees=True),
     }[form]
-    orientations = Orientations(
+    orientations = OrientationColumns(
         SimpleNamespace(si_value=lambda unit: np.radians(1.0)),
         SimpleNamespace(columns=[], form=form, axes="ZYX", unit="deg", inverse=inverse),
         SimpleNamespace(numbers=lambda *_: columns.copy()),

@@ -30,7 +30,7 @@ from drake_teleop.logs.read.description_fields import SI_VALUE_OF_UNIT
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.sample import CLOCK_START_S, sample_log_command
 from drake_teleop.logs.sample import FINGERTIP_PUSHES as TOUCHES_OF_SAMPLE
-from drake_teleop.logs.sample import NOISE_STD as SAMPLE_NOISE
+from drake_teleop.logs.sample import WRENCH_NOISE_STD as SAMPLE_NOISE
 
 WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")
 NOISE = np.repeat([0.1, 0.004], 3)

@@ -13,12 +13,12 @@ from posed_record import GRAVITY_W, LATE, PHI, SECONDS, TRUTH, Kind, motion_at, 
 from scipy.interpolate import BSpline
 
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
-from drake_teleop.logs.pose_motion.imu_rows import _least_squares, compare_imu
+from drake_teleop.logs.pose_motion.imu_rows import _fit_sensor_parameters, correct_imu_data
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
 from drake_teleop.logs.pose_motion.spectra import (
     WrenchGrid,
     end_taper,
-    frequency_bands,
+    make_frequency_bands,
     noise_moments,
     signal_spectrum,
 )
@@ -56,7 +56,7 @@ def poses_of(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
 
 def test_poses_determine_bias_axes_clock_and_noise_of_an_imu():
     splines = PoseSplines(poses_of(Kind(seed=4))[2], 0.07)
-    aid = compare_imu(splines, imu_data(4, later=0.008), GRAVITY_W)
+    aid = correct_imu_data(splines, imu_data(4, later=0.008), GRAVITY_W)
     assert aid is not None
     truth = motion_at(aid.t - LATE)
     acceleration = np.einsum("nij,nj->ni", truth.R_WS, truth.specific_force) + GRAVITY_W
@@ -82,7 +82,7 @@ def test_gains_of_an_imu_have_a_prior_of_10_percent(size):
     prior = np.column_stack([np.eye(9) / 0.1, np.zeros((9, 5))])
     stacked = np.concatenate([stacked.real, stacked.imag, prior])
     expected = np.linalg.lstsq(stacked[:, :13], stacked[:, 13], rcond=None)[0]
-    D, b, shift = _least_squares(y, X, one, change, weight)
+    D, b, shift = _fit_sensor_parameters(y, X, one, change, weight)
     np.testing.assert_allclose([*D.ravel(), *b, shift], expected, atol=1e-10)
 
 
@@ -106,7 +106,7 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
     exact = poses_of(replace(ROUGH, place=0.0, turn=0.0))[2]
     t = np.arange(0.0, SECONDS, 0.01)
     grid, taper = WrenchGrid(t, np.zeros((len(t), 6)), 1), end_taper(t, 1.0, SECONDS - 1.0)
-    of = frequency_bands(grid, taper, 6.0)
+    of = make_frequency_bands(grid, taper, 6.0)
     clean = PoseSplines(exact, 0.05).signals(t, GRAVITY_W)
     sums, said = np.zeros(2), np.zeros(2)
     for seed in range(6):
@@ -115,7 +115,7 @@ def test_noise_of_splines_of_poses_and_imu_is_predicted():
         # The quaternion contains half the angle.
         q = exact.quaternion + 0.5 * ROUGH.turn * rng.normal(size=exact.quaternion.shape)
         noisy = Poses(exact.t, moved, q / np.linalg.norm(q, axis=1, keepdims=True))
-        aid = compare_imu(PoseSplines(noisy, 0.1), imu_data(seed), GRAVITY_W)
+        aid = correct_imu_data(PoseSplines(noisy, 0.1), imu_data(seed), GRAVITY_W)
         assert aid is not None
         splines = SplineCache(noisy, aid).splines_with_spacing(0.05)
         error = splines.signals(t, GRAVITY_W) - clean
@@ -145,7 +145,7 @@ def test_imu_with_other_axes_is_rejected():
     splines, imu = PoseSplines(poses_of(Kind(seed=4))[2], 0.07), imu_data(4)
     assert imu.specific_force is not None
     other = replace(imu, specific_force=imu.specific_force[:, [1, 0, 2]])
-    assert compare_imu(splines, other, GRAVITY_W) is None
+    assert correct_imu_data(splines, other, GRAVITY_W) is None
 
 
 @pytest.mark.long

@@ -44,7 +44,7 @@ _DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Fitted model with one more extension.
+    """Fitted load model with one more extension, such as drift: a possible cause of a misfit.
 
     `score` is twice the gain in log likelihood, minus a cost of the added parameters.
     """
@@ -55,20 +55,20 @@ class Candidate:
 
 
 def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
-    """Fit the possible extensions of a model and yield those with sufficient effect.
+    """Fit a model with each further extension, and yield those with sufficient effect.
 
-    `first` is True if the model is the rigid load alone.
+    `first` is True in the first round of the search.
     """
     model, data = state.model, state.data
     if first:
         yield from _axis_permutation_candidates(state)
     if data.gravity_W is not None:
         if "gravity" not in model.parts:
-            yield from _fit_part(
+            yield from _fit_extension(
                 state, "gravity", [start_of_tilt_fit(state), None], _is_tilt_significant
             )
         if "weight" not in model.parts and data.accelerates_enough:
-            yield from _fit_part(state, "weight", [None], _is_weight_significant)
+            yield from _fit_extension(state, "weight", [None], _is_weight_significant)
     if "torque factor" not in model.parts and data.accelerates_enough:
         yield from _torque_factor_candidates(state)
     for kind in ("offsets", "load"):
@@ -76,7 +76,7 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         if found is not None:
             yield _scored_candidate(kind, state, found, times=1)
     if not {"linear drift", "drift"} & set(model.parts):
-        yield from _fit_part(state, "linear drift", [None], _is_drift_significant)
+        yield from _fit_extension(state, "linear drift", [None], _is_drift_significant)
     for c in range(6):
         if c not in model.gains:
             larger = state.refit(replace(model, gains=(*model.gains, c)))
@@ -87,12 +87,12 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
             ):
                 yield _scored_candidate("gain", state, larger)
     if "frame" not in model.parts and data.accelerates_enough:
-        yield from _fit_part(
+        yield from _fit_extension(
             state, "frame", [None], lambda x: _extension_magnitude(x, "frame") > _SMALLEST_SHIFT_M
         )
     if first and not model.parts:
         angle = np.radians(_SMALLEST_ROTATION_DEG)
-        yield from _fit_part(
+        yield from _fit_extension(
             state, "rotation", [None], lambda x: _extension_magnitude(x, "rotation") > angle
         )
     spans = find_contact_spans(state)
@@ -101,9 +101,9 @@ def fit_candidates(state: State, first: bool) -> Iterator[Candidate]:
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _scored_candidate("contact", state, larger, more=6 + 2 * ends)
     if data.positions and "cable" not in model.parts and data.accelerates_enough:
-        yield from _fit_part(state, "cable", [None], lambda _: True)
+        yield from _fit_extension(state, "cable", [None], lambda _: True)
     if "drift" not in model.parts and "linear drift" not in model.parts:
-        yield from _fit_part(state, "drift", [None], _is_drift_significant)
+        yield from _fit_extension(state, "drift", [None], _is_drift_significant)
 
 
 def _scored_candidate(
@@ -117,7 +117,7 @@ def _scored_candidate(
     return Candidate(name, larger, float(score))
 
 
-def _fit_part(
+def _fit_extension(
     state: State, name: str, starts: list[Array | None], is_significant: Callable[[State], bool]
 ) -> Iterator[Candidate]:
     model = state.model.with_extension(name)
@@ -146,7 +146,6 @@ def has_negative_inertia(state: State) -> bool:
 
 
 def is_plausible(state: State) -> bool:
-    """Return whether all fitted parameters are physically plausible."""
     if has_negative_inertia(state):
         return False
     parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
@@ -182,7 +181,7 @@ def _is_tilt_significant(state: State) -> bool:
 
 
 def start_of_tilt_fit(state: State) -> Array | None:
-    """Return start parameters for a fit of a large tilt of gravity, from the force, or None."""
+    """Return start parameters for fitting a very wrong direction of gravity; None if unknown."""
     y = state.data.select_rows(state.rows.used).y
     sums = y.T @ y
     width = len(sums)

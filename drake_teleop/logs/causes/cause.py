@@ -15,7 +15,7 @@ from drake_teleop.logs.causes.candidates import fits_with_similar_torque_factors
 from drake_teleop.logs.causes.state import State
 
 _HAND_DISTANCE_S, _HAND_CONTACT_S = 0.8, 1.2
-CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGE_CAUSES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
 TEMPORARY_CAUSES = (*CHANGE_CAUSES, "drift", "contact", "cable", "no load")
@@ -31,7 +31,7 @@ class Cause:
         message: cause, value with its interval, and remedy.
         start_s, stop_s: time span since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.
-        fields: fields of the description and their corrected values, as in YAML.
+        fields: corrected values of fields of the log description, as in YAML.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class RecordPartWithLoad:
-    """Part of a record with one load phi (10,), and covariance (16, 16) of [offsets; phi]."""
+    """Part of a record with constant load phi (10,); `covariance` (16, 16) of [offsets; phi]."""
 
     start_s: float
     stop_s: float
@@ -81,7 +81,7 @@ def causes_of_fit(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 
 
 def loads_between_changes(state: State, covariance: Array) -> list[RecordPartWithLoad]:
-    """Return the parts of a record between changes of the load; none without a change."""
+    """Return the parts of a record between load changes, with their loads; [] without a change."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []
@@ -172,9 +172,9 @@ def _gain_error_cause(state: State, c: int) -> Cause:
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
     return Cause(
         "gain",
-        f"{CHANNELS[c]} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other"
+        f"{CHANNEL_NAMES[c]} reads {100 * value[0]:.2f} % (+- {100 * wide:.2g}) more than the other"
         " channels allow; calibrate the sensor",
-        values={"channel": CHANNELS[c], "gain": 1.0 + float(value[0])},
+        values={"channel": CHANNEL_NAMES[c], "gain": 1.0 + float(value[0])},
     )
 
 

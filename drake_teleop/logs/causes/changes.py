@@ -1,4 +1,4 @@
-"""Changes of offsets or load within a record, and contacts, by trimmed least squares."""
+"""Detection of contacts, and of changes of offsets or load, within a record."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array, find_runs_of_true
 from drake_teleop.logs.causes.instants import FORCES
-from drake_teleop.logs.causes.model import DELAY_PARAMETER, Step
+from drake_teleop.logs.causes.model import DELAY_PARAMETER, StepChange
 from drake_teleop.logs.causes.state import (
-    Spans,
     State,
+    TimeSpans,
     is_in_spans,
     likelihood_gain,
     regularized_inverse,
 )
 
-_MIN_GAIN = 60.0
+_MIN_LIKELIHOOD_GAIN = 60.0
 _REFINEMENT_STEP_SHARES, _REFINEMENT_STEPS = (1.0, 0.25), 2  # instants
 _MIN_DISTANCE_S, _RAMP_COST = 0.4, 80.0
 RAMP_S = 0.5
@@ -35,7 +35,7 @@ def add_step(state: State, kind: str) -> State | None:
     Return None if no change is significant.
     """
     best: State | None = None
-    for time in _likely_times(state, kind):
+    for time in _likely_step_times(state, kind):
         found = _refine_time(state, kind, time)
         ramp = fit_with_ramps(state, [[kind]], [time], state.spans)
         if 2.0 * (ramp.likelihood - found.likelihood) > _RAMP_COST:
@@ -46,7 +46,7 @@ def add_step(state: State, kind: str) -> State | None:
     return best if best is not None and _is_step_significant(best, last) else None
 
 
-def _likely_times(state: State, kind: str) -> list[float]:
+def _likely_step_times(state: State, kind: str) -> list[float]:
     data, rows = state.data, state.data.rows_per_block
     scan = _StepScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
@@ -56,7 +56,7 @@ def _likely_times(state: State, kind: str) -> list[float]:
     out: list[float] = []
     for _ in range(_NUM_TRIED_TIMES):
         j = int(np.argmax(gains))
-        if gains[j] < _MIN_GAIN:
+        if gains[j] < _MIN_LIKELIHOOD_GAIN:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
         time = float(data.t[max(near, key=scan.gain_of_change_at)]) - 0.5 * data.dt
@@ -68,7 +68,7 @@ def _likely_times(state: State, kind: str) -> list[float]:
 
 
 class _StepScan:
-    """Gain of twice the log likelihood by a change at any instant, for white noise."""
+    """Likelihood gain by a change of offsets or load at any instant, for white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
         power = np.maximum(state.rows.residual_rms(state.fit.residual), 1e-12)
@@ -106,13 +106,13 @@ def fit_with_ramps(
     state: State,
     kinds: Sequence[Sequence[str]],
     times: Sequence[float],
-    spans: Spans,
+    spans: TimeSpans,
     widths: Sequence[float] | None = None,
 ) -> State:
-    """Fit gradual changes of `kinds` near `times` [s], without the rows within `widths` [s]."""
+    """Fit gradual changes of "offsets" or "load" (`kinds`) near `times` [s], `widths` [s] long."""
     widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
-    steps = [Step(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
+    steps = [StepChange(kind, t) for t, both in zip(times, kinds, strict=True) for kind in both]
     first = len(state.model.steps)
     model = replace(state.model, steps=(*state.model.steps, *steps))
     found = State.fit_record(
@@ -126,7 +126,7 @@ def fit_with_ramps(
 
 
 def remove_small_steps(state: State) -> State:
-    """Remove insignificant changes one by one, the least significant first."""
+    """Remove insignificant changes of offsets or load one by one, and refit the model."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
@@ -170,7 +170,7 @@ def _ramp_middle(
 
 def _refine_time(state: State, kind: str, time: float) -> State:
     def fit_with_step_at(time: float, start: Array | None = None) -> State:
-        model = replace(state.model, steps=(*state.model.steps, Step(kind, time)))
+        model = replace(state.model, steps=(*state.model.steps, StepChange(kind, time)))
         return state.refit(model, start)
 
     best = fit_with_step_at(time)
@@ -208,9 +208,9 @@ _MAX_LOADS, _MAX_STEPS, _SHORTEST_RUN, _MAX_UNCOVERED = 4, 4, 4, 0.12
 _LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
 
 
-def find_contact_spans(state: State) -> Spans:
-    """Return time spans (start, stop) [s] whose residual far exceeds that of calm parts."""
-    blocks = _Blocks(state)
+def find_contact_spans(state: State) -> TimeSpans:
+    """Return time spans (start, stop) [s] of contact, whose residual far exceeds the usual one."""
+    blocks = _ResidualBlocks(state)
     contact_blocks = blocks.find_contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
         return ()
@@ -221,8 +221,8 @@ def find_contact_spans(state: State) -> Spans:
 
 
 def replace_contacts_by_steps(larger: State) -> State | None:
-    """Explain long contacts by changes of load and offsets; return None if impossible."""
-    blocks = _Blocks(larger)
+    """Return a model with changes of load and offsets instead of contacts; None for a bad fit."""
+    blocks = _ResidualBlocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_LOADS):
         contact_blocks = blocks.find_contact_blocks(left)
@@ -255,7 +255,7 @@ def _keep_long_runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_
     return out
 
 
-class _Blocks:
+class _ResidualBlocks:
     def __init__(self, state: State) -> None:
         data = state.data
         self._state = state
@@ -278,7 +278,7 @@ class _Blocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def find_contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return True for blocks with a residual far above the calmest; None for few blocks."""
+        """Return True for blocks `among` with a residual far above the calmest; None for few."""
         found = self._fit_calmest(np.flatnonzero(among))
         if found is None:
             return None
@@ -384,7 +384,7 @@ def replace_steps_by_contact(state: State) -> State:
 
 
 def shrink_contacts(state: State) -> State:
-    """Shorten the time spans of contacts to the rows with a large residual."""
+    """Return a fit whose time spans of contact are shortened to rows with a large residual."""
     dt = state.data.dt
     spans = [_shrunk_contact_span(state, span) for span in state.spans]
     return State.fit_record(
@@ -424,7 +424,7 @@ def _is_offset_step_undone(state: State, i: int, j: int) -> bool:
     return bool((np.abs(both) < 4.0 * np.sqrt(np.maximum(variance, 0.0))).all())
 
 
-def _spans_of_blocks(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> Spans:
+def _spans_of_blocks(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> TimeSpans:
     half = 0.5 * float(t[1] - t[0])
     last = len(t) - 1
     return tuple(

@@ -1,4 +1,4 @@
-"""Search for causes of a misfit, and the resulting load (docs/theory.md)."""
+"""Search for causes why a rigid load does not explain a wrench (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from drake_teleop.logs.causes.changes import (
 from drake_teleop.logs.causes.instants import Instants, delay_of_free_fit
 from drake_teleop.logs.causes.intervals import (
     block_deviations,
-    covariance_of,
-    factor_covariance,
     gain_covariance,
+    load_covariance,
     misfit_deviations,
+    torque_unit_covariance,
 )
 from drake_teleop.logs.causes.model import DELAY_PARAMETER, LOAD_PARAMETERS, Model
 from drake_teleop.logs.causes.state import State
@@ -84,9 +84,9 @@ SearchResult = tuple[State, float, list[Candidate]]
 def search_causes(
     data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
 ) -> SearchResult:
-    """Return the model that explains a record, additional delay [s], and rejected candidates.
+    """Return the fitted model that explains a record, additional delay [s], and rejected causes.
 
-    The model contains the extensions `given` from the start.
+    Arguments are as for `explain_misfit`.
     """
     plain = Model(parts=given)
     found = _search_causes_from(_initial_state(data, plain), 0.0, with_delay)
@@ -118,7 +118,7 @@ def search_causes(
 
 
 def may_be_coloured_noise(state: State) -> bool:
-    """Return whether the residual may be coloured noise, which smooth signals do not explain."""
+    """Return whether the residual may be coloured noise: smooth signals do not explain it."""
     return (
         state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
     )
@@ -259,16 +259,16 @@ _NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Causes why a rigid load does not explain a wrench, and the load of the model with causes.
+    """Causes why a rigid load does not explain a wrench, and the load fitted with these causes.
 
     Attributes:
         explained: whether the residual is sensor noise.
         theta, covariance: [offsets; phi] (16,) in the first part of the record [SI]; (16, 16).
         deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
-        loads: parts of a record whose load changes.
+        loads: parts of the record with different loads, if the load changes.
         removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
-        given: extensions of the model that are no causes.
+        given: quantities that are always estimated, such as "gravity", and are no causes.
     """
 
     causes: tuple[Cause, ...]
@@ -283,18 +283,18 @@ class Explanation:
     given: tuple[str, ...] = ()
 
     @property
-    def misfit(self) -> bool:
+    def is_misfit(self) -> bool:
         return not self.explained and is_clear_misfit(self.state)
 
     @property
     def several_gains(self) -> bool:
-        """Whether gain errors of single channels approximate those of a whole gain matrix."""
+        """Whether several gain errors were found, which only approximate a full gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)
 
 
-def explain(
+def explain_misfit(
     data: Instants, with_delay: InstantsAtDelay | None = None, given: tuple[str, ...] = ()
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
@@ -305,14 +305,14 @@ def explain(
     with one_blas_thread():
         state, delay_s, rejected = search_causes(data, with_delay, given)
         blocks = block_deviations(state)
-        gains = gain_covariance(state) + factor_covariance(state)
-        covariance = covariance_of(state, rejected, blocks, gains)
+        gains = gain_covariance(state) + torque_unit_covariance(state)
+        covariance = load_covariance(state, rejected, blocks, gains)
         causes = causes_of_fit(state, given)
         only_noise = residual_is_noise(state)
         if (
             not causes
             and (only_noise or may_be_coloured_noise(state))
-            and _is_no_load(state, covariance)
+            and _is_load_absent(state, covariance)
         ):
             causes = [_no_load_cause(state, covariance)]
         removed = None
@@ -332,7 +332,7 @@ def explain(
         )
 
 
-def _is_no_load(state: State, covariance: Array) -> bool:
+def _is_load_absent(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
     least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SIGNIFICANT * deviation))
     return bool(mass < least and deviation < 0.1)

@@ -30,18 +30,18 @@ FORCES, RATES, R, RP, TIME = (
     slice(64, 67),
 )
 NUM_SIGNALS = 67
-MOTION = np.r_[0:16, 28:37]
+MOTION_COLUMNS = np.r_[0:16, 28:37]
 """Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _RATE_HZ, _MAX_ROWS = 50.0, 20_000
 _BLOCK_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
 _MAX_EXACT_SIZE, _MIN_ACCELERATION_RATIO, _MAX_NOISE_SHARE = 5, 4.0, 1.0 / 64.0
 _SMOOTHING_WIDTHS = (5, 9, 15, 25)  # smoothing windows of a noisy angular acceleration [rows]
-_SMALLEST_NOISE = 1e-4  # smallest noise of a sensor, as a share of the wrench
+_MIN_NOISE_SHARE = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _DELAY_RANGE_S, _DELAY_STEP_S = 0.25, 0.01
 _MOTION_SIGNALS = slice(0, 16)
 _PRODUCT_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
-Motion = Callable[[Array], tuple[Array, ...]]
+MotionAtTime = Callable[[Array], tuple[Array, ...]]
 """Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
 
 
@@ -51,11 +51,11 @@ class Instants:
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, WIDTH) signals of the module docstring; 0 in unused rows.
+        y: (M, 67) signals of the module docstring; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
         white: (6,) standard deviation of white wrench noise in a block mean.
         gravity_W: (3,) gravity in the world [m/s^2], or None.
-        acceleration_noise: in a block mean [m/s^2].
+        acceleration_noise: standard deviation in a block mean [m/s^2].
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
 
@@ -84,7 +84,7 @@ class Instants:
 
     @cached_property
     def rows_per_block(self) -> int:
-        """Number of rows in a block, the time resolution of the search for contacts and changes."""
+        """Number of rows per block in the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
@@ -92,15 +92,15 @@ class Instants:
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def append_step_signals(self, times: tuple[float, ...]) -> Array:
-        """Return y and copies of its motion from each time on, (M, WIDTH + 25 len(times))."""
+        """Return y, and for each time [s] its 25 motion columns, set to 0 before that time."""
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
-            parts.append(self.y[:, MOTION] * share[:, None])
+            parts.append(self.y[:, MOTION_COLUMNS] * share[:, None])
         return np.hstack(parts)
 
     def lagged_products(self, y: Array, *, rows: int, lags: int = MAX_NOISE_LAG + 1) -> Array:
-        """Return sums of lagged products of y (M, W) over blocks, (blocks, lags, W, W)."""
+        """Return sums over blocks of products of y (M, W) with earlier y, (blocks, lags, W, W)."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -118,7 +118,7 @@ class Instants:
 def block_means_of_record(
     t: Array,
     wrench: Array,
-    motion: Motion | tuple[Array, ...],
+    motion: MotionAtTime | tuple[Array, ...],
     gravity_W: Array | None,
     lost: NDArray[np.bool_] | None = None,
     acceleration_noise: float = 0.0,
@@ -147,7 +147,7 @@ def block_means_of_record(
     white = white_noise(wrench)
     variance = np.array([column.var() for column in wrench.T])
     spread = np.sqrt(variance.reshape(2, 3).sum(axis=1)).repeat(3)
-    white = np.maximum(white, _SMALLEST_NOISE * spread)
+    white = np.maximum(white, _MIN_NOISE_SHARE * spread)
     share = _smooth_alpha(y, used) if gravity_W is None else 0.0
     out = Instants(
         middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
@@ -181,7 +181,7 @@ def _noise_share(x: Array) -> float:
 
 
 def _write_motion(
-    y: Array, t: Array, size: int, motion: Motion | tuple[Array, ...], gravity_W: Array | None
+    y: Array, t: Array, size: int, motion: MotionAtTime | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
     rows = len(y)
     if not callable(motion):

@@ -13,7 +13,7 @@ from drake_teleop.load.identification import natural_scales
 from drake_teleop.logs.causes.candidates import Candidate, fits_with_similar_torque_factors
 from drake_teleop.logs.causes.instants import ALPHA, FORCES, white_noise
 from drake_teleop.logs.causes.model import LOAD_PARAMETERS
-from drake_teleop.logs.causes.state import Rows, State, regularized_inverse
+from drake_teleop.logs.causes.state import State, UsedRows, regularized_inverse
 
 _NUM_JACKKNIFE_PARTS = 12
 _TOLERATED_RESIDUAL_RATIO, _USUAL_RESIDUAL_RATIO = 1.5, 1.15
@@ -31,7 +31,7 @@ _GAIN_ERRORS, _MIN_GAIN_LIKELIHOOD, _MIN_GAIN_SHARE = np.geomspace(1e-4, 0.1, 31
 _LARGEST_GAIN_ERROR = 0.025
 
 
-def covariance_of(
+def load_covariance(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
     """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes."""
@@ -47,7 +47,7 @@ def covariance_of(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return standard deviations (16,) of [offsets; phi] for a misfit without a found cause."""
+    """Return standard deviations (16,) of [offsets; phi] if no cause of a misfit was found."""
     if state.smooth_misfit > (
         _CLEAR_SMOOTH_MISFIT
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
@@ -108,7 +108,7 @@ def gain_covariance(state: State) -> Array:
     return np.asarray(effects @ effects.T)
 
 
-def factor_covariance(state: State) -> Array:
+def torque_unit_covariance(state: State) -> Array:
     """Return the covariance (16, 16) of [offsets; phi] due to an uncertain torque unit."""
     out = np.zeros((16, 16))
     for other in fits_with_similar_torque_factors(state):
@@ -129,7 +129,7 @@ def attenuation_bias(state: State) -> Array:
 
 
 def misfit_factor(state: State, blocks: Array) -> float:
-    """Return the factor that widens all standard deviations; 1 for stationary noise."""
+    """Return the factor on all standard deviations due to misfit; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD_PARAMETERS])
     shown = deviations < natural_scales(state.x[6:16])
     factor = 1.0
@@ -152,7 +152,7 @@ def block_deviations(state: State) -> Array:
     for part in at:
         used = np.zeros(len(rows.used), bool)
         used[part] = True
-        few = Rows(rows.data, used, rows.times, rows.columns)
+        few = UsedRows(rows.data, used, rows.times, rows.columns)
         gram, pull = replace(state.fit, rows=few).normal_equations(state.model, state.x)
         moves.append((regularized_inverse(whole - gram) @ (right - pull))[LOAD_PARAMETERS])
     spread = np.array(moves) - np.mean(moves, axis=0)

@@ -1,4 +1,4 @@
-"""Rigid load with further causes: the wrench as a function of few parameters, Eq. (T25)."""
+"""Model of the wrench: rigid load with extensions for causes of a misfit, Eq. (T25)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drake_teleop.logs.causes.instants import (
     ALPHA,
     CONSTANT_COLUMN,
     FORCES,
-    MOTION,
+    MOTION_COLUMNS,
     NUM_SIGNALS,
     PRODUCTS,
     RATES,
@@ -41,16 +41,16 @@ _EXTENSION_SIZES = {
 }
 _EXTENSION_LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
-_R_OF_STEP = slice(16, 25)
-_LARGEST_DELAY = 0.03  # s, in an iteration
-_ROTATION_STEP = 1e-4  # rad, step of the numerical derivative
+_STEP_ROTATION_COLUMNS = slice(16, 25)
+_MAX_DELAY_STEP_S = 0.03  # s, in an iteration
+_ROTATION_STEP_RAD = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _REGRESSOR_TENSOR = regressor_coefficients()[:, 6:, 7:19]
 _SYMMETRIC_INDICES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
-class Step:
+class StepChange:
     """Change of the offsets (6 parameters) or of the load (10 parameters) at `time` [s]."""
 
     kind: str
@@ -67,15 +67,15 @@ class Model:
 
     Attributes:
         parts: names of extensions, such as "gravity" or "drift".
-        gains: channels with a free gain.
+        gains: numbers of the wrench channels whose gain is estimated.
         steps: changes of offsets or load.
         axes: (3, 3) signed permutation of the wrench's axes.
-        factor: torque unit; the extension "torque factor" multiplies it.
+        factor: given factor on the torque; the extension "torque factor" corrects it.
     """
 
     parts: tuple[str, ...] = ()
     gains: tuple[int, ...] = ()
-    steps: tuple[Step, ...] = ()
+    steps: tuple[StepChange, ...] = ()
     axes: Array = field(default_factory=lambda: np.eye(3))
     factor: float = 1.0
 
@@ -100,20 +100,20 @@ class Model:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Indices (k,) of the signals in y that the model uses."""
+        """Indices (k,) of the signals that the model uses, in `append_step_signals`."""
         wide = bool({"gravity", "cable"} & set(self.parts))
-        kept = np.ones(NUM_SIGNALS + len(MOTION) * len(self.steps), bool)
+        kept = np.ones(NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), bool)
         if not wide:
             kept[R], kept[RP] = False, False
             for i in range(len(self.steps)):
-                kept[_columns_of_step(i)][_R_OF_STEP] = False
+                kept[_columns_of_step(i)][_STEP_ROTATION_COLUMNS] = False
         return np.flatnonzero(kept)
 
     @cached_property
     def limits(self) -> Array:
         """Largest change (size,) of each parameter in one iteration."""
         out = np.full(self.size, np.inf)
-        out[DELAY_PARAMETER] = _LARGEST_DELAY
+        out[DELAY_PARAMETER] = _MAX_DELAY_STEP_S
         for name, where in self.slices.items():
             out[where] = _EXTENSION_LIMITS.get(
                 name.split(" ")[0] if "gain" in name else name, np.inf
@@ -125,7 +125,7 @@ class Model:
         return tuple(step.time for step in self.steps)
 
     def start_parameters(self, x: Array, of: Model) -> Array:
-        """Return parameters (size,) from parameters x of the model `of`; new ones are 0."""
+        """Return parameters (size,) from those of another model, x of `of`; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY_PARAMETER + 1] = x[: DELAY_PARAMETER + 1]
         for name, where in self.slices.items():
@@ -134,15 +134,15 @@ class Model:
         return out
 
     def wrench_coefficients(self, x: Array) -> Array:
-        """Return the wrench's coefficients (B, 6, W) in the signals, for parameters x (B, size)."""
-        width, parts = NUM_SIGNALS + len(MOTION) * len(self.steps), self.slices
+        """Return coefficients (B, 6, W) of W signals in the wrench, for B parameter vectors x."""
+        width, parts = NUM_SIGNALS + len(MOTION_COLUMNS) * len(self.steps), self.slices
         motion = self._motion_coefficients(x)
         out = np.zeros((len(x), 6, width))
         out[..., :NUM_SIGNALS] = _load_coefficients(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
                 out[..., _columns_of_step(i)] = (
-                    _load_coefficients(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
+                    _load_coefficients(x[:, parts[f"step {i}"]]) @ motion[..., MOTION_COLUMNS]
                 )
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _REGRESSOR_TENSOR[:, :4, :3])
@@ -194,24 +194,24 @@ class Model:
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
 
     def wrench_derivative(self, x: Array) -> Array:
-        """Return the derivative (size, 6, k) of the wrench's coefficients by parameters x."""
+        """Return the derivative (size, 6, k) of the coefficients of k signals by parameters x."""
         steps = np.ones(self.size)
         if "rotation" in self.slices:
-            steps[self.slices["rotation"]] = _ROTATION_STEP
+            steps[self.slices["rotation"]] = _ROTATION_STEP_RAD
         moves = np.diag(steps)
         both = self.wrench_coefficients(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
     def residual_coefficients(self, x: Array) -> Array:
-        """Return coefficients (6, k) of the residual in the signals, for parameters x (size,)."""
+        """Return coefficients (6, k) of k signals in the residual, for parameters x (size,)."""
         out = -self.wrench_coefficients(x[None])[0]
         out[np.arange(6), FORCES.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])
 
 
 def _columns_of_step(i: int) -> slice:
-    return slice(NUM_SIGNALS + len(MOTION) * i, NUM_SIGNALS + len(MOTION) * (i + 1))
+    return slice(NUM_SIGNALS + len(MOTION_COLUMNS) * i, NUM_SIGNALS + len(MOTION_COLUMNS) * (i + 1))
 
 
 def _load_coefficients(phi: Array) -> Array:

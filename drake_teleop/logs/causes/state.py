@@ -14,13 +14,13 @@ from drake_teleop.logs.causes.model import Model
 
 _MIN_NOISE_ROWS = 50
 """Fewest rows for an autoregression."""
-Spans = tuple[tuple[float, float], ...]
+TimeSpans = tuple[tuple[float, float], ...]
 """(start, stop) of contacts [s]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
-    """Rows of a record that are used (M,), and the columns of its signals that a model needs."""
+class UsedRows:
+    """Rows of a record with `used` (M,) True, and the columns of its signals that a model needs."""
 
     data: Instants
     used: NDArray[np.bool_]
@@ -36,7 +36,7 @@ class Rows:
 
     @cached_property
     def lagged_product_sums(self) -> Array:
-        """Sums (5, W, W) of products of the signals at lags 0 to 4."""
+        """Sums (5, W, W) of products of W signals at lags of 0 to 4 rows."""
         return np.asarray(self.data.lagged_products(self.y, rows=len(self.y))[0])
 
     @cached_property
@@ -60,7 +60,7 @@ class Rows:
         return np.asarray(y[at])
 
     def whitened_products(self, filters: Array) -> Array:
-        """Return sums of products (6, n, n) of n signals, after each channel's 5-tap filter."""
+        """Return sums of products (6, n, n) of n signals, whitened by 5-tap filters (6, 5)."""
         width = self.y.shape[1]
         taps = [
             (filters[:, : MAX_NOISE_LAG + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)
@@ -73,7 +73,7 @@ class Rows:
     def noise_filters_and_power(
         self, residual: Array, floor: Array, order: int = MAX_NOISE_LAG
     ) -> tuple[Array, Array]:
-        """Return whitening filters (6, 5) and noise power (6,) for the residual (6, W)."""
+        """Return whitening filters (6, 5) and noise power (6,) for coefficients of the residual."""
         e = self.y @ residual.T
         filters = np.zeros((6, MAX_NOISE_LAG + 1))
         filters[:, 0] = 1.0
@@ -95,7 +95,7 @@ class Rows:
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
-def is_in_spans(data: Instants, spans: Spans) -> NDArray[np.bool_]:
+def is_in_spans(data: Instants, spans: TimeSpans) -> NDArray[np.bool_]:
     inside = np.zeros(len(data.t), bool)
     for start, stop in spans:
         inside |= (data.t >= start) & (data.t <= stop)
@@ -107,7 +107,7 @@ _RIDGE, _NOISE_POWER_FLOOR = 1e-11, 1e-14
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class ModelFit:
     """Model with parameters x (size,), fitted to rows of a record.
 
     Attributes:
@@ -118,7 +118,7 @@ class Fit:
     """
 
     model: Model
-    rows: Rows
+    rows: UsedRows
     x: Array
     covariance: Array
     residual: Array
@@ -141,8 +141,8 @@ class Fit:
 
 
 def fit_model(
-    model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
-) -> Fit:
+    model: Model, rows: UsedRows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
+) -> ModelFit:
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
@@ -150,7 +150,7 @@ def fit_model(
     floor = np.maximum(_NOISE_POWER_FLOOR * both, 1e-30)
     filters = np.zeros((6, MAX_NOISE_LAG + 1))
     filters[:, 0] = 1.0
-    found = Fit(
+    found = ModelFit(
         model,
         rows,
         x,
@@ -168,7 +168,7 @@ def fit_model(
         residual = model.residual_coefficients(x)
         order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else MAX_NOISE_LAG
         filters, power = rows.noise_filters_and_power(residual, floor, order)
-        found = Fit(model, rows, x, inverse, residual, filters, power)
+        found = ModelFit(model, rows, x, inverse, residual, filters, power)
         still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGENCE
         if still and step > _UNWEIGHTED_ITERATIONS:
             break
@@ -194,17 +194,16 @@ class State:
     """Model fitted to the rows of a record outside of contacts (`spans`: start, stop [s])."""
 
     data: Instants
-    spans: Spans
-    fit: Fit
+    spans: TimeSpans
+    fit: ModelFit
 
     @classmethod
     def fit_record(
-        cls, data: Instants, model: Model, start: Array | None = None, spans: Spans = ()
+        cls, data: Instants, model: Model, start: Array | None = None, spans: TimeSpans = ()
     ) -> State:
         used = data.used & ~is_in_spans(data, spans)
-        return cls(
-            data, spans, fit_model(model, Rows(data, used, model.step_times, model.columns), start)
-        )
+        rows = UsedRows(data, used, model.step_times, model.columns)
+        return cls(data, spans, fit_model(model, rows, start))
 
     def refit(self, model: Model, start: Array | None = None, **options: int) -> State:
         if start is None:
@@ -213,10 +212,10 @@ class State:
             self.data, self.spans, fit_model(model, self._rows_for_model(model), start, **options)
         )
 
-    def _rows_for_model(self, model: Model) -> Rows:
+    def _rows_for_model(self, model: Model) -> UsedRows:
         if self.rows.has_columns_of(model):
             return self.rows
-        return Rows(self.data, self.rows.used, model.step_times, model.columns)
+        return UsedRows(self.data, self.rows.used, model.step_times, model.columns)
 
     @property
     def model(self) -> Model:
@@ -232,7 +231,7 @@ class State:
         return self.x[where], self.fit.covariance[where, where]
 
     @property
-    def rows(self) -> Rows:
+    def rows(self) -> UsedRows:
         return self.fit.rows
 
     @cached_property
@@ -241,16 +240,16 @@ class State:
         if not self.spans:
             return self.fit.likelihood
         used = self.data.used & ~self.rows.used
-        inside = Rows(self.data, used, self.model.step_times, self.model.columns)
+        inside = UsedRows(self.data, used, self.model.step_times, self.model.columns)
         power = inside.noise_filters_and_power(self.fit.residual, 1e-6 * self.fit.power)[1]
         # Rows at the edges of contacts count as noise of this power, too.
-        count = len(self.state_without_contacts) - len(self.rows.rows_with_predecessors)
+        count = len(self._rows_including_contacts) - len(self.rows.rows_with_predecessors)
         return self.fit.likelihood - 0.5 * count * float(np.log(power).sum())
 
     @cached_property
-    def state_without_contacts(self) -> Array:
+    def _rows_including_contacts(self) -> Array:
         return np.asarray(
-            Rows(self.data, self.data.used, (), self.model.columns).rows_with_predecessors
+            UsedRows(self.data, self.data.used, (), self.model.columns).rows_with_predecessors
         )
 
     @cached_property
@@ -261,13 +260,13 @@ class State:
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """Gain of `smooth_gain` per degree of freedom: about 1 or below for noise of any colour."""
+        """Gain by smooth signals per degree of freedom; at most about 1 for noise."""
         gain, freedom = self.smooth_gain
         return gain / max(1, freedom - self.model.size)
 
     @cached_property
     def smooth_gain(self) -> tuple[float, int]:
-        """Gain of twice the log likelihood by generic smooth signals, and their number."""
+        """Gain of twice the log likelihood by adding generic smooth signals, and their number."""
         y = self.data.y
         part = np.linspace(0.0, _NUM_SMOOTH_SEGMENTS, len(y), endpoint=False).astype(int)
         columns = np.hstack(
@@ -300,7 +299,7 @@ class State:
 
 
 def likelihood_gain(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
-    """Return right^T gram^-1 right and the rank; diagonals below `least` count as rounding."""
+    """Return the gain right^T gram^-1 right of twice the log likelihood, and the rank of gram."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
     if not used.any():

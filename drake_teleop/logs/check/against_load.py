@@ -37,16 +37,16 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 
-GOOD_SHARE = 0.02
+GOOD_RESIDUAL = 0.02
 """Largest unexplained share of the variance, without white noise, of a good fit."""
-VALID_SHARE = 0.05
+VALID_RESIDUAL = 0.05
 """Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_IMPROVEMENT = 4.0
 """Smallest factor by which an edit must reduce the unexplained share."""
 _FALSE_ALARM_RATE, _NUM_TESTED_EDITS = 1e-6, 50
 _CUTOFF_HZ = 15.0
-_ALREADY_SIGNED = ("sign", "swapped axes")  # mirrored axes are a cause that `identify` names
-_FREE_SHARE = 0.75
+_FINDINGS_WITH_SIGN = ("sign", "swapped axes")  # mirrored axes are a cause that `identify` names
+_CONTACT_FREE_SHARE = 0.75
 """Share of a record that is without contact, if any is."""
 _MAX_SAMPLES = 1500
 
@@ -67,13 +67,13 @@ class LoadFit:
     independent: float = 1e9
 
     @property
-    def good(self) -> bool:
+    def is_good(self) -> bool:
         """Whether the fitted load has a positive mass and explains the wrench."""
-        return self.mass > 0 and self.unexplained < GOOD_SHARE + self.noise
+        return self.mass > 0 and self.unexplained < GOOD_RESIDUAL + self.noise
 
 
-def load_fit(log: Log, kept_share: float = 1.0) -> LoadFit:
-    """Fit a load and offsets to the share of a log that fits best, after a low-pass of 15 Hz."""
+def fit_load(log: Log, kept_share: float = 1.0) -> LoadFit:
+    """Fit load and offsets to the best fitting share of a log, after a low-pass of 15 Hz."""
     cutoff = None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
     smooth = low_pass_log(log, cutoff).select_rows(far_from_gaps(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
@@ -84,13 +84,13 @@ def load_fit(log: Log, kept_share: float = 1.0) -> LoadFit:
         rest = np.zeros_like(smooth.gravity[rows])
         V = np.dstack([V, regressor(-smooth.gravity[rows], rest, rest)[..., :4]])
     V, w = V / scale[:, None], wrench / scale
-    theta = _least_squares(V, w)
+    theta = _fit_load_parameters(V, w)
     if kept_share < 1.0:
         errors = w - V @ theta
         errors = np.linalg.norm(errors - np.median(errors, axis=0), axis=1)
         best = errors <= np.quantile(errors, kept_share)
         V, w = V[best], w[best]
-        theta = _least_squares(V, w)
+        theta = _fit_load_parameters(V, w)
     total = float(w.var(axis=0).sum()) + 1e-30
     unexplained = float((w - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
@@ -102,7 +102,7 @@ def load_fit(log: Log, kept_share: float = 1.0) -> LoadFit:
     return LoadFit(unexplained, float(theta[0]), noise, independent)
 
 
-def _least_squares(V: Array, w: Array) -> Array:
+def _fit_load_parameters(V: Array, w: Array) -> Array:
     V = V - V.mean(axis=0)
     matrix = V.reshape(-1, V.shape[2])
     size = np.linalg.norm(matrix, axis=0) + 1e-12
@@ -129,7 +129,7 @@ def min_reduction_factor(fit: LoadFit) -> float:
     return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARM_RATE / _NUM_TESTED_EDITS)))
 
 
-UNDETERMINED_SHARE = 0.9
+MIN_UNDETERMINED_SHARE = 0.9
 """Unexplained share of the wrench's variance above which a load is undetermined."""
 SMALLEST_LAG_S = 0.002
 """Smallest reported delay [s]."""
@@ -148,22 +148,22 @@ def check_wrench(description: Description, data: LogData) -> tuple[list[Finding]
     def fit_edited_description(edited: Description, kept_share: float = 1.0) -> LoadFit:
         # A wrong description may cause a wrong delay.
         log = _log_with_edited_wrench(thin, description, edited) or data.read_thinned_log(edited)
-        fits = [load_fit(remove_delay(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
+        fits = [fit_load(remove_delay(log, shift), kept_share) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fit_edited_description(description)
     # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
     inside = delay is not None and abs(delay) < 0.9 * DELAY_SEARCH_RANGE_S
     edits: list[tuple[Finding | None, Description]] = []
-    if not (given.good and inside):
+    if not (given.is_good and inside):
         edits += _clock_offset_edits(description, thin)
-    if not given.good:
+    if not given.is_good:
         edits = [*wrench_and_motion_edits(description), *edits]
     found = _better_edits(fit_edited_description, given, edits)
-    if not found and not given.good and not log.static:  # contact may hide what fits
-        without_contact = partial(fit_edited_description, kept_share=_FREE_SHARE)
+    if not found and not given.is_good and not log.static:  # contact may hide what fits
+        without_contact = partial(fit_edited_description, kept_share=_CONTACT_FREE_SHARE)
         found = _better_edits(without_contact, without_contact(description), edits)
-    if not found and given.good:
+    if not found and given.is_good:
         return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
         return _findings_without_remedy(description, log, given, delay)
@@ -188,17 +188,17 @@ def _better_edits(
 ) -> list[tuple[LoadFit, Finding | None, Description]]:
     """Return the edits with which a load of positive mass explains the wrench far better.
 
-    If there is none, each is tried with the opposite sign of the wrench.
+    If there are none, each edit is tried with the opposite sign of the wrench.
     """
     positive, negative = [], []
     for finding, edited in edits:
         fit = try_edit(fitted, edited)
         if fit is not None and fit.mass > 0:
             positive.append((fit, finding, edited))
-        elif fit is not None and finding is not None and finding.name not in _ALREADY_SIGNED:
+        elif fit is not None and finding is not None and finding.name not in _FINDINGS_WITH_SIGN:
             negative.append((fit, *with_opposite_sign(finding, edited)))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
-    valid, decisive = VALID_SHARE + given.noise, given.unexplained / min_reduction_factor(given)
+    valid, decisive = VALID_RESIDUAL + given.noise, given.unexplained / min_reduction_factor(given)
     limit = min(1.01 * given.unexplained if given.mass < 0 else decisive, valid)
     found = [entry for entry in positive if entry[0].unexplained < limit]
     return found or [entry for entry in negative if entry[0].unexplained < min(decisive, valid)]
@@ -207,7 +207,7 @@ def _better_edits(
 def _is_delay_significant(log: Log, delay: float | None) -> bool:
     if delay is None:
         return False
-    none, aligned = load_fit(log), load_fit(remove_delay(log, delay))
+    none, aligned = fit_load(log), fit_load(remove_delay(log, delay))
     gain = none.independent * np.log(none.unexplained / (aligned.unexplained + 1e-30))
     return bool(gain > 25.0)
 
@@ -244,7 +244,7 @@ def _findings_without_remedy(
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > VALID_SHARE + given.noise:
+    if delay is None or unexplained_share(wrench, residual) > VALID_RESIDUAL + given.noise:
         return [], None
     if fit.rejected.any():
         # Contacts bias the delay.
@@ -255,7 +255,7 @@ def _findings_without_remedy(
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
     """Return a finding if a record does not determine the mass of a load."""
-    if load.verdicts[6] != "not" and unexplained < UNDETERMINED_SHARE:
+    if load.verdicts[6] != "not" and unexplained < MIN_UNDETERMINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit"
@@ -279,7 +279,7 @@ def _clock_offset_edits(description: Description, log: Log) -> Iterator[tuple[No
 
     def unexplained_at_shift(shift: float) -> float:
         s, omega, alpha = (resample(t + shift, smooth.t, x) for x in smooth.motion)
-        return load_fit(Log(t, wrench, s, omega, alpha)).unexplained
+        return fit_load(Log(t, wrench, s, omega, alpha)).unexplained
 
     shifts = np.arange(-reach, reach + 1e-9, 0.02)
     best = float(shifts[int(np.argmin([unexplained_at_shift(x) for x in shifts]))])
@@ -361,6 +361,6 @@ def _fit_delay_over_time(log: Log) -> tuple[float, float] | None:
 
 def _unexplained_without_delay(log: Log) -> float:
     try:
-        return load_fit(remove_delay(log, estimate_delay(log, 15.0) or 0.0)).unexplained
+        return fit_load(remove_delay(log, estimate_delay(log, 15.0) or 0.0)).unexplained
     except DrakeTeleopError:
         return np.inf

@@ -1,4 +1,4 @@
-"""Errors of convention in a log description, found by the laws of motion."""
+"""Wrong units, signs, axes and clocks in a log description, found by the laws of motion."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_load import (
-    GOOD_SHARE,
+    GOOD_RESIDUAL,
     LoadFit,
     check_wrench,
     drift_finding,
-    load_fit,
+    fit_load,
     payload_finding,
     unexplained_share,
 )
@@ -31,18 +31,18 @@ from drake_teleop.logs.check.imu_checks import check_imu_against_pose, check_imu
 from drake_teleop.logs.check.log_data import LogData, channel_findings
 from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.description import ONLY_IN_DESCRIPTION, Description, load_description
+from drake_teleop.logs.read.description import YAML_ONLY_NOTE, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.table_files import TABLE_READERS, read_table
 from drake_teleop.logs.read.tables import Table
 
 _MIN_MOTION_RMS = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
-_FEWEST_POSES = 6
+_MIN_CHECKED_POSES = 6
 """Fewest poses that allow a check of the fit."""
 _MIN_DIRECTION_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
-_CONSTANT_SHARE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
+_MIN_LIVE_SHARE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def check_suspicious_load(
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < MIN_CLOCK_ERROR_S)
-    if load.mass > 0 and unexplained < GOOD_SHARE and clocks and 5.0 < weight < 20.0:
+    if load.mass > 0 and unexplained < GOOD_RESIDUAL and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings_without_lag(check)) if _is_suspicious(log) else ()
     found = _findings_without_lag(check)
@@ -160,12 +160,12 @@ def check_conventions(
     if Path(source).suffix.lower() not in TABLE_READERS:
         return found
     # A canonical table has no description to edit.
-    findings = (replace(f, message=f"{f.message} ({ONLY_IN_DESCRIPTION})") for f in found.findings)
+    findings = (replace(f, message=f"{f.message} ({YAML_ONLY_NOTE})") for f in found.findings)
     return replace(found, findings=tuple(findings))
 
 
 def _is_wrench_constant(log: Log) -> bool:
-    return bool((np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * np.abs(log.wrench).max()).all())
+    return bool((np.ptp(log.wrench, axis=0) <= _MIN_LIVE_SHARE * np.abs(log.wrench).max()).all())
 
 
 def _check_description(data: LogData, description: Description) -> Conventions:
@@ -178,7 +178,7 @@ def _check_description(data: LogData, description: Description) -> Conventions:
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
     if dead:  # A dead channel would cause wrong findings about motion and load.
         return Conventions(
-            (*dead, *broken), load_fit(data.read_thinned_log(description)), None, None
+            (*dead, *broken), fit_load(data.read_thinned_log(description)), None, None
         )
     findings, description = correct_gravity_unit(description, log)
     more, description = check_imu_signals(description, data.read_thinned_log(description))
@@ -187,7 +187,7 @@ def _check_description(data: LogData, description: Description) -> Conventions:
     if description.imu and description.pose:
         more, mounting, description = check_imu_against_pose(description, data)
         findings += more
-    fit = load_fit(data.read_thinned_log(description))
+    fit = fit_load(data.read_thinned_log(description))
     if broken or (mounting is not None and mounting.mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
     if "weight" in log.free:  # the checks below require the weight of the load in the wrench
@@ -228,7 +228,7 @@ def _merge_clock_findings(
 def _static_poses_finding(log: Log) -> Finding | None:
     if not log.static:
         return None
-    if len(log) < _FEWEST_POSES:
+    if len(log) < _MIN_CHECKED_POSES:
         return Finding(
             "static poses",
             f"{len(log)} poses at rest are too few to check the fit; record 12, turned about two"

@@ -32,7 +32,7 @@ class Finding:
     Args:
         name: category for programs: "sign", "units" ...
         message: observation and remedy.
-        fields: fields of the description and their corrected values, as in YAML.
+        fields: corrected values of fields of the log description, as in YAML.
     """
 
     name: str
@@ -92,7 +92,7 @@ def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Findi
 
 
 def pose_edits(description: Description) -> Iterator[Edit]:
-    """Yield alternatives to the described form of the orientation and sign of gravity."""
+    """Yield edits of a description: other forms of the orientation, opposite sign of gravity."""
     pose, imu = description.pose, description.imu
     sensed = imu is not None and imu.specific_force is not None
     if imu is not None and sensed:
@@ -128,7 +128,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
 
 
 def with_opposite_sign(finding: Finding, description: Description) -> Edit:
-    """Return an edit that also inverts the sign of the wrench."""
+    """Return finding and description of an edit, with the sign of the wrench inverted, too."""
     stream = "static" if description.static else "wrench"
     path, sign = f"{stream}.sign", -getattr(description, stream).sign
     text = f"the sign of the wrench is inverted, and {finding.message} and {path}: {sign}"
@@ -145,7 +145,7 @@ def try_edit(function: Callable[[Description], Any], edited: Description) -> Any
 
 
 def wrench_and_motion_edits(description: Description) -> Iterator[Edit]:
-    """Yield alternatives to the described signs, axes and units of wrench and motion."""
+    """Yield edits of a description: other signs, axes and units of wrench and motion."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
     text = "the sign of the wrench is inverted"

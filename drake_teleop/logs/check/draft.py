@@ -84,7 +84,7 @@ _QUATERNION_TOLERANCE = 0.01  # of the length
 _NUMBERED_QUATERNION_PATTERN = r"(^|_)(q|quat|quaternion|orient|orientation|rot)_?[0-4]$"
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_RAW_COUNT = 2000.0  # median of integers that are raw counts
-_FILL_IN = "FILL IN"
+_FILL_IN_TEXT = "FILL IN"
 _TIME_FIELDS = ("column", "nanoseconds")
 _COUNTER_PATTERN = r"(^|_)(index|idx|frame|row|seq|counter|count|sample|episode)s?(_|$)"
 _MIN_CLOCK_ROWS = 20
@@ -98,7 +98,7 @@ _NO_TIME_NOTE = "No column of time was recognized; where there is none, time: {r
 
 
 class Draft(NamedTuple):
-    """Streams of a log description, and comment lines about them."""
+    """Draft of a log description: its streams as in YAML, and its comment lines (`head`)."""
 
     streams: dict[str, Any]
     head: list[str]
@@ -133,15 +133,15 @@ def join_drafts(drafts: Sequence[Draft]) -> Draft:
 def _is_template(stream: dict[str, Any]) -> bool:
     groups = [group for group in stream.values() if isinstance(group, dict)]
     columns = [column for group in groups for column in group.get("columns", ())]
-    return bool(columns) and set(columns) == {_FILL_IN}
+    return bool(columns) and set(columns) == {_FILL_IN_TEXT}
 
 
-class _Columns(NamedTuple):
+class _UnitColumns(NamedTuple):
     columns: list[str]
     unit: str
 
 
-_NO_COLUMNS = _Columns([], "")
+_NO_COLUMNS = _UnitColumns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
@@ -153,14 +153,14 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         | _find_quaternion(table, plain)
         | _find_array_columns(table, plain)
     )
-    _resolve_translation(found, plain)
+    _torque_to_position(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream_of_groups(**groups: Any) -> dict[str, Any]:
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _draft_time(table, plain, beside), **groups}
 
-    none = _Columns([_FILL_IN] * 3, "")
+    none = _UnitColumns([_FILL_IN_TEXT] * 3, "")
     wrench = stream_of_groups(
         **{
             kind: _draft_quantity(table, kind, found.get(kind, none))
@@ -193,7 +193,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
-    if _FILL_IN in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
+    if _FILL_IN_TEXT in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _streams_of_static_poses(draft)
     times = {stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_FIELDS}
     used |= times - {None}
@@ -208,8 +208,8 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
         "above all wrench.sign, units and frames.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
         *([_NO_TORQUE_NOTE] if "force" in found and "torque" not in found else []),
-        *([_NO_TIME_NOTE] if _FILL_IN in times else []),
-        *([_RAW_COUNTS_NOTE] if f"'scale': '{_FILL_IN}'" in str(draft) else []),
+        *([_NO_TIME_NOTE] if _FILL_IN_TEXT in times else []),
+        *([_RAW_COUNTS_NOTE] if f"'scale': '{_FILL_IN_TEXT}'" in str(draft) else []),
         *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return Draft(draft, head)
@@ -224,7 +224,6 @@ def _streams_of_static_poses(draft: dict[str, Any]) -> dict[str, Any]:
 
 
 def _split_name_and_unit(name: str) -> tuple[str, str]:
-    """Return the words of a column's name, and its unit: `Fx [N]`, `Fx (N)` or `Fx_N`."""
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     suffix = re.search(r"(?:(?<=[xyz])|(?<=ch|aw|ll))_([a-z/]+)$", name, re.IGNORECASE)
     if unit is None and suffix is not None and suffix[1].lower() in _UNIT_NAMES:
@@ -237,8 +236,8 @@ def _remove_trailing_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    found: dict[str, _Columns] = {}
+def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+    found: dict[str, _UnitColumns] = {}
     for kind, names in _VECTOR_NAME_PATTERNS.items():
         axes = "wxyz" if kind == "orientation" else "xyz"
         ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
@@ -251,11 +250,11 @@ def _find_vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
         whole = [group for group in groups.values() if len(group) == len(axes)]
         for group in (whole or list(groups.values()))[:1]:
             columns = [group[axis] for axis in axes if axis in group]
-            found[kind] = _Columns(columns, plain[columns[0]][1])
+            found[kind] = _UnitColumns(columns, plain[columns[0]][1])
     return found
 
 
-def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
     ends: dict[str, dict[str, str]] = {}
     for name, (words, _) in plain.items():
         prefix, _, end = words.rpartition("_")
@@ -264,18 +263,18 @@ def _find_euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]
         for group in ends.values():
             if all(name in group for name in names):
                 columns = [group[name] for name in names]
-                return {axes: _Columns(columns, plain[columns[0]][1])}
+                return {axes: _UnitColumns(columns, plain[columns[0]][1])}
     return {}
 
 
-def _resolve_translation(found: dict[str, _Columns], plain: dict[str, tuple[str, str]]) -> None:
+def _torque_to_position(found: dict[str, _UnitColumns], plain: dict[str, tuple[str, str]]) -> None:
     torque = found.get("torque", _NO_COLUMNS).columns
     bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
     if bare and "force" not in found and "position" not in found:
         found["position"] = found.pop("torque")
 
 
-def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_POSE_VECTOR_PATTERN, words):
@@ -285,7 +284,7 @@ def _find_pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[
             quaternion = columns[first : first + 4]
             if _have_unit_length(table, quaternion):
                 position = columns[:3] if first else columns[4:7]
-                return {kind: _Columns(quaternion, ""), "position": _Columns(position, "")}
+                return {kind: _UnitColumns(quaternion, ""), "position": _UnitColumns(position, "")}
     return {}
 
 
@@ -294,43 +293,43 @@ def _have_unit_length(table: Table, quaternion: list[str]) -> bool:
     return bool(np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE)
 
 
-def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+def _find_quaternion(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_NUMBERED_QUATERNION_PATTERN, words):
             groups.setdefault(_remove_trailing_number(words), []).append(name)
     fours = [group for group in groups.values() if len(group) == 4]
     found = next((group for group in fours if _have_unit_length(table, group)), None)
-    return {"orientation": _Columns(found, "")} if found else {}
+    return {"orientation": _UnitColumns(found, "")} if found else {}
 
 
-def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+def _find_numbered_columns(plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(r"\d$", words):
             groups.setdefault(_remove_trailing_number(words), []).append(name)
-    found: dict[str, _Columns] = {}
+    found: dict[str, _UnitColumns] = {}
     for start, kinds in _NUMBERED_COLUMN_PATTERNS.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
         for base in sorted(fit, key=lambda name: "target" in name)[:1]:
             for kind, places in kinds.items():
                 columns = [groups[base][k] for k in places]
-                found[kind] = _Columns(columns, plain[columns[0]][1])
+                found[kind] = _UnitColumns(columns, plain[columns[0]][1])
     by_words = {words: name for name, (words, _) in plain.items()}
     if all(word in by_words for word in _MATRIX_ELEMENT_NAMES):
-        found["matrix"] = _Columns([by_words[word] for word in _MATRIX_ELEMENT_NAMES], "")
+        found["matrix"] = _UnitColumns([by_words[word] for word in _MATRIX_ELEMENT_NAMES], "")
     return found
 
 
-def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    found: dict[str, _Columns] = {}
+def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _UnitColumns]:
+    found: dict[str, _UnitColumns] = {}
     arrays = _array_names(table)
     for kind, names in {**_VECTOR_NAME_PATTERNS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
             words, unit = plain[name]
-            whole = _Columns([name], unit)
+            whole = _UnitColumns([name], unit)
             fits = _width_of_columns(table, whole) == width
             form = kind
             if kind == "orientation" and words.endswith(("_xyzw", "_wxyz")):
@@ -340,7 +339,7 @@ def _find_array_columns(table: Table, plain: dict[str, tuple[str, str]]) -> dict
                 found[form] = whole
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
         for kind, places in _HOMOGENEOUS_MATRIX_PLACES.items():
-            found[kind] = _Columns([f"{name}[{k}]" for k in places], "")
+            found[kind] = _UnitColumns([f"{name}[{k}]" for k in places], "")
     return found
 
 
@@ -348,19 +347,19 @@ def _array_names(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _width_of_columns(table: Table, found: _Columns) -> int:
+def _width_of_columns(table: Table, found: _UnitColumns) -> int:
     return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
 
 
-def _draft_quantity(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
+def _draft_quantity(table: Table, kind: str, found: _UnitColumns) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(found.columns)}
-    if kind in ("force", "torque") and _are_counts(table, found.columns):
-        group["scale"] = _FILL_IN
+    if kind in ("force", "torque") and _are_raw_counts(table, found.columns):
+        group["scale"] = _FILL_IN_TEXT
     if found.unit:
         unit = _UNIT_NAMES.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
-        group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN
+        group["unit"] = unit if unit in _ALLOWED_UNITS[kind] else _FILL_IN_TEXT
         return group
-    if _FILL_IN in found.columns or kind in ("force", "torque"):
+    if _FILL_IN_TEXT in found.columns or kind in ("force", "torque"):
         return group
     size = np.linalg.norm(np.hstack([table.raw(n, n) for n in found.columns]), axis=1)
     if kind == "specific_force":
@@ -372,8 +371,8 @@ def _draft_quantity(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
     return group | {"unit": other if np.nanmax(size) > limit else usual}
 
 
-def _are_counts(table: Table, columns: list[str]) -> bool:
-    if _FILL_IN in columns:
+def _are_raw_counts(table: Table, columns: list[str]) -> bool:
+    if _FILL_IN_TEXT in columns:
         return False
     first = table.raw(columns[0], columns[0])
     if not np.nanmedian(np.abs(first)) > _MIN_RAW_COUNT:
@@ -381,7 +380,7 @@ def _are_counts(table: Table, columns: list[str]) -> bool:
     return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
 
 
-def _draft_pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
+def _draft_pose(table: Table, found: dict[str, _UnitColumns]) -> dict[str, Any]:
     if _width_of_columns(table, found.get("orientation", _NO_COLUMNS)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif form := next((name for name in ("quaternion_xyzw", "matrix") if name in found), None):
@@ -407,7 +406,7 @@ def _draft_time(table: Table, plain: dict[str, tuple[str, str]], beside: str) ->
     named = [name for name in named if f"{name}[0]" not in table.columns]
     named = named or _clock_columns(table, plain)
     if not named:
-        return {"column": _FILL_IN}
+        return {"column": _FILL_IN_TEXT}
     if beside in table.columns:
         structure, rows = beside.rpartition(".")[0], len(table.columns[beside])
         named.sort(

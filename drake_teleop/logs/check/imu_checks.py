@@ -6,7 +6,7 @@ import numpy as np
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.rotations import rotation_matrices, signed_permutations
-from drake_teleop.logs.check.against_load import GOOD_SHARE, MIN_IMPROVEMENT, VALID_SHARE
+from drake_teleop.logs.check.against_load import GOOD_RESIDUAL, MIN_IMPROVEMENT, VALID_RESIDUAL
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Edit,
@@ -25,7 +25,7 @@ RANGE_OF_DEGREES_PER_RADIAN = (40.0, 80.0)
 """Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
 MIN_GRAVITY_ERROR = 0.02
 """Smallest reported error of gravity; calibrated sensors are within 1 %."""
-_SIGNIFICANT = 5.0
+_SIGNIFICANT_DEVIATIONS = 5.0
 _MIN_CORRELATION = 0.8
 _COMPARISON_CUTOFF_HZ = 5.0
 _MAX_UNSWAPPED_SHARE = 0.5
@@ -133,7 +133,10 @@ def _angular_acceleration_axes_finding(imu: Imu, log: Log) -> Finding | None:
 
 
 def _windowed_specific_forces(log: Log, P: Array) -> Array:
-    """Return specific forces (2, n, 3) in Hann windows, and half a window later [m/s^2]."""
+    """Return mean specific forces (2, n, 3) in n Hann windows, and half a window later.
+
+    The gyroscope, with axes permuted by P, rotates them to the axes at the window's start.
+    """
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
@@ -168,7 +171,7 @@ def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
     ratio, deviation = np.mean(ratios), np.std(ratios, ddof=1) / np.sqrt(len(ratios))
     off = abs(ratio - 1.0)
     if not 0.7 < ratio < 1.4 or off < max(
-        MIN_GRAVITY_ERROR + 3.0 * deviation, _SIGNIFICANT * deviation
+        MIN_GRAVITY_ERROR + 3.0 * deviation, _SIGNIFICANT_DEVIATIONS * deviation
     ):
         return None
     assert imu.specific_force is not None
@@ -198,25 +201,25 @@ def check_imu_against_pose(
     if given is None:
         return [], None, description
     findings: list[Finding] = []
-    if given.unexplained > GOOD_SHARE or given.mirrored or given.rotation_angle_deg > 10:
+    if given.unexplained > GOOD_RESIDUAL or given.mirrored or given.rotation_angle_deg > 10:
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
             if (found := try_edit(fit_mounting, edited)) and not found.mirrored
         ]
-        limit = min(VALID_SHARE, given.unexplained / MIN_IMPROVEMENT)
+        limit = min(VALID_RESIDUAL, given.unexplained / MIN_IMPROVEMENT)
         if given.mirrored:
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
-        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_SHARE:
+        elif given.rotation_angle_deg > 10 and given.unexplained < VALID_RESIDUAL:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[3].rotation_angle_deg < 10]
-            limit = min(VALID_SHARE, 1.5 * given.unexplained + 1e-4)
+            limit = min(VALID_RESIDUAL, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0], default=None)
         if best and best[0] < limit:
             findings.append(best[1])
             description, given = best[2], best[3]
-    if given.unexplained > VALID_SHARE and not given.mirrored:
+    if given.unexplained > VALID_RESIDUAL and not given.mirrored:
         return findings, given, description
     if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
         finding, description = _correct_imu_clock(description, given, data)

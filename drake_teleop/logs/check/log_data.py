@@ -1,4 +1,4 @@
-"""Tables of a log, whole and thinned to 100 Hz, for repeated reading, and checks of channels."""
+"""Tables of a log in memory, and checks of its channels."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from drake_teleop.logs.read.reading import read_description
 from drake_teleop.logs.read.streams import MIN_STREAM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
-_RATE_HZ = 100.0
-_TIME_COLUMN = "thinned time stamps of"
+_THINNED_RATE_HZ = 100.0
+_TIME_PREFIX = "thinned time stamps of"
 
 
 class LogData:
@@ -55,7 +55,7 @@ class LogData:
         stamped = {}
         for name, stream in _described_streams(description).items():
             if (time := getattr(stream, "time", None)) is not None:
-                column = {"column": f"{_TIME_COLUMN} {name}", "unit": "s"}
+                column = {"column": f"{_TIME_PREFIX} {name}", "unit": "s"}
                 time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
                 stamped[name] = stream.model_copy(update={"time": time})
         description = description.model_copy(update=stamped)
@@ -76,7 +76,7 @@ class LogData:
             return 1
         rate = 1 / max(1e-12, float(np.median(np.diff(t))))
         # A short record keeps enough samples.
-        most = min(rate / _RATE_HZ, len(t) / MIN_STREAM_SAMPLES)
+        most = min(rate / _THINNED_RATE_HZ, len(t) / MIN_STREAM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _table_of_stream(self, stream: Any) -> Table:
@@ -97,7 +97,7 @@ class LogData:
         table, rows = self._table_of_stream(stream), None
         if getattr(stream, "time", None) is not None:
             t, rows = self._times_and_rows(stream)
-            thin.columns[f"{_TIME_COLUMN} {name}"] = _means_of_consecutive_rows(t[:, None], k)
+            thin.columns[f"{_TIME_PREFIX} {name}"] = _means_of_consecutive_rows(t[:, None], k)
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 
 _CUTOFF_HZ = 3.0
-_WORST_CONDITION = 1e8
+_MAX_CONDITION_NUMBER = 1e8
 _SMALLEST_SHIFT, _LARGEST_DEVIATION = 0.02, 0.01  # m
-_SIGNIFICANT = 5.0  # standard deviations
+_SIGNIFICANT_DEVIATIONS = 5.0  # standard deviations
 _UNIT_RANGE, _MAX_UNIT_DEVIATION = (0.7, 1.43), 0.15
-_UNKNOWN_UNIT = 50.0
+_MIN_UNIT_ERROR_FACTOR = 50.0
 MIN_POSES_DURATION_S = 4.0
 """Shorter records have too few frequencies for an estimate by poses alone [s]."""
 _UNIT_TOLERANCE, _NEAREST_COM, _FARTHEST_COM = 0.1, 2e-4, 1.5  # 1, m, m
@@ -67,7 +67,7 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     columns, by_pose = (low_pass(x, sensed.dt, _CUTOFF_HZ) for x in (columns, by_pose))
     inner = slice(len(t) // 50, len(t) - len(t) // 50)
     fit = _fit_with_offset(columns[inner], by_pose[inner], 2.0 * _CUTOFF_HZ * float(t[-1] - t[0]))
-    if fit is None or abs(fit[0][0]) <= _SIGNIFICANT * fit[1][0]:
+    if fit is None or abs(fit[0][0]) <= _SIGNIFICANT_DEVIATIONS * fit[1][0]:
         return []
     x, deviations = fit
     k = float(x[0])
@@ -78,7 +78,7 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     size = float(np.linalg.norm(shift))
     if abs(k - 1.0) > _MAX_UNIT_DEVIATION or deviation > _LARGEST_DEVIATION:
         return []
-    if size < max(_SMALLEST_SHIFT, _SIGNIFICANT * deviation):
+    if size < max(_SMALLEST_SHIFT, _SIGNIFICANT_DEVIATIONS * deviation):
         return []
     place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
     text = (
@@ -90,14 +90,14 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
 
 
 def _position_unit_finding(now: str, kappa: float, deviation: float) -> Finding | None:
-    if not abs(kappa) > _SIGNIFICANT * deviation:
+    if not abs(kappa) > _SIGNIFICANT_DEVIATIONS * deviation:
         return None
     text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
     for unit in POSITION_UNITS:
         ratio = SI_VALUE_OF_UNIT[unit] / SI_VALUE_OF_UNIT[now]
         if unit != now and _UNIT_RANGE[0] < kappa / ratio < _UNIT_RANGE[1]:
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
-    if 1.0 / _UNKNOWN_UNIT < abs(kappa) < _UNKNOWN_UNIT:  # noise or another error
+    if 1.0 / _MIN_UNIT_ERROR_FACTOR < abs(kappa) < _MIN_UNIT_ERROR_FACTOR:  # noise or another error
         return None
     return Finding(
         "units",
@@ -117,7 +117,7 @@ def _fit_with_offset(
     if (size == 0.0).any():
         return None
     gram = (A / size).T @ (A / size)
-    if np.linalg.cond(gram) > _WORST_CONDITION:
+    if np.linalg.cond(gram) > _MAX_CONDITION_NUMBER:
         return None
     inverse = np.linalg.inv(gram)
     x = inverse @ ((A / size).T @ b)

@@ -39,7 +39,7 @@ from drake_teleop.logs.dataset.dataset_files import (
     open_dataset,
     write_copy,
 )
-from drake_teleop.logs.dataset.episode_faults import Finding, name_faults, saturated_channels
+from drake_teleop.logs.dataset.episode_faults import EpisodeFault, name_faults, saturated_channels
 from drake_teleop.logs.dataset.episode_verdict import (
     HALF_WIDTH_OF_NORMAL,
     EpisodeSignals,
@@ -64,7 +64,7 @@ from drake_teleop.logs.read.reading import read_description
 
 _MAX_CALIBRATION_EPISODES = 24  # episodes that determine load, lag and noise
 _MAX_DRAFTED_EPISODES, _MAX_CORRECTIONS = 3, 5
-_STREAMS = ("wrench", "imu", "pose")
+_STREAM_NAMES = ("wrench", "imu", "pose")
 _MAX_EXCESS_SPREAD = 1.5  # log spread beyond the usual one that no hypothesis explains
 _CONTACT_MARGIN_FRAMES, _MIN_FREE_FRAMES = (
     2,
@@ -74,7 +74,7 @@ _WORK_FOLDER_NAME = "unfinished"
 
 
 class EpisodeTask(NamedTuple):
-    """Input for the verdict of an episode."""
+    """Data that the verdicts of all episodes share."""
 
     dataset: Dataset
     streams: dict[str, Any]
@@ -103,22 +103,24 @@ def dataset_command(
     """
     if (load is None) != identify:
         raise DrakeTeleopError(
-            "needs one of --load and --identify", where="dataset", remedy="give one of them"
+            "exactly one of --load and --identify is required", where="dataset", remedy="give one"
         )
     known = None if load is None else Identification.load(load)
     dataset, copied = open_dataset(path), out / path.resolve().name
     if path.resolve() in (out.resolve(), copied.resolve(), *out.resolve().parents):
         raise DrakeTeleopError(
-            "is in the dataset, which is never changed", where=str(out), remedy="give another --out"
+            "the output folder is in the dataset, which must not change",
+            where=str(out),
+            remedy="give another --out",
         )
     make_folder(out)
     with output_folder(out), show_progress(not quiet) as stage, one_blas_thread():
         streams = _described_or_drafted_streams(dataset, description)
-        work = _work_folder(out, dataset, [str(load), known, streams])
+        work = _open_work_folder(out, dataset, [str(load), known, streams])
         shared = _estimate_shared_load(dataset, streams, known, stage("load"))
         task = EpisodeTask(dataset, streams, shared)
         rows = _judge_all_episodes(task, work, jobs, stage("episodes"))
-        columns = [_read_columns(work / f"{k}.npy") for k in range(len(rows))]
+        columns = [_read_new_columns(work / f"{k}.npy") for k in range(len(rows))]
         write_copy(dataset, copied, columns)
         write_text(out / "description.yaml", to_yaml_text(streams))
         shared.identification.save(out / "identification.json")
@@ -140,9 +142,9 @@ def _described_or_drafted_streams(dataset: Dataset, description: Path | None) ->
     data = read_yaml(description)
     if not isinstance(data, dict) or not isinstance(data.get("wrench"), dict):
         raise DrakeTeleopError(
-            "has no wrench", where=str(description), remedy="see docs/log-description.md"
+            "describes no wrench", where=str(description), remedy="see docs/log-description.md"
         )
-    for name in _STREAMS:
+    for name in _STREAM_NAMES:
         if isinstance(data.get(name), dict):
             data[name].pop("file", None)
     _description_of_episode(data, dataset.episodes[0], dataset.fps)  # report errors before the work
@@ -151,7 +153,7 @@ def _described_or_drafted_streams(dataset: Dataset, description: Path | None) ->
 
 def _description_of_episode(streams: dict[str, Any], episode: Episode, fps: float) -> Description:
     data = copy.deepcopy(streams)
-    for name in _STREAMS:
+    for name in _STREAM_NAMES:
         if name in data:
             time = {"rate": fps} if np.isfinite(fps) else {"column": "timestamp"}
             data[name] = {"file": episode.file, "time": time} | data[name]
@@ -190,7 +192,7 @@ def _choose_quaternion_order_and_sign(
         loads = []
         for episode in episodes:
             with suppress(DrakeTeleopError):
-                log, _ = _episode_log(dataset, tried, episode)
+                log, _ = _read_log(dataset, tried, episode)
                 loads.append(load_of_episode(EpisodeSignals(log)))
         if loads:
             spread = float(np.median([x.spread.sum() for x in loads]))
@@ -238,7 +240,7 @@ def _remove_file_names(draft: Draft, fps: float) -> dict[str, Any]:
     return streams
 
 
-def _episode_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tuple[Log, Array]:
+def _read_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) -> tuple[Log, Array]:
     """Return the log of an episode, and the times (N,) of its rows on the log's clock [s]."""
     table, described = (
         dataset.read_episode(episode),
@@ -249,7 +251,7 @@ def _episode_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) ->
     log = read_description(described, source, tables=tables, differentiate=False)
     if log.posed is None and log.R_WS is None:
         raise DrakeTeleopError(
-            "has no orientation", where=source, remedy="describe a pose with an orientation"
+            "the episode has no orientation", where=source, remedy="describe pose.orientation"
         )
     assert described.wrench is not None
     clock = read_clock(described.wrench.time, table, described.wrench.columns, source)
@@ -257,7 +259,7 @@ def _episode_log(dataset: Dataset, streams: dict[str, Any], episode: Episode) ->
     return log, at
 
 
-def _work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
+def _open_work_folder(out: Path, dataset: Dataset, settings: list[Any]) -> Path:
     files = sorted({episode.file for episode in dataset.episodes})
     states = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     key = hashlib.sha256(repr((settings, states)).encode()).hexdigest()
@@ -276,7 +278,7 @@ def _estimate_shared_load(
     logs, errors = [], []
     for k, episode in enumerate(dataset.episodes[::step]):
         try:
-            logs.append(_episode_log(dataset, streams, episode)[0])
+            logs.append(_read_log(dataset, streams, episode)[0])
         except DrakeTeleopError as error:
             errors.append(error)
         progress(0.5 * (k + 1) * step / len(dataset.episodes))
@@ -317,19 +319,19 @@ def _judge_episode(task: EpisodeTask, work: Path, number: int) -> None:
     write_json(work / f"{number}.json", to_plain_values({"episode": episode.name} | row))
 
 
-def _read_columns(path: Path) -> NewColumns:
+def _read_new_columns(path: Path) -> NewColumns:
     values = np.load(path, allow_pickle=False)
     return NewColumns(values[:, :6], values[:, 6] > 0.5)
 
 
 def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, Any], NewColumns]:
     shared = task.shared
-    log, at = _episode_log(task.dataset, task.streams, episode)
+    log, at = _read_log(task.dataset, task.streams, episode)
     signals = EpisodeSignals(log)
     predict = signals.reading_predictor(shared.phi)
     found = find_hypothesis(predict, signals.regressor_at_lag, shared.lag, shared.typical)
     residual = unexplained_reading(found, predict, signals.regressor_at_lag)
-    faults: list[Finding] = saturated_channels(log.wrench)
+    faults: list[EpisodeFault] = saturated_channels(log.wrench)
     faults += name_faults(found, shared.lag, shared.phi, 1.0 / log.dt)
     offsets = np.tile(found.offsets, (len(residual), 1))
     step = find_offset_step(residual, found.spread)
@@ -338,14 +340,14 @@ def _verdict_on_episode(task: EpisodeTask, episode: Episode) -> tuple[dict[str, 
         offsets[:k], offsets[k:] = before, after
         change = ", ".join(f"{x:.3g}" for x in after - before)
         text = f"the offsets change by [{change}] N, N m at {log.t[k]:.2f} s"
-        faults.append(Finding("tared", text, float(log.t[k])))
+        faults.append(EpisodeFault("tared", text, float(log.t[k])))
     spread = spread_and_centre_of_calm_half(residual - offsets, 0.1 * shared.typical)[0] - np.log(
         shared.typical
     )
     spread -= np.log(found.gain).repeat(3)
     if not faults and spread.mean() > _MAX_EXCESS_SPREAD:
         text = "no single fault explains the wrench: it is in contact most of the time, or the load"
-        faults.append(Finding("unexplained", f"{text} changes", None))
+        faults.append(EpisodeFault("unexplained", f"{text} changes", None))
     contact, touched = _contact_wrench_and_flags(shared, signals, found, residual - offsets)
     rows = np.array([np.interp(at, log.t, x) for x in contact.T]).T
     nearest = np.clip(np.round((at - log.t[0]) / log.dt).astype(int), 0, len(log) - 1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
 from drake_teleop.common.files import make_folder, whole_file, write_table
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.array_files import import_optional, read_hdf5, read_zarr
+from drake_teleop.logs.read.array_files import import_optional_module, read_hdf5, read_zarr
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.table_files import columns_with_nested, read_table
@@ -32,7 +32,7 @@ _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
 class Episode(NamedTuple):
-    """Rows of one episode in a file; `group` is that of an HDF5 file."""
+    """Episode: file, first row, number of rows (0: the whole file), and group in an HDF5 file."""
 
     name: str
     file: Path
@@ -57,7 +57,6 @@ class Dataset(NamedTuple):
     fps: float
 
     def read_episode(self, episode: Episode) -> Table:
-        """Return the columns of an episode."""
         if self.kind == "tables":
             return read_table(episode.file)
         rows = slice(episode.first, episode.first + episode.rows)
@@ -86,7 +85,6 @@ def _with_element_columns(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
 
 
 def open_dataset(path: Path) -> Dataset:
-    """Return the episodes of a dataset."""
     if not path.exists():
         raise DrakeTeleopError("no such file or folder", where=str(path), remedy="check the path")
     with wrap_read_errors(path, "check that the dataset is complete"):
@@ -127,7 +125,7 @@ def _open_lerobot(path: Path) -> Dataset:
 def _open_hdf5(path: Path) -> Dataset:
     names: list[str] = []
     settings: dict[str, Any] = {}
-    with import_optional("h5py", path).File(path, "r") as file:
+    with import_optional_module("h5py", path).File(path, "r") as file:
         if "data" in file:
             data = file["data"]
             names = sorted(data, key=lambda name: (len(name), name))
@@ -234,7 +232,7 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
     head = first - 2
     if len(rows) != len(frame) or len(frame) != len(new.in_contact) or head < 0:
         raise DrakeTeleopError(
-            "its lines are not the rows of a table with names",
+            "columns can only be added to a file with a header and one line for each row",
             where=str(path),
             remedy="convert it to Parquet",
         )
@@ -253,7 +251,7 @@ def _write_csv(path: Path, target: Path, new: NewColumns) -> None:
 
 
 def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> None:
-    h5py = import_optional("h5py", dataset.path)
+    h5py = import_optional_module("h5py", dataset.path)
     make_folder(out.parent)
     with whole_file(out) as temporary:
         shutil.copyfile(dataset.path, temporary)
@@ -268,7 +266,7 @@ def _write_hdf5(dataset: Dataset, out: Path, columns: Sequence[NewColumns]) -> N
 
 
 def _write_zarr(out: Path, columns: Sequence[NewColumns]) -> None:
-    zarr = import_optional("zarr", out)
+    zarr = import_optional_module("zarr", out)
     group, new = zarr.open_group(out / "data", mode="r+"), _join_columns(columns)
     for name, values in zip(("contact_wrench", "in_contact"), new, strict=True):
         array = values.astype(np.float32 if values.ndim == 2 else bool)

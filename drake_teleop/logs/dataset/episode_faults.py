@@ -11,17 +11,17 @@ from drake_teleop.logs.dataset.episode_verdict import Hypothesis
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.logs.read.description_fields import FORCE_UNITS, SI_VALUE_OF_UNIT, TORQUE_UNITS
 
-_UNITS = (
+_UNITS_OF_QUANTITIES = (
     ("force", "N", set(FORCE_UNITS) - {"N"}),
     ("torque", "N m", set(TORQUE_UNITS) - {"N m", "N mm"}),  # N mm equals mN m
 )
 _UNIT_TOLERANCE, _SMALLEST_GAIN = 0.04, 0.06
 _MIN_ROTATION_DEG = 4.0
-_SMALLEST_LAG = 0.6  # frames
-_FEWEST_SATURATED = 4
+_MIN_LAG_FRAMES = 0.6  # frames
+_MIN_SATURATED_FRAMES = 4
 
 
-class Finding(NamedTuple):
+class EpisodeFault(NamedTuple):
     """Named fault with its description and figures."""
 
     name: str
@@ -29,21 +29,21 @@ class Finding(NamedTuple):
     value: Any
 
 
-def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> list[Finding]:
-    """Return the deviations of a hypothesis from the usual description by name.
+def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> list[EpisodeFault]:
+    """Return the faults of an episode that a hypothesis contains.
 
-    `known` (10,) is the known load.
+    `usual_lag` [frames] is that of other episodes, `known` (10,) the usual load.
     """
     if x.phi is not None:
         mass = float(x.phi[0])
         text = f"the load is another one: {mass:.3g} kg instead of {known[0]:.3g} kg"
-        return [Finding("tool changed", text, x.phi.tolist())]
+        return [EpisodeFault("tool changed", text, x.phi.tolist())]
     found = []
     if x.kind == "base":
-        found.append(Finding("frame", "the wrench is in the axes of the base", "base"))
+        found.append(EpisodeFault("frame", "the wrench is in the axes of the base", "base"))
     if x.kind == "weight removed":
         text = "the robot has already removed the load's weight from the wrench"
-        found.append(Finding("weight removed", text, None))
+        found.append(EpisodeFault("weight removed", text, None))
     found += _rotation_findings(
         x.force, "the wrench" if np.allclose(x.force, x.torque) else "the force"
     )
@@ -51,58 +51,58 @@ def name_faults(x: Hypothesis, usual_lag: float, known: Array, fps: float) -> li
         found += _rotation_findings(x.torque, "the torque")
     found += _unit_findings(x.gain)
     late = x.lag - usual_lag
-    if abs(late) >= _SMALLEST_LAG:
+    if abs(late) >= _MIN_LAG_FRAMES:
         side = "behind" if late > 0 else "ahead of"
         text = f"the motion is {abs(late):.1f} frames ({abs(late) / fps:.3f} s) {side} the wrench"
-        found.append(Finding("lag", f"{text}, compared with the other episodes", late))
+        found.append(EpisodeFault("lag", f"{text}, compared with the other episodes", late))
     return found
 
 
-def _rotation_findings(M: Array, what: str) -> list[Finding]:
+def _rotation_findings(M: Array, what: str) -> list[EpisodeFault]:
     from scipy.spatial.transform import Rotation
 
     single = np.flatnonzero(np.diag(M) < 0)
     if np.allclose(np.abs(M), np.eye(3)) and len(single) == 1:
         text = f"axis {'xyz'[single[0]]} of {what} is reversed"
-        return [Finding("sign", text, np.diag(M).tolist())]
+        return [EpisodeFault("sign", text, np.diag(M).tolist())]
     found = []
     if np.linalg.det(M) < 0:
-        found.append(Finding("sign", f"{what} is negated", -1))
+        found.append(EpisodeFault("sign", f"{what} is negated", -1))
         M = -M
     turn = Rotation.from_matrix(M).as_rotvec(degrees=True)
     angle = float(np.linalg.norm(turn))
     if angle > _MIN_ROTATION_DEG:
         axis = ", ".join(f"{a:.2g}" for a in turn / angle)
         text = f"{what} is turned by {angle:.3g} deg about [{axis}] of S"
-        found.append(Finding("frame", text, M.tolist()))
+        found.append(EpisodeFault("frame", text, M.tolist()))
     return found
 
 
-def _unit_findings(gain: Array) -> list[Finding]:
+def _unit_findings(gain: Array) -> list[EpisodeFault]:
     found = []
-    for factor, (what, si, names) in zip(gain, _UNITS, strict=True):
+    for factor, (what, si, names) in zip(gain, _UNITS_OF_QUANTITIES, strict=True):
         if abs(factor - 1.0) < _SMALLEST_GAIN:
             continue
         unit = min(names, key=lambda name: abs(np.log(factor * SI_VALUE_OF_UNIT[name])))
         near = abs(factor * SI_VALUE_OF_UNIT[unit] - 1.0) < _UNIT_TOLERANCE
         text = f"the {what} is {factor:.4g} times that in {si}"
-        found.append(Finding("unit", text + (f": its unit is {unit}" if near else ""), factor))
+        found.append(EpisodeFault("unit", text + (f": its unit is {unit}" if near else ""), factor))
     return found
 
 
-def saturated_channels(wrench: Array) -> list[Finding]:
+def saturated_channels(wrench: Array) -> list[EpisodeFault]:
     """Return a finding for channels of a wrench (N, 6) that stay at an end of their range."""
     names = []
     for name, x in zip(WRENCH_COLUMNS, wrench.T, strict=True):
         if x.min() == x.max():
-            return [Finding("dead channel", f"{name} is {x[0]:.4g} in all frames", name)]
+            return [EpisodeFault("dead channel", f"{name} is {x[0]:.4g} in all frames", name)]
         starts = np.flatnonzero(np.diff(x, prepend=np.nan))
         lengths, values = np.diff(starts, append=len(x)), x[starts]
         ends = (values == x.max()) | (values == x.min())
         longest = int(lengths[ends].max())
-        if longest >= max(_FEWEST_SATURATED, 2 * int(lengths[~ends].max(initial=0))):
+        if longest >= max(_MIN_SATURATED_FRAMES, 2 * int(lengths[~ends].max(initial=0))):
             names.append(f"{name} for {longest} frames")
     if not names:
         return []
     text = f"channels stay at the end of their range: {', '.join(names)}"
-    return [Finding("saturated", text, names)]
+    return [EpisodeFault("saturated", text, names)]

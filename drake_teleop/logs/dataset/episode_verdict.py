@@ -37,7 +37,7 @@ _COST_PER_DEVIATION, _COST_FRAMES = (
     40.0,
 )  # required reduction of the log spread, for each deviation
 _NUM_START_PARTS = 4
-_FLOOR_SHARE = 0.3
+_MIN_SPREAD_SHARE = 0.3
 _INLIER_DEVIATIONS, _STEP_DEVIATIONS = 5.0, 5.0
 _FEWEST_STEP_FRAMES, _STEP_SHARE, _NUM_TRIED_STEPS = 12, 0.12, 20
 _NOISE_MARGIN = 1.5
@@ -53,7 +53,7 @@ class Hypothesis:
     """Explanation of an episode's wrench.
 
     Attributes:
-        kind: one of `KINDS`.
+        kind: one of `HYPOTHESIS_KINDS`.
         lag: delay of the motion behind the wrench [frames].
         force, torque: (3, 3) rotation or mirroring of the load's force and torque.
         gain: (2,) factors of force and torque.
@@ -79,18 +79,17 @@ class Hypothesis:
         return np.hstack([self.gain[0] * f @ self.force.T, self.gain[1] * tau @ self.torque.T])
 
     def wrench_of_reading(self, wrench: Array) -> Array:
-        """Invert `apply`: map readings (N, 6) without offsets to wrenches in S [N, N m]."""
+        """Invert `reading_of_load`: map readings (N, 6) without offsets to wrenches in S."""
         f, tau = wrench[:, :3] @ self.force, wrench[:, 3:] @ self.torque
         return np.hstack([f / self.gain[0], tau / self.gain[1]])
 
 
 def hypothesis_without_fault(lag: float) -> Hypothesis:
-    """Return the hypothesis without a fault."""
     return Hypothesis("sensor", lag, np.eye(3), np.eye(3), np.ones(2))
 
 
 def spread_and_centre_of_calm_half(residual: Array, floor: Array) -> tuple[Array, Array]:
-    """Return log half widths (6,) of the narrowest half of residuals (N, 6), and its centres."""
+    """Return log half widths (6,), at least log `floor`, and centres of half of the residuals."""
     widths, centres = narrowest_half(residual)
     return np.log(np.maximum(0.5 * widths, floor)), centres
 
@@ -104,7 +103,7 @@ def find_hypothesis(
         usual_lag: lag of the other episodes [frames].
         typical: (6,) half widths of the residual of other episodes [N, N m].
     """
-    search = HypothesisSearch(predict, regress, usual_lag, _FLOOR_SHARE * typical)
+    search = HypothesisSearch(predict, regress, usual_lag, _MIN_SPREAD_SHARE * typical)
     usual = search.with_spread_and_cost(hypothesis_without_fault(usual_lag))
     if usual.spread.sum() - np.log(typical).sum() < search.price:
         return usual
@@ -125,7 +124,7 @@ def find_hypothesis(
 
 
 def unexplained_reading(x: Hypothesis, predict: PredictReading, regress: RegressorAtLag) -> Array:
-    """Return the part (N, 6) of the reading that is not from the load, with offsets."""
+    """Return the reading (N, 6) without the load's part by a hypothesis; offsets remain."""
     wrench, load_wrench = predict(x.kind, x.lag)
     if x.phi is not None:
         return np.asarray(wrench - regress(x.lag) @ x.phi)
@@ -133,7 +132,7 @@ def unexplained_reading(x: Hypothesis, predict: PredictReading, regress: Regress
 
 
 class HypothesisSearch:
-    """Hypotheses for one episode; arguments as for `find_hypothesis`, `floor` (6,) of spreads."""
+    """Search for the best hypothesis of an episode; `floor` (6,) is the least half width."""
 
     def __init__(
         self, predict: PredictReading, regress: RegressorAtLag, usual_lag: float, floor: Array
@@ -147,7 +146,6 @@ class HypothesisSearch:
         return unexplained_reading(x, self.predict, self.regress)
 
     def with_spread_and_cost(self, x: Hypothesis) -> Hypothesis:
-        """Return the hypothesis with its spread, offsets and cost."""
         spread, offsets = spread_and_centre_of_calm_half(self._reading_residual(x), self.floor)
         cost = float(spread.sum()) + self.price * _weighted_number_of_deviations(x, self.usual_lag)
         return replace(x, spread=spread, offsets=offsets, cost=cost)
@@ -176,7 +174,7 @@ class HypothesisSearch:
                 )
 
     def best_permutation(self, w: Array, p: Array, channels: slice) -> Array:
-        """Return the signed permutation with the least spread of three channels."""
+        """Return the signed permutation (3, 3) with which p fits three channels of w best."""
         w, p, floor = w[:, channels], p[:, channels], self.floor[channels]
         pairs = w[:, :, None, None] - np.multiply.outer(p, [1.0, -1.0])[:, None]
         spread = spread_and_centre_of_calm_half(pairs.reshape(len(w), -1), np.repeat(floor, 6))[
@@ -189,7 +187,7 @@ class HypothesisSearch:
         return np.asarray(_SIGNED_PERMUTATIONS[int(np.argmin(costs))])
 
     def start_rows(self) -> Iterator[NDArray[np.bool_]]:
-        """Yield flags (N,) of all frames and of parts, of which one may be without contact."""
+        """Yield flags (N,) of frames for a first fit: all, then each quarter of the episode."""
         at = np.arange(self.frames) * _NUM_START_PARTS // self.frames
         yield at >= 0
         for part in range(_NUM_START_PARTS):
@@ -198,7 +196,7 @@ class HypothesisSearch:
     def refit_to_best_rows(self, x: Hypothesis, *, det: float, scale: bool) -> Hypothesis:
         """Return the hypothesis with rotation and factors fitted to the best rows.
 
-        The determinant of the fitted rotation is `det`; 0 keeps the rotation.
+        The determinant of the fitted rotation is `det`; 0 keeps the rotation. `scale` fits factors.
         """
         found = [self._fit_to_rows(x, rows, det, scale) for rows in self.start_rows()]
         return min(found, key=lambda x: x.cost)
@@ -245,7 +243,7 @@ class HypothesisSearch:
         return x
 
     def best_lag(self, x: Hypothesis) -> float:
-        """Return the lag with the least spread of a hypothesis."""
+        """Return the lag [frames] with the least spread of a hypothesis."""
         lag, reach = self.usual_lag, float(MAX_LAG_FRAMES)
         for step in (0.5, 1.0 / LAG_STEPS_PER_FRAME):
             lags = lag + np.arange(-reach, reach + 0.5 * step, step)
@@ -254,7 +252,7 @@ class HypothesisSearch:
         return lag
 
     def lag_of_linear_fit(self, kind: str) -> float:
-        """Return the lag with which a linear map of the load's wrench fits best."""
+        """Return the lag [frames] with which a linear map of the load's wrench fits best."""
         lags = self.usual_lag + np.arange(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 0.1, 0.25)
         lag, rows = self.usual_lag, np.ones(self.frames, bool)
         for _ in range(2):
@@ -280,7 +278,7 @@ def _rows_of_smallest_residual(residual: Array) -> NDArray[np.bool_]:
 
 
 def _fit_rotation(w: Array, p: Array, gain: Array, det: float) -> Array:
-    """Return the M (3, 3) with a determinant that minimises |w - gain M p|, both scaled."""
+    """Return the orthogonal M (3, 3) with determinant `det` that minimises |w - gain M p|."""
     H = np.zeros((3, 3))
     for channels, factor in zip((_FORCE, _TORQUE), gain, strict=True):
         size = factor * np.linalg.norm(p[:, channels]) + 1e-12
@@ -301,12 +299,12 @@ def _weighted_number_of_deviations(x: Hypothesis, usual_lag: float) -> float:
     count = float(x.kind != "sensor") + float(abs(x.lag - usual_lag) > 1e-9)
     if x.phi is not None:
         return count + 4.0
-    count += _weight_of_rotation(x.force) + float(not np.allclose(x.force, x.torque))
+    count += _rotation_cost(x.force) + float(not np.allclose(x.force, x.torque))
     scaled = x.gain != 1.0
     return count + float(scaled[0]) + float(scaled[1])
 
 
-def _weight_of_rotation(M: Array) -> float:
+def _rotation_cost(M: Array) -> float:
     if np.allclose(np.abs(M), np.eye(3)):
         return 0.0 if M.trace() > 2.9 else 1.0
     return 1.5 if np.allclose(np.abs(M).max(axis=0), 1.0) else 2.5
@@ -384,7 +382,6 @@ class EpisodeSignals:
         self._fine = self.motion(log.t[0] + grid * log.dt)
 
     def motion(self, t: Array) -> Motion:
-        """Return the motion at times t (N,) [s]."""
         log = self.log
         if self._splines is None or log.posed is None:
             assert log.gravity is not None and log.R_WS is not None
@@ -397,7 +394,7 @@ class EpisodeSignals:
         return Motion(*self._splines.motion(t, g), self._splines.gravity(t, g), R)
 
     def motion_at_lag(self, lag: float) -> Motion:
-        """Return the motion (N, ...) at the frames, `lag` frames later."""
+        """Return the motion (N, ...) `lag` frames after each frame."""
         step = round((lag + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME)
         if (
             abs(step - (lag + _MARGIN_FRAMES) * LAG_STEPS_PER_FRAME) < 1e-6
@@ -408,11 +405,13 @@ class EpisodeSignals:
         return self.motion(self.log.t + lag * self.log.dt)
 
     def regressor_at_lag(self, lag: float) -> Array:
-        """Return the regressor V (N, 6, 10), with the motion `lag` frames later."""
         return regressor(*self.motion_at_lag(lag)[:3])
 
     def reading_predictor(self, phi: Array) -> PredictReading:
-        """Return reading and wrench of a load phi (10,) as a function of kind and lag [frames]."""
+        """Return a function of kind (`HYPOTHESIS_KINDS`) and lag [frames].
+
+        It returns the reading in the axes of S, and the wrench of load phi (10,) to compare with.
+        """
 
         @cache
         def predict_reading(kind: str, lag: float) -> tuple[Array, Array]:

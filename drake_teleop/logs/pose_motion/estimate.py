@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.imu_rows import compare_imu
+from drake_teleop.logs.pose_motion.imu_rows import correct_imu_data
 from drake_teleop.logs.pose_motion.linear_model import (
     MAX_DELAY_CHANGE_S,
     FitWindow,
@@ -58,19 +58,19 @@ _MAX_FREQUENCY_OVER_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
 _MIN_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
 _MIN_INSTANTS, _MIN_INSTANTS_WITH_KNOWN_LOAD = 100, 32
-_NEGLIGIBLE = 1e-3
-_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_NEGLIGIBLE_EFFECT = 1e-3
+_IDENTITY_ROTATION = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PoseFrame:
     """Estimated frame P of the recorded poses, relative to the sensor frame S.
 
     Attributes:
         p_SoPo_S: (3,) origin of P from So, in S [m].
         R_SP: (3, 3) rotation from axes of P to those of S.
         position_deviations: (3,) standard deviations of the origin [m]; inf if undetermined.
-        turn_deviations_deg: (3,) those of rotations about the axes of S [deg].
+        turn_deviations_deg: (3,) standard deviations of R_SP about the axes of S [deg].
         shifted, turned: whether origin, axes differ significantly from the description.
     """
 
@@ -95,7 +95,7 @@ class PoseMotion:
     """Motion from splines of poses, with knots and delay that fit a wrench best.
 
     Attributes:
-        splines: on the wrench's clock.
+        splines: splines of the poses, on the wrench's clock.
         delay_s, delay_deviation: delay of the motion behind the wrench, and its standard deviation
             [s]; inf if undetermined.
         clock_rate: relative rate error of the poses' clock, such as 5e-5; 0 if insignificant.
@@ -127,7 +127,7 @@ class PoseEstimate(PoseMotion):
     """
 
     fit: RigidFit
-    frame: Frame
+    frame: PoseFrame
     free: RigidFit
     seen: UnitsAndAxes
     t: Array
@@ -151,7 +151,7 @@ def estimate_from_poses(
     gravity_W: ArrayLike,
     *,
     p_SoPo_S: ArrayLike | None = (0.0, 0.0, 0.0),
-    R_SP: ArrayLike | None = _IDENTITY,
+    R_SP: ArrayLike | None = _IDENTITY_ROTATION,
     delay: float | None = None,
     gain: float = 0.0,
     lost: NDArray[np.bool_] | None = None,
@@ -220,7 +220,7 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: ImuData | None = None,
 ) -> PoseMotion:
-    """Return the motion from poses of S with which an identified load fits a wrench best."""
+    """Return the motion from poses of S with which a load (6, 16), Eq. (T73), fits best."""
     with one_blas_thread():
         motion, last, _ = _find_motion(
             *(t, wrench, poses, gravity_W, delay, lost, imu),
@@ -249,10 +249,11 @@ def _find_motion(
     grid, poses = WrenchGrid.from_samples(t, wrench, load), poses.with_continuous_quaternions()
     known, guess = delay is not None, delay or 0.0
     taper = _base_taper(grid, poses, lost, guess)
-    if (taper > 0.5).sum() < fewest:
+    usable = int((taper > 0.5).sum())
+    if usable < fewest:
         raise DrakeTeleopError(
-            "wrench and poses have too little in common",
-            remedy="record longer, without interruptions",
+            f"wrench and poses share {usable} instants, {grid.dt:.2g} s apart ({fewest} required)",
+            remedy="record both at the same time, longer, without interruptions",
         )
     top = min(
         MAX_FREQUENCY_HZ,
@@ -276,13 +277,13 @@ def _find_motion(
         cache = splines_of_averaged_poses(near_poses)
     choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:
-        imu_rows = compare_imu(PoseSplines(near_poses, imu_spacing), imu, gravity)
+        imu_rows = correct_imu_data(PoseSplines(near_poses, imu_spacing), imu, gravity)
         agrees = imu_rows is not None
         choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
     chosen, spacing, late = choose_knot_spacing(part, choices, late, known=known)
     imu_rows = chosen.imu_rows
     if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
-        imu_rows = compare_imu(PoseSplines(poses, imu_spacing), imu, gravity)
+        imu_rows = correct_imu_data(PoseSplines(poses, imu_spacing), imu, gravity)
     last = part.spectra_at_delay(chosen.splines_with_spacing(spacing), late)
     splines = PoseSplines(poses, spacing, imu_rows)
     return PoseMotion(splines, last.delay, np.inf, rate, agrees), last, whole
@@ -343,7 +344,7 @@ def _start_with_free_frame(
     return RigidParameters(np.zeros(16), fit.state.tau, R @ start.R.T @ start.r, R)
 
 
-def _estimate_frame(free: RigidFit, start: RigidParameters) -> Frame:
+def _estimate_frame(free: RigidFit, start: RigidParameters) -> PoseFrame:
     R_SP, r = free.state.R.T, free.state.r
     origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]
@@ -353,7 +354,7 @@ def _estimate_frame(free: RigidFit, start: RigidParameters) -> Frame:
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NEGLIGIBLE
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NEGLIGIBLE_EFFECT
         deviations = np.where(lost, np.inf, deviations)
     moved = free.state.r - start.r
     turned = Rotation.from_matrix(start.R.T @ free.state.R).as_rotvec()
@@ -362,7 +363,7 @@ def _estimate_frame(free: RigidFit, start: RigidParameters) -> Frame:
     limits = np.radians([MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG])
     shifted = _is_significant(moved, covariance[:3, :3], MIN_SHIFT, MAX_SHIFT_DEVIATION)
     tilted = _is_significant(turned, covariance[3:, 3:], *limits)
-    return Frame(
+    return PoseFrame(
         p_SoPo_S=origin,
         R_SP=R_SP,
         position_deviations=deviations,

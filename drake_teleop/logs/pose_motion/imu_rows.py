@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.poses import ImuData
-from drake_teleop.logs.pose_motion.spectra import Complex, end_taper, exclude_from_taper
+from drake_teleop.logs.pose_motion.spectra import ComplexArray, end_taper, exclude_from_taper
 from drake_teleop.logs.pose_motion.splines import ImuSplineRows, PoseSplines
 
 _PRIOR_GAIN_STD = 0.1
@@ -34,7 +34,7 @@ class _SensorModel:
         return np.asarray(np.linalg.solve(np.eye(3) + self.D, (y - self.b).T).T)
 
 
-def compare_imu(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
+def correct_imu_data(splines: PoseSplines, imu: ImuData, gravity_W: Array) -> ImuSplineRows | None:
     """Return IMU data corrected to fit splines of poses, or None if the two do not agree."""
     powers = tuple(std**2 / splines.rate for std in splines.estimate_pose_noise())
     averaged, sensors = imu.average_to_rate(_COMPARISON_RATE_HZ), []
@@ -73,7 +73,10 @@ def _fit_sensor(
     which: int,
     pose_noise: tuple[float, int],
 ) -> _SensorModel | None:
-    """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y."""
+    """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y.
+
+    `which` is 0 for an accelerometer, 1 for a gyroscope.
+    """
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)
     even = t[0] + dt * np.arange(place[-1] + 1)
@@ -88,7 +91,7 @@ def _fit_sensor(
     noise: NDArray[np.floating] = pose_noise[0] * (2.0 * np.pi * frequency[used]) ** pose_noise[1]
     energy = float(np.sum(taper**2)) / dt
 
-    def tapered_spectrum(x: Array) -> Complex:
+    def tapered_spectrum(x: Array) -> ComplexArray:
         return np.asarray(np.fft.rfft(x * taper[:, None], axis=0)[used], np.complex128)
 
     # Third differences remove the motion; the squares of 1, 3, 3, 1 add up to 20.
@@ -105,9 +108,9 @@ def _fit_sensor(
         if step == 0:
             power = max(power, float(np.median(np.abs(Y - X) ** 2)) / energy)
         weight = 1.0 / np.sqrt(energy * (noise + power))
-        D, b, shift = _least_squares(Y - X, X, one, change, weight)
+        D, b, shift = _fit_sensor_parameters(Y - X, X, one, change, weight)
         residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
-        power = _noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
+        power = _estimate_noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
         tau += shift
         if abs(tau) > _MAX_SHIFT_S:
             return None
@@ -119,8 +122,8 @@ def _fit_sensor(
     return _SensorModel(D, b, tau, power)
 
 
-def _least_squares(
-    y: Complex, X: Complex, one: Complex, change: Complex, weight: Array
+def _fit_sensor_parameters(
+    y: ComplexArray, X: ComplexArray, one: ComplexArray, change: ComplexArray, weight: Array
 ) -> tuple[Array, Array, float]:
     K = len(y)
     columns = np.zeros((K, 3, 13), complex)
@@ -136,7 +139,7 @@ def _least_squares(
     return found[:9].reshape(3, 3), found[9:12], float(found[12])
 
 
-def _noise_power(
+def _estimate_noise_power(
     residual: NDArray[np.floating], pose_noise: NDArray[np.floating], white: float
 ) -> float:
     power = max(float(np.median(residual)), white)

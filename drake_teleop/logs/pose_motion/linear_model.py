@@ -12,12 +12,12 @@ from drake_teleop.common.numeric import Array, parabola_minimum
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.spectra import (
     FORCE_COLUMNS,
-    Complex,
+    ComplexArray,
     FrequencyBands,
     NoiseLevels,
     WrenchGrid,
     end_taper,
-    frequency_bands,
+    make_frequency_bands,
     random_walk_shape,
     second_moments,
     shift_spectrum,
@@ -37,10 +37,10 @@ TRIED_KNOT_SPACINGS_S = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
 """Knot distances that are tried first; then two between the best and its neighbours [s]."""
 MAX_DELAY_CHANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
-ROUNDING = 1e-7
+ROUNDING_SHARE = 1e-7
 """Least noise of a channel relative to the wrench."""
 _COARSE_STEP_S, _FINE_STEP_S, _FINEST_STEP_S = 0.016, 1e-3, 1e-5
-_ITERATIONS = 4
+_FIT_ITERATIONS = 4
 _SEARCH_RATE_HZ = 125.0
 _RANK_TOLERANCE, _FULL_RANK_TOLERANCE = 1e-12, 1e-8
 # Corners of a wandering offset [Hz], and least reduction of a channel's cost.
@@ -54,7 +54,7 @@ class LinearFit:
     """Fit of the wrench by free coefficients of 16 signals of the motion.
 
     Attributes:
-        coefficients: (6, 16); zero for constant signals.
+        coefficients: (6, 16); 0 for signals that are 0.
         covariance: (6, 16, 16) of the rows of coefficients.
         power: (bands, 6) mean noise power.
         costs: (6,) negative log likelihood of each channel.
@@ -101,7 +101,7 @@ def _fit_moments(
     power = np.maximum(ff / levels.sizes[:, None], floor).mean(axis=-2, keepdims=True)
     power = np.broadcast_to(power, (*zf.shape[:-2], 6))
     flat = zz.reshape(*zz.shape[:-2], -1)
-    for _ in range(_ITERATIONS):
+    for _ in range(_FIT_ITERATIONS):
         weight = 1.0 / power
         gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, *zz.shape[-2:])
         right = np.swapaxes(np.sum(zf * weight[..., None, :], axis=-3), -1, -2)
@@ -140,11 +140,11 @@ def rounding_error_power(Z: Array, sizes: Array) -> Array:
 def _rounding_power(ff: Array, sizes: Array) -> Array:
     power = ff.sum(axis=0) / sizes.sum()
     both = power.reshape(2, 3).sum(axis=1).repeat(3)
-    return np.maximum(ROUNDING**2 * both, 1e-60)
+    return np.maximum(ROUNDING_SHARE**2 * both, 1e-60)
 
 
 def fit_noise_levels(Z: Array, of: FrequencyBands) -> NoiseLevels:
-    """Return noise levels with the drift of lowest cost in each wrench channel, Eq. (T74)."""
+    """Return noise levels with the drift spectrum that fits each wrench channel best, Eq. (T74)."""
     levels = NoiseLevels.white_within_groups(of)
     least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
     for corner in _TRIED_DRIFT_CORNERS_HZ:
@@ -162,12 +162,12 @@ class Spectra:
     Attributes:
         grid, taper: instants of the record, and their weights (M,).
         delay: delay of the signals [s].
-        zeta: (M, 16) signals in time.
+        zeta: (M, 16) motion signals over time.
     """
 
     of: FrequencyBands
-    wrench: Complex
-    signals: Complex
+    wrench: ComplexArray
+    signals: ComplexArray
     delay: float
     grid: WrenchGrid
     taper: Array
@@ -175,7 +175,6 @@ class Spectra:
 
     @property
     def max_delay_change_s(self) -> float:
-        """Largest change of the delay in a search [s]."""
         return min(MAX_DELAY_CHANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
 
     @cached_property
@@ -281,7 +280,7 @@ class FitWindow:
 
     def spectra_at_delay(self, splines: PoseSplines, delay: float) -> Spectra:
         """Return spectra of the wrench, and of the motion `delay` [s] later."""
-        of = frequency_bands(self.grid, self.taper, self.top)
+        of = make_frequency_bands(self.grid, self.taper, self.top)
         count = len(of.frequency)
         zeta = splines.signals(self.grid.t + delay, self.gravity_W)
         wrench = wrench_spectrum(self.grid, self.taper, count)
@@ -292,7 +291,7 @@ class FitWindow:
 def best_delay(
     spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
 ) -> tuple[float, float]:
-    """Return the delay of lowest cost within `reach`, to the step `finest` [s], and this cost."""
+    """Return the delay [s] of highest likelihood within +-`reach`, and its cost, Eq. (T75)."""
     step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs_at_delays(at)
@@ -321,7 +320,7 @@ def delay_deviation(spectra: Spectra) -> float:
 def guess_knot_spacing(
     window: FitWindow, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
-    """Return knot distance [s] and delay [s] of lowest cost on a coarse grid.
+    """Return knot distance [s] and delay [s] of highest likelihood on a coarse grid.
 
     The delay is not changed if `known`.
     """
@@ -340,9 +339,9 @@ def guess_knot_spacing(
 def choose_knot_spacing(
     window: FitWindow, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return splines, knot distance [s] and delay [s] of about lowest cost.
+    """Return splines, knot distance [s] and delay [s] of about the highest likelihood.
 
-    Knots are 8 or 16 % closer than at lowest cost. The delay is not changed if `known`.
+    Knots are 8 or 16 % closer than at the highest likelihood. The delay is not changed if `known`.
     """
     start = window.spectra_at_delay(
         choices[0].splines_with_spacing(TRIED_KNOT_SPACINGS_S[0]), delay
@@ -390,7 +389,7 @@ def _allowed_spacings(cache: SplineCache) -> list[float]:
 
 _MAX_CLOCK_RATE_STEPS, _MIN_LIKELIHOOD_GAIN = 3, 25.0
 # A larger change of the delay [s] is not caused by a clock.
-_MAX_CHANGE_S = 0.2
+_MAX_CLOCK_CHANGE_S = 0.2
 
 
 def estimate_clock_rate_error(
@@ -405,7 +404,7 @@ def estimate_clock_rate_error(
         trial = best + step
         if gain < _MIN_LIKELIHOOD_GAIN and best == 0.0:
             return 0.0
-        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CHANGE_S:
+        if abs(trial) * float(grid.t[-1] - grid.t[0]) > 2.0 * _MAX_CLOCK_CHANGE_S:
             break
         splines = PoseSplines(correct_clock_rate(cache.poses, trial, grid, delay), spacing)
         now = first.with_motion(splines, window.gravity_W, delay)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.pose_motion.linear_model import ROUNDING, Spectra
+from drake_teleop.logs.pose_motion.linear_model import ROUNDING_SHARE, Spectra
 from drake_teleop.logs.pose_motion.spectra import WrenchGrid, distance_to_flag
 from drake_teleop.logs.pose_motion.splines import MOTION_COLUMNS
 
@@ -15,17 +15,17 @@ NOTHING_REJECTED_NOTE = (
     " cannot be distinguished from errors of the motion: no sample was rejected"
 )
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS = 3.0, 4.5, 30
-_NORMAL_MAD = 1.4826
+_STD_OVER_MAD = 1.4826
 _MAX_INFORMATION_LOSS = 2.5
-_PASSED_SHARE = 0.3
+_HALF_GAIN_OVER_KNOT_RATE = 0.3
 _MIN_MARGIN_S = 0.1
 """Least margin on both sides of a rejected time span [s]."""
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
     """Return (M,) True for contact, impact or saturation, and a note for the user."""
-    # A Gaussian gain, one half at `_PASSED_SHARE` / h, does not ring.
-    gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED_SHARE) ** 2)
+    # A Gaussian gain, one half at `_HALF_GAIN_OVER_KNOT_RATE` / h, does not ring.
+    gain = 0.5 ** ((spectra.of.frequency * spacing / _HALF_GAIN_OVER_KNOT_RATE) ** 2)
     grid = spectra.grid
     x, y = (
         _spectrum_to_time_signal(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench)
@@ -77,9 +77,9 @@ def _normalized_residual_distances(
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
-    scale = _NORMAL_MAD * np.median(residual[inside], axis=0)
+    scale = _STD_OVER_MAD * np.median(residual[inside], axis=0)
     rms = np.sqrt(np.mean(y**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    return np.asarray((residual / np.maximum(scale, ROUNDING * rms + 1e-30)).max(axis=1))
+    return np.asarray((residual / np.maximum(scale, ROUNDING_SHARE * rms + 1e-30)).max(axis=1))
 
 
 def _information_loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:

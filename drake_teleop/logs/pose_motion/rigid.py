@@ -31,9 +31,9 @@ LOAD_PARAMETERS, DELAY_PARAMETER, LEVER_PARAMETERS, ROTATION_PARAMETERS = (
 )
 _MAX_FIT_STEPS, _CONVERGENCE_TOLERANCE = 40, 1e-4
 _MAX_RIGID_RATIO, _GAIN_MISFIT_FACTOR, _NOISE_RATIO = 4.0, 1.5, 1.5
-_MAX_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
-_MIN_REST_SHARE = 0.1
-_ROTATION_STEP = 1e-4  # rad, step of a numerical derivative
+_MAX_PARAMETER_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
+_MIN_OWN_NOISE_SHARE = 0.1
+_ROTATION_STEP_RAD = 1e-4  # rad, step of a numerical derivative
 _RANK_TOLERANCE = 1e-12
 
 
@@ -58,7 +58,7 @@ class RigidFit:
         misfit, degrees: twice the log likelihood ratio to the linear model, and its degrees of
             freedom.
         misfit_of_gains: expected increase of the misfit by the stated gain errors.
-        one_weight: whether all bands had one weight.
+        one_weight: whether all frequency bands had the same weight.
     """
 
     state: RigidParameters
@@ -112,14 +112,14 @@ def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
 
     The wrench does not contain the weight of `removed_weight` [m, m c] (4,).
     """
-    C = _coefficients_of(phi)
+    C = _load_coefficients(phi)
     if removed_weight is not None:
-        weight = _coefficients_of(np.concatenate([removed_weight, np.zeros(6)]))
+        weight = _load_coefficients(np.concatenate([removed_weight, np.zeros(6)]))
         C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
 
 
-def _coefficients_of(phi: Array) -> Array:
+def _load_coefficients(phi: Array) -> Array:
     theta = np.concatenate([np.zeros(6), phi])
     M = motion_transformation_matrix(np.eye(3), np.zeros(3))[:, :NUM_MOTION_SIGNALS]
     return np.asarray(np.einsum("cjk,j->ck", regressor_coefficients(), theta) @ M)
@@ -177,7 +177,7 @@ class _FitData:
 
 
 @dataclass(frozen=True, eq=False)
-class _Solution:
+class _RigidSolution:
     state: RigidParameters
     B: Array
     W: Array
@@ -188,7 +188,7 @@ class _Solution:
 
 def _solve_rigid_fit(
     record: _FitData, state: RigidParameters, *, one_weight: bool = False
-) -> _Solution:
+) -> _RigidSolution:
     sizes, clean = record.levels.sizes, record.Z - record.Q
     R = _residual_covariances(record, state, record.power * sizes[:, None])
     for _ in range(_MAX_FIT_STEPS):
@@ -200,16 +200,16 @@ def _solve_rigid_fit(
         inverse, undetermined = _inverse_of_free_parameters(gram, record.free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
-        step *= min(1.0, float(np.min(_MAX_STEP / np.maximum(np.abs(step), 1e-300))))
+        step *= min(1.0, float(np.min(_MAX_PARAMETER_STEP / np.maximum(np.abs(step), 1e-300))))
         state = _apply_step(state, step)
         used = _used_degrees_of_freedom(B, record.Z, W, inverse)
         R = _residual_covariances(record, state, _residual_sums(record, state), used)
         if np.max(np.abs(step) / size) < _CONVERGENCE_TOLERANCE:
             break
-    return _Solution(state, B, W, inverse, R, undetermined)
+    return _RigidSolution(state, B, W, inverse, R, undetermined)
 
 
-def _covariance(record: _FitData, solution: _Solution, inflation: float, gain: float) -> Array:
+def _covariance(record: _FitData, solution: _RigidSolution, inflation: float, gain: float) -> Array:
     B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
     middle = _normal_equations(B, np.zeros((6, MOMENTS_SIZE)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
@@ -226,7 +226,7 @@ def _covariance(record: _FitData, solution: _Solution, inflation: float, gain: f
     return larger
 
 
-def _weight_estimation_factors(record: _FitData, solution: _Solution) -> Array:
+def _weight_estimation_factors(record: _FitData, solution: _RigidSolution) -> Array:
     levels, B = record.levels, solution.B
     half = np.einsum("cjk,ji->cik", B, solution.inverse)
     weight = np.diagonal(solution.W, axis1=1, axis2=2)
@@ -249,7 +249,7 @@ def _residual_coefficients(state: RigidParameters) -> Array:
 
 
 def _residual_derivative(state: RigidParameters) -> tuple[Array, Array]:
-    """Return B = -de/dx (6, 23, 38) and the residual e (6, 38), in coefficients of y."""
+    """Return B = -de/dx (6, 23, 38) and e (6, 38): coefficients of 38 signals in the residual."""
     L, M = _residual_coefficients(state), _motion_map_with_delay(state)
     B = np.zeros((6, NUM_PARAMETERS, MOMENTS_SIZE))
     B[:, LOAD_PARAMETERS] = regressor_coefficients() @ M
@@ -258,10 +258,10 @@ def _residual_derivative(state: RigidParameters) -> tuple[Array, Array]:
         lever = _motion_map_with_delay(replace(state, r=state.r + unit)) - M
         ahead, behind = (
             _motion_map_with_delay(replace(state, R=_rotate_by_vector(state.R, x * unit)))
-            for x in (_ROTATION_STEP, -_ROTATION_STEP)
+            for x in (_ROTATION_STEP_RAD, -_ROTATION_STEP_RAD)
         )
         B[:, 17 + i] = -L @ lever
-        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_STEP)
+        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_STEP_RAD)
     return B, L @ M
 
 
@@ -302,7 +302,7 @@ def _residual_covariances(
     P = _residual_powers(record.Q, state) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
-        _MIN_REST_SHARE * levels.noise_power(sums, used),
+        _MIN_OWN_NOISE_SHARE * levels.noise_power(sums, used),
         rounding_error_power(record.Z, levels.sizes),
     )
     rest = np.maximum(levels.noise_power(sums - own, used), least)
@@ -323,7 +323,7 @@ def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
     return parameter_errors_by_gains(BF, W, inverse)
 
 
-def _misfit_of_gains(record: _FitData, solution: _Solution, gain: float) -> float:
+def _misfit_of_gains(record: _FitData, solution: _RigidSolution, gain: float) -> float:
     if gain == 0.0:
         return 0.0
     B, levels = solution.B, record.levels
@@ -352,7 +352,7 @@ def _rotate_by_vector(R: Array, rho: Array) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())
 
 
-_ITERATIONS = 5
+_UNIT_RATIO_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,7 +362,7 @@ class UnitsAndAxes:
     Attributes:
         kappa: unit error of position; 1e-3 for mm described as m.
         kappa_deviation: its standard deviation; inf if undetermined.
-        deviation: largest standard deviation of M_g (3, 3), force over minus gravity [kg].
+        deviation: largest standard deviation of M_g (3, 3) [kg], force over minus gravity.
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         masses: (3,) singular values of M_g [kg].
     """
@@ -375,7 +375,7 @@ class UnitsAndAxes:
 
     @property
     def is_usable(self) -> bool:
-        """Whether M_g is known to 5 % of the mass."""
+        """Whether M_g, force over minus gravity, is known to 5 % of the mass."""
         return bool(self.deviation < 0.05 * self.masses.mean())
 
     @property
@@ -402,7 +402,7 @@ def _position_unit_ratio(
         return np.nan, np.inf
     a, g, v_a, v_g = (x[known] for x in (a, g, variances_a, variances_g))
     kappa = 0.0
-    for _ in range(_ITERATIONS):
+    for _ in range(_UNIT_RATIO_ITERATIONS):
         weight = 1.0 / (v_a + kappa**2 * v_g)
         information = float(weight @ np.maximum(g * g - v_g, 0.0))
         if not information > 0.0:  # gravity is not observable

@@ -17,7 +17,7 @@ from drake_teleop.logs.pose_motion.splines import (
     passed_noise_share,
 )
 
-Complex = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]
 
 MAX_FREQUENCY_HZ = 25.0
 """Highest frequency that is used [Hz]."""
@@ -77,7 +77,7 @@ class FrequencyBands:
 
     Attributes:
         frequency, band: (K,) used frequencies [Hz], and their bands.
-        weight: (K,) half the independent numbers of each frequency.
+        weight: (K,) half the number of independent values at each frequency.
         group: (count,) group of each band.
     """
 
@@ -92,7 +92,7 @@ class FrequencyBands:
 
     @cached_property
     def sizes(self) -> Array:
-        """Half the independent numbers (count,) of each band."""
+        """Half the number of independent values (count,) in each band."""
         return np.asarray(np.bincount(self.band, self.weight), np.float64)
 
     def sums_over_bands(self, values: Array) -> Array:
@@ -101,7 +101,7 @@ class FrequencyBands:
         return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])
 
 
-def frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
+def make_frequency_bands(grid: WrenchGrid, taper: Array, top: float) -> FrequencyBands:
     """Return frequency bands up to `top` [Hz]; small groups are joined to the next."""
     frequency = grid.frequency[grid.frequency <= top]
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.transform_length)
@@ -145,7 +145,7 @@ def distance_to_flag(flags: NDArray[np.bool_]) -> Array:
     return np.minimum(at - before, after - at)
 
 
-def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> Complex:
+def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> ComplexArray:
     """Return the spectrum (count, 6) of the tapered wrench, scaled as those of the signals."""
     fine = np.zeros(grid.transform_length * grid.stride)
     n = len(grid.wrench)
@@ -157,7 +157,7 @@ def wrench_spectrum(grid: WrenchGrid, taper: Array, count: int) -> Complex:
     return out
 
 
-def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> Complex:
+def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> ComplexArray:
     """Return the spectrum (count, 16) of tapered motion signals zeta (M, 16), Eq. (T73)."""
     out = np.empty((count, zeta.shape[1]), np.complex128)
     for c, column in enumerate(zeta.T):
@@ -165,8 +165,8 @@ def signal_spectrum(grid: WrenchGrid, taper: Array, zeta: Array, count: int) -> 
     return out
 
 
-def shift_spectrum(spectrum: Complex, frequency: Array, shift: float) -> Complex:
-    """Return spectra (K, 16) of zeta and taper `shift` [s] later; the constant is unchanged."""
+def shift_spectrum(spectrum: ComplexArray, frequency: Array, shift: float) -> ComplexArray:
+    """Return spectra (K, 16) of tapered signals `shift` [s] later; that of constant 1 is kept."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
     return out
@@ -189,7 +189,7 @@ def _filter_by_response(grid: WrenchGrid, x: Array, response: NDArray[np.complex
 
 
 def second_moments(
-    zeta: Complex, wrench: Complex, of: FrequencyBands, rates: Complex | None = None
+    zeta: ComplexArray, wrench: ComplexArray, of: FrequencyBands, rates: ComplexArray | None = None
 ) -> Array:
     """Return second moments (bands, 38, 38) of y = [zeta (16), F (6), d zeta/dt (16)].
 
@@ -215,7 +215,7 @@ class NoiseLevels:
     """Noise of the wrench, with one level for each group of bands and channel.
 
     Attributes:
-        sizes, group: (bands,) half the independent numbers of each band, and its group.
+        sizes, group: (bands,) half the number of independent values in each band, and its group.
         shape: (bands, 6) power relative to the level.
     """
 
@@ -242,7 +242,6 @@ class NoiseLevels:
         return np.asarray(level[..., self.group, :] * self.shape)
 
     def sums_over_groups(self, x: Array) -> Array:
-        """Return the sums (groups, ...) of x (bands, ...) over the bands of each group."""
         return np.asarray(np.add.reduceat(x, self._first_bands_of_groups, axis=0))
 
     @cached_property
@@ -273,7 +272,7 @@ def noise_moments(
     of: FrequencyBands,
     noise: tuple[float, float],
 ) -> Array:
-    """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `Spectra.moments`.
+    """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `second_moments`.
 
     `noise`: standard deviations of position [m] and rotation [rad].
     """

@@ -49,7 +49,7 @@ class ImuSplineRows:
     def from_sensor_axes(
         self, splines: PoseSplines, gravity_W: Array, s: Array | None, omega: Array | None
     ) -> ImuSplineRows:
-        """Return the rows of specific force s and omega (K, 3) in S, oriented by `splines`."""
+        """Return rows with specific force s and omega (K, 3), rotated from S by `splines`."""
         q = splines.quaternion(self.t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -58,11 +58,11 @@ class ImuSplineRows:
         if omega is not None:
             w, v = q[:, :1], q[:, 1:]
             real = -np.sum(v * omega, axis=1, keepdims=True)
-            rates = 0.5 * np.hstack([real, w * omega + _cross(v, omega)])
+            rates = 0.5 * np.hstack([real, w * omega + _cross_products(v, omega)])
         return replace(self, acceleration_W=acceleration, quaternion_rate=rates)
 
     def remaining_noise_shares(self, frequency: Array) -> tuple[Array, Array]:
-        """Return the shares (K,) of position and rotation noise that remain, Eq. (T83)."""
+        """Return the shares (K,) of position and rotation noise that an IMU leaves, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
         for pose, own, order, rows in zip(
@@ -82,8 +82,7 @@ class PoseSplines:
 
     Args:
         smooth: penalize the fifth derivative, with the weight of largest marginal likelihood, and
-            expect derivatives at the ends as large as inside, with the same correlations. Poses on
-            one side alone determine these with a several times larger error.
+            expect derivatives at the ends as large as inside, with the same correlations.
     """
 
     def __init__(
@@ -101,11 +100,11 @@ class PoseSplines:
         self._blocks = _row_blocks(len(t))
         knots = _knots(t, spacing, with_imu=imu_rows is not None)
         try:
-            self._spline = self._fit(t, knots)
+            self._spline = self._fit_spline(t, knots)
         except np.linalg.LinAlgError:  # too few poses per knot between gaps
-            self._spline = self._fit(t, _thin_knots(knots, t))
+            self._spline = self._fit_spline(t, _thin_knots(knots, t))
 
-    def _fit(self, t: Array, knots: Array) -> BSpline:
+    def _fit_spline(self, t: Array, knots: Array) -> BSpline:
         poses, imu_rows = self.poses, self.imu_rows
         values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._blocks)
         times = (t[x] for x in self._blocks)
@@ -275,7 +274,7 @@ class SplineCache:
 
     def __init__(self, poses: Poses, imu_rows: ImuSplineRows | None = None) -> None:
         self.poses, self.imu_rows = poses, imu_rows
-        self._fit: dict[float, PoseSplines] = {}
+        self._fit_spline: dict[float, PoseSplines] = {}
 
     @property
     def rate(self) -> float:
@@ -283,13 +282,13 @@ class SplineCache:
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def splines_with_spacing(self, spacing: float) -> PoseSplines:
-        if spacing not in self._fit:
-            self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
-        return self._fit[spacing]
+        if spacing not in self._fit_spline:
+            self._fit_spline[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
+        return self._fit_spline[spacing]
 
 
 def passed_noise_share(frequency: Array, spacing: float) -> Array:
-    """Return the share (K,) of white noise's power that splines pass at a frequency, Eq. (T72)."""
+    """Return the share (K,) of noise power that splines pass at frequencies [Hz], Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (SPLINE_DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)
@@ -374,18 +373,18 @@ def _band(gram: csr_array) -> Array:
 
 def _vector_part_of_relative_quaternion(q: Array, p: Array) -> Array:
     v, w = q[:, 1:], p[:, 1:]
-    out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)
+    out: Array = q[:, :1] * w - p[:, :1] * v - _cross_products(v, w)
     return out
 
 
 def _rotate_to_P(q: Array, n: Array, x: Array) -> Array:
     v = -q[:, 1:]
-    once = _cross(v, x)
-    out: Array = x + 2.0 * (q[:, :1] * once + _cross(v, once)) / n
+    once = _cross_products(v, x)
+    out: Array = x + 2.0 * (q[:, :1] * once + _cross_products(v, once)) / n
     return out
 
 
-def _cross(a: Array, b: Array) -> Array:
+def _cross_products(a: Array, b: Array) -> Array:
     out = np.empty(a.shape)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.subtract(a[:, j] * b[:, k], a[:, k] * b[:, j], out=out[:, i])

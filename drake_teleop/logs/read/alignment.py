@@ -16,7 +16,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.canonical import Log
 
-_MIN_SAMPLES = 8
+_MIN_ALIGNED_SAMPLES = 8
 _CHUNK_ROWS = 2**18
 _MIN_WINDOW_SAMPLES = 9
 _POLYNOMIAL_DEGREE = 5
@@ -25,7 +25,6 @@ SMOOTHER_WINDOW_OVER_PERIOD = 1.8
 
 
 def mean_time_step(t: Array) -> float:
-    """Return the mean step of times `t` (N,) [s]."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
@@ -108,7 +107,7 @@ def smooth_derivatives(
 
 
 def noise_gain_of_derivatives(dt: float, bandwidth_hz: float | None) -> Array:
-    """Return factors (3,) of `smooth_derivatives` on white noise: [1], [1/s], [1/s^2]."""
+    """Return noise (3,) of `smooth_derivatives` over white noise of x: [1], [1/s], [1/s^2]."""
     weights = smoother_weights(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
@@ -172,11 +171,12 @@ def remove_delay(log: Log, delay_s: float) -> Log:
         return log
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
-    if known.sum() < _MIN_SAMPLES:
+    if known.sum() < _MIN_ALIGNED_SAMPLES:
         raise DrakeTeleopError(
-            f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples",
+            f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples"
+            f" ({_MIN_ALIGNED_SAMPLES} are required)",
             where=log.source,
-            remedy="give a shorter one, or auto",
+            remedy="give a shorter delay, or `auto`",
         )
     s, omega, alpha = (resample(at[known], log.t, x) for x in log.motion)
     gravity, R_WS = (
@@ -227,7 +227,7 @@ def widen_flags(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 
 DELAY_SEARCH_RANGE_S = 0.25
-_MAX_SAMPLES = 5000
+_MAX_DELAY_SAMPLES = 5000
 _MIN_DELAY_SAMPLES = 32
 
 
@@ -247,7 +247,7 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
     inside = np.flatnonzero(inside & ~gap)
     if len(inside) < _MIN_DELAY_SAMPLES:
         return None
-    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES)
+    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_DELAY_SAMPLES)
     cost = _cost_of_shift(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([cost(shift) for shift in shifts])

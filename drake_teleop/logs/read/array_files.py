@@ -31,13 +31,13 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
     Names are relative to `group`. `transpose` reverses the axes, as for files of MATLAB. Raise
     OSError for a damaged file, ValueError for a too large array or one in another file.
     """
-    h5py, found = import_optional("h5py", path), dict[str, NDArray]()
+    h5py, found = import_optional_module("h5py", path), dict[str, NDArray]()
     with h5py.File(path, "r") as file:
 
         def add_dataset(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset) and _is_numeric_table(item, transpose):
                 if item.external is not None or item.is_virtual:
-                    raise ValueError(f"{name} is in another file")
+                    raise ValueError(f"the array {name} is in another file, which is not read")
                 array = np.asarray(item[()])
                 found[name.replace("/", ".")] = array.T if transpose else array
 
@@ -47,7 +47,7 @@ def read_hdf5(path: Path, *, transpose: bool = False, group: str = "/") -> dict[
 
 def read_zarr(path: Path, *, rows: slice = slice(None)) -> dict[str, NDArray]:
     """Return some rows of the numeric arrays of a Zarr folder; raise errors as `read_hdf5`."""
-    zarr = import_optional("zarr", path)
+    zarr = import_optional_module("zarr", path)
     group = zarr.open_group(path, mode="r")
     members = group.members(max_depth=None)
     arrays = {name: item for name, item in members if isinstance(item, zarr.Array)}
@@ -67,16 +67,16 @@ def _is_numeric_table(item: Any, transpose: bool) -> bool:
     ):
         return False
     if math.prod(shape) > _MAX_VALUES:
-        raise ValueError(f"an array of {math.prod(shape):.2g} numbers is too large")
+        raise ValueError(f"an array has {math.prod(shape):.2g} numbers (at most {_MAX_VALUES:.2g})")
     return True
 
 
-def import_optional(name: str, path: Path) -> Any:
+def import_optional_module(name: str, path: Path) -> Any:
     try:
         return import_module(name)
     except ImportError:
         raise DrakeTeleopError(
-            f"reading {path.suffix} files needs {name}",
+            f"reading {path.suffix} files requires the Python package {name}",
             where=str(path),
             remedy=remedy_to_install_extra("formats"),
         ) from None
@@ -90,7 +90,7 @@ _MAT_HEADER_BYTES, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = (
     1 << 11,
     20,
 )
-_NUMERIC_CLASSES = range(6, 16)  # numeric classes
+_MAT_NUMERIC_CLASSES = range(6, 16)  # numeric classes
 _MAT_NUMBER_TYPES = dict(enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4"], start=1)) | {
     9: "f8",
     12: "i8",
@@ -101,10 +101,7 @@ _DAMAGED_FILE_MESSAGE = "it is damaged or incomplete"
 
 
 def read_mat(path: Path) -> dict[str, NDArray]:
-    """Return the numeric arrays of a MATLAB file by name; fields are named `structure.field`.
-
-    Raise ValueError if the file is invalid or has no arrays.
-    """
+    """Return the numeric arrays of a MATLAB file by name; fields are named `structure.field`."""
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version
 
@@ -123,7 +120,7 @@ def read_mat(path: Path) -> dict[str, NDArray]:
             if isinstance(value, np.ndarray):
                 _add_array(name, value, found)
     if not found:
-        raise ValueError("it has no arrays; save tables and timeseries as arrays")
+        raise ValueError("it has no arrays of numbers; save tables and timeseries as arrays")
     return found
 
 
@@ -155,7 +152,7 @@ def _add_variable(
         raise ValueError(_DAMAGED_FILE_MESSAGE)
     (flags, *_), size = (_parse_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
-    if flags & 0xFF in _NUMERIC_CLASSES and not flags & _COMPLEX:
+    if flags & 0xFF in _MAT_NUMERIC_CLASSES and not flags & _COMPLEX:
         if len(parts) != 4:
             raise ValueError(_DAMAGED_FILE_MESSAGE)
         _add_array(name, _parse_numbers(parts[3], order).reshape(size, order="F"), found)

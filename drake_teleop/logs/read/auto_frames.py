@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.causes.explain import explain
+from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import Instants, block_means_of_record, delay_of_free_fit
 from drake_teleop.logs.read.alignment import remove_delay, resample
 from drake_teleop.logs.read.canonical import Log
@@ -50,8 +50,8 @@ def estimate_auto_imu_mounting(
         lever = _choose_lever_arm(mounting, at_Io, f"{source}:imu.position")
         position = tuple(lever.p_SoIo_S.tolist())
         notes.append(
-            f"imu.position found: {_format_mm(lever)} mm, from the {lever.source}; write it into"
-            f" the description as imu.position: {_round_for_yaml(lever.p_SoIo_S)}"
+            f"imu.position found: {_format_arm_mm(lever)} mm, from the {lever.source}; write it"
+            f" into the description as imu.position: {_round_for_yaml(lever.p_SoIo_S)}"
         )
     return replace_imu_fields(frame=frame, position=position), tuple(notes)
 
@@ -125,7 +125,7 @@ def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> Leve
         )
         raise DrakeTeleopError(
             f"the motion does not determine {axes} of the accelerometer's position"
-            f" ({_format_mm(lever)} mm, from the {lever.source})",
+            f" ({_format_arm_mm(lever)} mm, from the {lever.source})",
             where=where,
             remedy="turn faster, about more axes, or give imu.position in metres",
         )
@@ -136,7 +136,7 @@ def _round_for_yaml(x: Array) -> list:
     return list((np.round(x, 4) + 0.0).tolist())
 
 
-def _format_mm(lever: LeverArm) -> str:
+def _format_arm_mm(lever: LeverArm) -> str:
     return ", ".join(
         f"{axis} {1e3 * value:.1f} +- {1e3 * deviation:.1f}" if deviation < 1 else f"{axis} unknown"
         for axis, value, deviation in zip("xyz", lever.p_SoIo_S, lever.deviations, strict=True)
@@ -231,7 +231,7 @@ def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     )
 
 
-_MAX_DEVIATION_DEG = 2.0
+_MAX_GRAVITY_DEVIATION_DEG = 2.0
 
 
 def estimate_auto_gravity(
@@ -240,7 +240,7 @@ def estimate_auto_gravity(
     """Return the description with an estimate for `gravity: auto`, and notes."""
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf
-    explanation = explain(
+    explanation = explain_misfit(
         block_means_of_log(log),
         lambda delay_s: block_means_of_log(remove_delay(log, delay_s)),
         ("gravity",),
@@ -252,7 +252,7 @@ def estimate_auto_gravity(
         across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2
         spread = np.linalg.eigvalsh(across @ covariance @ across)[-1]
         deviation = float(np.degrees(np.sqrt(spread) / STANDARD_GRAVITY))
-    if not deviation < _MAX_DEVIATION_DEG:
+    if not deviation < _MAX_GRAVITY_DEVIATION_DEG:
         raise DrakeTeleopError(
             "the data do not determine the direction of gravity",
             where=f"{source}:gravity",

@@ -92,7 +92,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         if not connections:
             known = [f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())]
             raise DrakeTeleopError(
-                f"has no topic {topic!r}",
+                f"the bag has no topic {topic!r}",
                 where=str(path),
                 remedy=f"its topics are {', '.join(known)}",
             )
@@ -102,7 +102,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
             for message in [reader.deserialize(raw, connection.msgtype)]
             for part in getattr(message, "transforms", [message])
         )
-        blocks = _read_blocks(pairs, child_frame, f"{path}:{topic}")
+        blocks = _read_message_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
     columns = _join_blocks(blocks)
@@ -161,7 +161,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     if not is_bag(path):
         raise DrakeTeleopError(
-            "is not a bag",
+            "the path is not a bag",
             where=str(path),
             remedy="give a folder with metadata.yaml, or a .mcap, .db3 or .bag file",
         )
@@ -170,7 +170,7 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise DrakeTeleopError(
-            "bags are read by the library rosbags, which is not installed",
+            "reading bags requires the Python package rosbags, which is not installed",
             where=str(path),
             remedy=remedy_to_install_extra("ros"),
         ) from error
@@ -189,7 +189,9 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise DrakeTeleopError(
-            f"cannot be read: {text}", where=str(path), remedy="check it with `ros2 bag info`"
+            f"the bag cannot be read: {text}",
+            where=str(path),
+            remedy="check it with `ros2 bag info`",
         ) from error
 
 
@@ -221,7 +223,7 @@ def _limit_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def _read_blocks(
+def _read_message_blocks(
     pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
     children: set[str] = set()

@@ -26,7 +26,7 @@ ANGULAR_VELOCITY_COLUMNS = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION_COLUMNS = ("alpha_x", "alpha_y", "alpha_z")
 QUATERNION_COLUMNS = ("q_w", "q_x", "q_y", "q_z")
 POSITION_COLUMNS = ("p_x", "p_y", "p_z")
-_KINEMATICS = {
+_KINEMATIC_COLUMNS = {
     "specific_force": SPECIFIC_FORCE_COLUMNS,
     "angular_velocity": ANGULAR_VELOCITY_COLUMNS,
     "angular_acceleration": ANGULAR_ACCELERATION_COLUMNS,
@@ -60,15 +60,15 @@ class Log:
         gravity: (N, 3) gravity in S [m/s^2].
         static: True if the samples are separate poses at rest.
         bridged: (N,) True for samples interpolated over gaps.
-        notes: assumptions of the reader.
+        notes: assumptions made during reading.
         posed: recorded poses, if they have positions.
         gain_std: standard deviation of the sensor gains (relative).
         R_WS: (N, 3, 3) orientation of S in the world W.
         gravity_W: (3,) gravity in W [m/s^2].
         one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        free: "gravity" and "weight" if these are estimated from the data.
-        resolution: step of force and torque of static poses [N, N m].
+        free: those of "gravity" and "weight" that are estimated from the data.
+        resolution: quantization step of force and torque, for static poses [N, N m].
 
     Raises:
         DrakeTeleopError: for wrong shapes, values that are not finite, or decreasing `t`.
@@ -106,7 +106,7 @@ class Log:
                 )
             if not np.isfinite(value).all():
                 raise DrakeTeleopError(
-                    "holds NaN or infinity",
+                    "holds NaN or infinity (numbers must be finite)",
                     where=f"{self.source}:{name}",
                     remedy="cut or repair these samples",
                 )
@@ -164,7 +164,7 @@ def write_log(log: Log, path: str | Path) -> None:
     frame = pl.DataFrame({"t": log.t} | dict(zip(names, values.T, strict=True)))
     if path.suffix not in (".csv", ".parquet"):
         raise DrakeTeleopError(
-            f"format {path.suffix!r} is not known",
+            f"logs cannot be written in the format {path.suffix!r}",
             where=str(path),
             remedy="name it .csv or .parquet",
         )
@@ -193,7 +193,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
     table.numbers(WRENCH_COLUMNS, 6, str(path))
     fields: dict[str, dict[str, Any]] = {
         name: {"columns": names}
-        for name, names in _KINEMATICS.items()
+        for name, names in _KINEMATIC_COLUMNS.items()
         if are_columns_present(names)
     }
     if "orientation" in fields:

@@ -34,8 +34,8 @@ class Clock:
 
     Attributes:
         rows: (N,) row of the table for each time.
-        total: number of stamps before removal.
-        notes: corrections.
+        total: number of the table's rows, with removed ones.
+        notes: sentences about corrections.
         episodes: number of times at which the clock starts.
     """
 
@@ -105,7 +105,7 @@ def time_stamps_s(time: Time, table: Table, where: str) -> tuple[Array, int]:
         raise DrakeTeleopError(
             "the column holds dates or times of day, which have no unit",
             where=f"{where}.unit",
-            remedy="leave it out",
+            remedy="leave `unit` out",
         )
     columns = whole.raw_side_by_side(names, f"{where}.column")
     t = columns[:, 0] * SI_VALUE_OF_UNIT[time.unit]
@@ -119,7 +119,7 @@ def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
     """Return a note about the episodes of a wrench's clock; raise an error for several files."""
     if num_files > 1:
         raise DrakeTeleopError(
-            f"the clock starts {clock.episodes} times, and the streams are in several files",
+            f"the clock starts {clock.episodes} times, which requires all streams in one file",
             where=where,
             remedy="write all streams into one table, or each episode into files of its own",
         )
@@ -260,7 +260,8 @@ def _check_rate(t: Array, time: Time, where: str) -> None:
     if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"
     raise DrakeTeleopError(
-        f"the median step of the time stamps is {step:.3g} s, a rate of {1 / step:.3g} Hz",
+        f"the median step of the time stamps is {step:.3g} s ({1 / MAX_RATE_HZ:g} to"
+        f" {1 / MIN_RATE_HZ:g} s are plausible), a rate of {1 / step:.3g} Hz",
         where=f"{where}.unit",
         remedy=remedy,
     )
@@ -274,7 +275,8 @@ def _check_stamps_are_even(t: Array, rows: NDArray[np.intp], table: Table, where
     row = table.line_in_file(rows[longest + 1])
     raise DrakeTeleopError(
         f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
-        f" {steps.mean():.3g} s, longest {steps[longest]:.3g} s to row {row} of {table.path.name}",
+        f" {steps.mean():.3g} s (at most {_MAX_STEP_RATIO:g} times that), longest"
+        f" {steps[longest]:.3g} s to row {row} of {table.path.name}",
         where=where,
         remedy="cut the log where its clock jumps; if rows come in bursts, give time.rate",
     )

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 _INSPECTED_HEAD_BYTES = 2**16  # bytes from which the format is detected
 _ROWS_FOR_TYPES = 1000  # rows from which column types are inferred
-_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_LONE_CR = re.compile(rb"\r(?!\n)")
+_UTF_16_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_LONE_CR_PATTERN = re.compile(rb"\r(?!\n)")
 _BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
-_QUOTED_NUMBER = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
-_THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
-_QUOTED = re.compile('"[^"]*"')
+_QUOTED_NUMBER_PATTERN = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
+_THOUSANDS_PATTERN = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
+_QUOTED_TEXT_PATTERN = re.compile('"[^"]*"')
 _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
@@ -34,7 +34,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
     with path.open("rb") as file:
         head = file.read(_INSPECTED_HEAD_BYTES)
     source: Path | bytes = path
-    if head.startswith(_UTF_16):
+    if head.startswith(_UTF_16_MARKS):
         source = path.read_text("utf-16").encode()
         head = source[:_INSPECTED_HEAD_BYTES]
     if (text := _normalize_separators_and_encoding(path, source, head)) is not None:
@@ -73,14 +73,14 @@ def _normalize_separators_and_encoding(
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _INSPECTED_HEAD_BYTES))
         tail = file.read() if isinstance(source, Path) else source
-    returns, commas = bool(_LONE_CR.search(head)), _QUOTED_NUMBER.findall(head)
+    returns, commas = bool(_LONE_CR_PATTERN.search(head)), _QUOTED_NUMBER_PATTERN.findall(head)
     # "1,500" can be 1500.
-    commas = [found for found in commas if not _THOUSANDS.fullmatch(b",".join(found))]
+    commas = [found for found in commas if not _THOUSANDS_PATTERN.fullmatch(b",".join(found))]
     if not (returns or commas or _content_length(tail) < len(tail)):
         return None
     text = path.read_bytes() if isinstance(source, Path) else source
-    text = _LONE_CR.sub(b"\n", text) if returns else text
-    text = _QUOTED_NUMBER.sub(rb"\1.\2", text) if commas else text
+    text = _LONE_CR_PATTERN.sub(b"\n", text) if returns else text
+    text = _QUOTED_NUMBER_PATTERN.sub(rb"\1.\2", text) if commas else text
     return text[: _content_length(text)]
 
 
@@ -100,7 +100,7 @@ def _parse_with_types(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
 
 
 def _find_separator(line: str) -> str:
-    bare = _QUOTED.sub("", line).strip()
+    bare = _QUOTED_TEXT_PATTERN.sub("", line).strip()
     if ";" in bare or "\t" in bare:
         return ";" if ";" in bare else "\t"
     return " " if "," not in bare and " " in bare else ","

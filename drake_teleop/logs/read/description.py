@@ -40,16 +40,16 @@ from drake_teleop.logs.read.description_fields import (
     Position,
     PositionOrAuto,
     RotationOrAuto,
-    Strict,
+    StrictModel,
     Torque,
     Weight,
 )
 
-ONLY_IN_DESCRIPTION = "in a log description of this table; the canonical form has no such line"
+YAML_ONLY_NOTE = "in a log description of this table; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
 
 
-class Time(Strict):
+class Time(StrictModel):
     """Time of the rows of a stream: a column of stamps or a nominal rate."""
 
     column: Column | None = None
@@ -58,9 +58,9 @@ class Time(Strict):
         default=None, description="column of nanoseconds, added to the seconds of `column`"
     )
     rate: Number | None = Field(
-        default=None, ge=1e-3, le=1e6, description="Hz, if there is no column"
+        default=None, ge=1e-3, le=1e6, description="constant rate in Hz, if there is no column"
     )
-    offset: Number = Field(default=0.0, description="s, added to the stream's clock")
+    offset: Number = Field(default=0.0, description="seconds that are added to the stream's clock")
     scale: Number = Field(
         default=1.0,
         ge=0.5,
@@ -71,24 +71,24 @@ class Time(Strict):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Time:
         if (self.column is None) == (self.rate is None):
-            raise ValueError("give either column or rate")
+            raise ValueError("time needs either column or rate, not both: give one of them")
         if self.nanoseconds is not None and (self.column is None or self.unit != "s"):
-            raise ValueError("nanoseconds are added to a column of seconds: give column, unit s")
+            raise ValueError("nanoseconds require a column of seconds: give column, with unit s")
         return self
 
 
-class Orientation(Strict):
+class Orientation(StrictModel):
     """Orientation R_WS of S, or of the stream's frame if `frame` is a rotation."""
 
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector", "euler"]
-    unit: Literal["rad", "deg"] = Field(default="rad", description="of rotation_vector and euler")
+    unit: Literal["rad", "deg"] = Field(default="rad", description="unit of the angles")
     axes: str | None = Field(
         default=None,
         description="axes of the Euler angles, in the order of the columns: small letters for"
         " fixed axes, such as xyz (roll, pitch, yaw), capitals for moving ones, such as ZYX",
     )
-    inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
+    inverse: bool = Field(default=False, description="true if the columns hold R_SW")
 
     @model_validator(mode="after")
     def _check_axes(self) -> Orientation:
@@ -118,7 +118,7 @@ _TOPIC_DEFAULTS: dict[str, dict[str, Any]] = {
 }
 
 
-class _Stream(Strict):
+class _Stream(StrictModel):
     file: Path
     header: bool = True
 
@@ -134,8 +134,8 @@ class _Stream(Strict):
         return tuple(c for quantity in quantities for c in getattr(quantity, "columns", ()))
 
 
-class _Recorded(_Stream):
-    topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
+class _RecordedStream(_Stream):
+    topic: str | None = Field(default=None, description="topic of a ROS bag or MCAP file")
     child_frame: str | None = Field(
         default=None, description="child frame of the transform in the topic"
     )
@@ -165,7 +165,7 @@ class _Recorded(_Stream):
         return self.file.joinpath(*f"{self.topic}/{self.child_frame or ''}".split("/"))
 
 
-class Wrench(_Recorded):
+class Wrench(_RecordedStream):
     """File and columns of the force-torque sensor."""
 
     _defaults = ("force", "torque")
@@ -178,7 +178,7 @@ class Wrench(_Recorded):
     gain_std: GainStd = 0.0
 
 
-class Imu(_Recorded):
+class Imu(_RecordedStream):
     """File and columns of an IMU."""
 
     _defaults = ("specific_force", "angular_velocity")
@@ -189,18 +189,18 @@ class Imu(_Recorded):
     sign: Literal[1, -1] = Field(
         default=1, description="sign of the specific force; -1 if the file has g - a"
     )
-    frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
+    frame: ImuFrame = Field(default="sensor", description="axes of the IMU; auto: estimated")
     position: PositionOrAuto = Field(
-        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: it is found"
+        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: estimated"
     )
 
     @model_validator(mode="after")
     def _check_signals(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
-            raise ValueError("give specific_force, angular_velocity, or both")
+            raise ValueError("an IMU has no signal: give specific_force, angular_velocity, or both")
         if self.is_mounting_auto and not self.specific_force:
             raise ValueError(
-                "auto: frame and position are found from specific_force; give it, or them"
+                "auto is found from specific_force: give that, or values of frame and position"
             )
         return self
 
@@ -209,7 +209,7 @@ class Imu(_Recorded):
         return self.frame == "auto" or self.position == "auto"
 
 
-class Pose(_Recorded):
+class Pose(_RecordedStream):
     """File and columns of a pose of sensor, flange or TCP."""
 
     _defaults = ("orientation", "position")
@@ -219,23 +219,23 @@ class Pose(_Recorded):
     frame: Frame = "sensor"
     position_in_sensor: PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0),
-        description="p_SoPo_S of the posed frame's origin, m; auto: it is found",
+        description="origin of the posed frame in S, p_SoPo_S, m; auto: estimated",
     )
     rotation_in_sensor: RotationOrAuto = Field(
         default=None,
-        description="R_SP, from the posed frame to S, as frame has it; auto: it is found",
+        description="rotation R_SP from the posed frame to S, as in frame; auto: estimated",
     )
 
     @model_validator(mode="after")
     def _check_frame(self) -> Pose:
         if self.frame == "base":
-            raise ValueError("frame must be sensor, or the rotation from the posed frame to S")
+            raise ValueError("frame must be sensor, or a rotation matrix from the posed frame to S")
         if self.frame != "sensor" and self.rotation_in_sensor is not None:
-            raise ValueError("frame and rotation_in_sensor are the same: give one of them")
+            raise ValueError("frame and rotation_in_sensor mean the same: give one of them")
         shifted = self.position_in_sensor == "auto" or any(self.position_in_sensor)
         if self.position is None and (shifted or self.rotation_in_sensor == "auto"):
             raise ValueError(
-                "position_in_sensor and auto need positions: give pose.position, or remove them"
+                "position_in_sensor and auto require positions: give pose.position, or remove them"
             )
         return self
 
@@ -253,14 +253,14 @@ class Pose(_Recorded):
 
 
 class Static(_Stream):
-    """Averages over separate poses at rest, one per row."""
+    """Wrenches averaged over separate poses at rest, one pose per row."""
 
     force: Force
     torque: Torque
     sign: Literal[1, -1] = 1
     frame: Frame = "sensor"
     weight: Weight = None
-    gravity: Acceleration | None = Field(default=None, description="g_S in S")
+    gravity: Acceleration | None = Field(default=None, description="gravity in S")
     specific_force: Acceleration | None = Field(
         default=None, description="what an accelerometer reads at rest, -g_S, in S"
     )
@@ -270,7 +270,7 @@ class Static(_Stream):
     @model_validator(mode="after")
     def _check_alternatives(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
-            raise ValueError("give one of gravity (in S), specific_force (in S), orientation")
+            raise ValueError("static needs one of gravity, specific_force (both in S), orientation")
         if self.weight == "removed":
             raise ValueError(
                 "weight: removed cannot be used with static poses: record the load in motion,"
@@ -279,7 +279,7 @@ class Static(_Stream):
         return self
 
 
-class Description(Strict):
+class Description(StrictModel):
     """Description of a log: a wrench with imu, pose or both; or static poses."""
 
     gravity: Gravity = (0.0, 0.0, -STANDARD_GRAVITY)
@@ -291,9 +291,9 @@ class Description(Strict):
     @model_validator(mode="after")
     def _check_streams(self) -> Description:
         if np.abs(self.gravity_W).max() > _MAX_GRAVITY:
-            raise ValueError(f"gravity exceeds {_MAX_GRAVITY:g} m/s^2")
+            raise ValueError(f"gravity exceeds {_MAX_GRAVITY:g} m/s^2: give it in m/s^2")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
-            raise ValueError("gravity: auto is found from a wrench with a pose and no imu")
+            raise ValueError("gravity: auto is found from a pose alone: add pose, and remove imu")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
                 raise ValueError("static poses cannot be combined with wrench, imu or pose")
@@ -315,7 +315,7 @@ class Description(Strict):
 
     def _check_weight(self, wrench: Wrench) -> None:
         if wrench.weight is not None and self.pose is None:
-            raise ValueError("wrench.weight follows from the orientation: add pose")
+            raise ValueError("wrench.weight requires an orientation: add pose")
         pose = self.pose is not None and self.pose.is_frame_auto
         kinds = {"pose: auto": pose, "gravity: auto": self.gravity == "auto"}
         kinds["wrench.weight"] = wrench.weight is not None

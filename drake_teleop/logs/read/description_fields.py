@@ -74,13 +74,13 @@ def _parse_imu_frame(value: Any) -> Any:
 
 def _parse_rotation(value: Any) -> Any:
     if value in ("sensor", "base"):
-        raise ValueError("must be a 3x3 rotation matrix from the posed frame to S, or auto")
+        raise ValueError("must be a 3x3 rotation matrix from posed frame to S, or the word auto")
     return value if value is None else _parse_imu_frame(value)
 
 
 def _parse_position(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
-        raise ValueError("must be three numbers [m], or auto")
+        raise ValueError("a position must be three numbers [m], or the word auto")
     return value
 
 
@@ -90,20 +90,20 @@ def _is_number(value: Any) -> bool:
 
 def _parse_gravity(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
-        raise ValueError("must be a number, three numbers [m/s^2], or auto")
+        raise ValueError("gravity must be a number, three numbers [m/s^2], or the word auto")
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
 def _parse_scale(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
     if any(_is_number(x) and abs(x) < _MIN_SCALE for x in factors):
-        raise ValueError(f"must have absolute values of at least {_MIN_SCALE:g}")
+        raise ValueError(f"factors must have absolute values of at least {_MIN_SCALE:g}")
     return [float(value)] * 3 if _is_number(value) else value
 
 
 def _parse_weight(value: Any) -> Any:
     if value is not None and value != "removed" and not isinstance(value, (list, tuple)):
-        raise ValueError("must be removed, or four numbers [m, m c_x, m c_y, m c_z] [kg, kg m]")
+        raise ValueError("weight must be the word removed, or [m, m c_x, m c_y, m c_z] in kg, kg m")
     return value
 
 
@@ -118,8 +118,8 @@ GainStd = Annotated[
     Field(
         ge=0,
         le=0.2,
-        description="standard deviation of the sensor's gains, 0.01 for 1 %, as its maker or a"
-        " calibration says",
+        description="standard deviation of the sensor's gains, such as 0.01 for 1 %, from its data"
+        " sheet or a calibration",
     ),
 ]
 _NUMBER_OR_VECTOR_SCHEMA: list[dict[str, Any]] = [
@@ -128,7 +128,7 @@ _NUMBER_OR_VECTOR_SCHEMA: list[dict[str, Any]] = [
 ]
 _GRAVITY_SCHEMA = {
     "anyOf": [*_NUMBER_OR_VECTOR_SCHEMA, {"type": "string", "const": "auto"}],
-    "description": "magnitude, or the vector in the world, m/s^2; auto: the direction is found",
+    "description": "magnitude, or the vector in the world, m/s^2; auto: the direction is estimated",
 }
 Gravity = Annotated[
     Vector | Literal["auto"], BeforeValidator(_parse_gravity), WithJsonSchema(_GRAVITY_SCHEMA)
@@ -143,7 +143,7 @@ Weight = Annotated[
     Vector4 | Literal["removed"] | None,
     BeforeValidator(_parse_weight),
     Field(
-        description="that the robot has subtracted: removed if it is the load's, or that of a"
+        description="weight that the robot has subtracted: removed (that of the load), or that of a"
         " payload, [m, m c_x, m c_y, m c_z] in S, kg and kg m"
     ),
 ]
@@ -155,8 +155,8 @@ RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_p
 PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]
 
 
-class Strict(BaseModel):
-    """Frozen model that rejects unknown fields and numbers beyond 1e12."""
+class StrictModel(BaseModel):
+    """Immutable Pydantic model that rejects unknown fields and numbers beyond 1e12."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -169,7 +169,7 @@ class Strict(BaseModel):
         return value
 
 
-class _VectorColumns(Strict):
+class _VectorColumns(StrictModel):
     columns: tuple[Column, ...]
     scale: Scale = (1.0, 1.0, 1.0)
 

@@ -26,11 +26,11 @@ from drake_teleop.logs.read.canonical import Log
 
 # Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
 _MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
-Pairs = list[tuple[Array, Array]]
+SignalPairs = list[tuple[Array, Array]]
 """Signal of the pose and of the IMU, for each sensor, see `comparable_signals`."""
 
 
-def comparable_signals(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
+def comparable_signals(t: Array, imu: Log, pose: Log, gyroscope: bool) -> SignalPairs:
     """Return pairs of signals (N, 3): of the pose at times `t`, and of the IMU on its own clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
@@ -38,7 +38,7 @@ def comparable_signals(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
     return pairs
 
 
-def lag_of_imu_clock(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
+def lag_of_imu_clock(t: Array, pairs: SignalPairs, t_imu: Array, reach: float, arm: Array) -> float:
     """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
 
     The axes of the IMU may differ by any affine map. Effects linear in `arm` (N, k) are removed.
@@ -67,12 +67,12 @@ def lag_of_imu_clock(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Ar
     return lag
 
 
-def clock_drift(
-    t: Array, pairs: Pairs, t_imu: Array, lag: float, independent: float
+def estimate_clock_drift(
+    t: Array, pairs: SignalPairs, t_imu: Array, lag: float, independent: float
 ) -> tuple[float, float]:
     """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
 
-    `lag` [s] is a first estimate. An insignificant drift is set to 0.
+    `lag` [s] is a first estimate, from `independent` samples. An insignificant drift is 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])
@@ -168,9 +168,9 @@ def jackknife_deviations(jacobian: Array, residual: Array, width: int) -> Array:
     return np.where(unknown, np.inf, deviations)
 
 
-MAX_LEVER_DEVIATION = 0.005
+MAX_LEVER_DEVIATION_M = 0.005
 """Largest standard deviation of a determined coordinate [m]."""
-MAX_UNEXPLAINED = 0.05
+MAX_UNEXPLAINED_SHARE = 0.05
 """Largest unexplained share of the variance of a valid fit."""
 COMPARISON_CUTOFF_HZ = 8.0
 """Cut-off of the low-pass on all signals [Hz]."""
@@ -197,7 +197,7 @@ class LeverArm:
     @property
     def is_determined_by_axis(self) -> NDArray[np.bool_]:
         """Booleans (3,): True where the standard deviation is below 5 mm."""
-        return self.deviations < MAX_LEVER_DEVIATION
+        return self.deviations < MAX_LEVER_DEVIATION_M
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
@@ -228,7 +228,7 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     offsets = (wrench - V @ phi).mean(axis=0)
     x, deviations = solve_least_squares(residual_at, np.concatenate([np.zeros(4), offsets, phi]))
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual_at(x), wrench))
-    if (left > MAX_UNEXPLAINED * whole).any():
+    if (left > MAX_UNEXPLAINED_SHARE * whole).any():
         return None
     observable = are_axes_observable(lever_matrix(*motion[1:]), smooth, cutoff)
     return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
@@ -247,7 +247,7 @@ def lever_matrix(omega: Array, alpha: Array) -> Array:
 
 
 def are_axes_observable(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """Return (3,) True for axes along which the motion far exceeds its noise."""
+    """Return (3,) True for axes along which the motion K determines a lever arm."""
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
     noise = above.var(axis=0) / 7
@@ -262,8 +262,7 @@ MAX_RIGHT_ANGLE_ERROR_DEG = 5.0
 MAX_DEVIATION_DEG = 1.0
 """Largest standard deviation of a determined rotation [deg]."""
 MAX_UNEXPLAINED_GRAVITY = 0.005
-"""Lower limit than `MAX_UNEXPLAINED`, for logs without positions: unmodelled accelerations resemble
-a rotation."""
+"""Limit for logs without positions, where unmodelled accelerations resemble a rotation."""
 _MAX_LAG_S = 1.0
 
 
@@ -318,10 +317,10 @@ class Mounting:
     def fits_pose(self) -> bool:
         """Whether IMU and pose agree, with small unexplained shares."""
         omega_agrees = (
-            self.unexplained_turning is None or self.unexplained_turning < MAX_UNEXPLAINED
+            self.unexplained_turning is None or self.unexplained_turning < MAX_UNEXPLAINED_SHARE
         )
         if self.lever is not None:
-            return not self.mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED
+            return not self.mirrored and omega_agrees and self.unexplained < MAX_UNEXPLAINED_SHARE
         # Without positions the pose determines the angular velocity, but not the acceleration.
         known = self.unexplained_turning is not None or self.unexplained < MAX_UNEXPLAINED_GRAVITY
         return not self.mirrored and omega_agrees and known
@@ -359,7 +358,7 @@ def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | 
         arm = lever_matrix(omega, alpha).reshape(-1, 9)
     lag = lag_of_imu_clock(t, pairs, imu.t, reach, arm)
     centre = float(t.mean())
-    middle, drift = clock_drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
+    middle, drift = estimate_clock_drift(t, pairs, imu.t, lag, 2 * cutoff * float(t[-1] - t[0]))
     R, mirrored = _kabsch(resample(t + middle + drift * (t - centre), imu.t, pairs[0][1]), expected)
 
     # The estimated lag allows the use of more samples.

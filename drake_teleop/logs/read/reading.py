@@ -34,7 +34,7 @@ from drake_teleop.logs.read.bags import is_bag, missing_topic_error, read_stream
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, episodes_note, find_gaps_in_times, read_clock
 from drake_teleop.logs.read.description import (
-    ONLY_IN_DESCRIPTION,
+    YAML_ONLY_NOTE,
     Description,
     Imu,
     Pose,
@@ -43,9 +43,9 @@ from drake_teleop.logs.read.description import (
     load_description,
 )
 from drake_teleop.logs.read.streams import (
-    MAX_VALUES,
+    MAX_SIGNAL_VALUES,
     MIN_STREAM_SAMPLES,
-    Orientations,
+    OrientationColumns,
     Stream,
     common_time_of_streams,
     resample_to_clock,
@@ -73,7 +73,6 @@ def read_log(
     specific force from the accelerometer, else from the position, else it is -gravity.
 
     Args:
-        path: the file.
         bandwidth_hz: bandwidth of derivatives, see `smooth_derivatives`; None: the largest.
         differentiate: False leaves the motion zero where poses are its only source, for users of
             `Log.posed`.
@@ -88,13 +87,13 @@ def read_log(
         )
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
-        reader = _Reader(load_description(path), str(path), bandwidth_hz)
-        return reader.read_stream_log(differentiate=differentiate)
+        reader = _LogReader(load_description(path), str(path), bandwidth_hz)
+        return reader.read_recording(differentiate=differentiate)
     if path.suffix.lower() in TABLE_READERS:
         table = read_table(path)
         description = describe_canonical(path, table)
-        reader = _Reader(description, str(path), bandwidth_hz, {path: table})
-        return reader.read_stream_log(keep_origin=True, differentiate=differentiate)
+        reader = _LogReader(description, str(path), bandwidth_hz, {path: table})
+        return reader.read_recording(keep_origin=True, differentiate=differentiate)
     if is_bag(path):
         raise missing_topic_error(path)
     raise DrakeTeleopError(
@@ -112,10 +111,10 @@ def read_description(
     differentiate: bool = True,
 ) -> Log:
     """Return the log of a description with absolute paths, as `read_log`."""
-    return _Reader(description, source, 30.0, tables).read_stream_log(differentiate=differentiate)
+    return _LogReader(description, source, 30.0, tables).read_recording(differentiate=differentiate)
 
 
-class _Reader:
+class _LogReader:
     def __init__(
         self,
         description: Description,
@@ -131,7 +130,7 @@ class _Reader:
         self._one_sided_s = 0.0
         self._tables = dict(tables or {})
 
-    def read_stream_log(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
+    def read_recording(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
         if self._description.static is not None:
             if keep_origin:
                 self._notes.append("each row is interpreted as a pose at rest")
@@ -141,11 +140,11 @@ class _Reader:
         causes = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
         free = tuple(name for name, is_free in causes.items() if is_free)
         if self._description.gravity == "auto":
-            self._replace_auto(estimate_auto_gravity)
+            self._replace_auto_fields(estimate_auto_gravity)
         if self._description.pose is not None and self._description.pose.is_frame_auto:
-            self._replace_auto(estimate_auto_pose_frame, differentiate=False)
+            self._replace_auto_fields(estimate_auto_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.is_mounting_auto:
-            self._replace_auto(estimate_auto_imu_mounting)
+            self._replace_auto_fields(estimate_auto_imu_mounting)
         table = self._table_of_stream(self._description.wrench)
         clock = self._read_clock_and_gaps("wrench", self._description.wrench, table)
         wrench = self._read_wrench("wrench", self._description.wrench, table, clock.total)
@@ -169,19 +168,19 @@ class _Reader:
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
         other = self._description.model_copy(update={"wrench": without})
-        return restore_weight(log, np.array(weight), self._read_edited(other))
+        return restore_weight(log, np.array(weight), self._read_edited_log(other))
 
-    def _replace_auto(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
-        read = partial(self._read_edited, differentiate=differentiate)
+    def _replace_auto_fields(self, describe: _EstimateAuto, *, differentiate: bool = True) -> None:
+        read = partial(self._read_edited_log, differentiate=differentiate)
         self._description, notes = describe(self._description, self._source, read)
         self._notes += notes
 
-    def _read_edited(self, description: Description, *, differentiate: bool = True) -> Log:
+    def _read_edited_log(self, description: Description, *, differentiate: bool = True) -> Log:
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
                 self._table_of_stream(stream)
-        reader = _Reader(description, self._source, 30.0, self._tables)
-        return reader.read_stream_log(differentiate=differentiate)
+        reader = _LogReader(description, self._source, 30.0, self._tables)
+        return reader.read_recording(differentiate=differentiate)
 
     def _table_of_stream(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.source not in self._tables:
@@ -207,12 +206,12 @@ class _Reader:
         values -= getattr(quantity, "bias", 0.0)
         values *= sign * self._description.si_value(quantity.unit) * np.array(quantity.scale)
         is_table = Path(self._source).suffix.lower() in TABLE_READERS
-        of_table = f" ({ONLY_IN_DESCRIPTION})" if is_table else ""
+        of_table = f" ({YAML_ONLY_NOTE})" if is_table else ""
         remedy = (
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
         )
-        table.check_size(values, *MAX_VALUES[field], where, remedy)
+        table.check_size(values, *MAX_SIGNAL_VALUES[field], where, remedy)
         return values
 
     def _read_pose(self, stream: Pose, *, differentiate: bool) -> Stream:
@@ -249,7 +248,7 @@ class _Reader:
             position = self._read_vectors("pose", "position", stream.position, table, clock.total)
             position = clock.select_timed_rows(position)
         where, form = f"{self._source}:pose.orientation", stream.orientation
-        orientations = Orientations(self._description, form, table, clock.total, where)
+        orientations = OrientationColumns(self._description, form, table, clock.total, where)
         quaternion = orientations.allocate_quaternions(len(clock.rows))
         origin = np.array(stream.position_in_sensor)
         for start in range(0, len(quaternion), _CHUNK_ROWS):
@@ -305,7 +304,7 @@ class _Reader:
 
     def _orientation_error(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
         return DrakeTeleopError(
-            "base axes cannot be turned to S without an orientation",
+            "vectors in the axes of the base cannot be rotated to S without an orientation",
             where=f"{self._source}:{name}.frame",
             remedy=remedy,
         )
@@ -322,7 +321,7 @@ class _Reader:
         else:
             assert stream.orientation is not None
             where, form = f"{self._source}:static.orientation", stream.orientation
-            orientations = Orientations(self._description, form, table, table.rows, where)
+            orientations = OrientationColumns(self._description, form, table, table.rows, where)
             R_WS = orientations.rotations(np.arange(table.rows))
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
@@ -336,11 +335,9 @@ class _Reader:
         n = len(wrench)
         if n < MIN_STATIC_POSES:
             raise DrakeTeleopError(
-                f"{n} poses are too few",
+                f"{n} poses at rest are too few (at least {MIN_STATIC_POSES} are required)",
                 where=f"{self._source}:static",
-                remedy=(
-                    f"record at least {MIN_STATIC_POSES}, better 12, with different orientations"
-                ),
+                remedy="record 12 or more, with different orientations",
             )
         rest = np.zeros((n, 3))
         return Log(

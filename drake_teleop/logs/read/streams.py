@@ -24,7 +24,7 @@ from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
 from drake_teleop.logs.read.tables import Table
 
 MIN_STREAM_SAMPLES = 16
-MAX_VALUES = {
+MAX_SIGNAL_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
     "specific_force": (1e6, "m/s^2"),
@@ -91,8 +91,8 @@ def specific_force_at_So(
     return s - np.cross(alpha, p_SoIo_S) - np.cross(omega, np.cross(omega, p_SoIo_S))
 
 
-class Orientations:
-    """Orientations of S in a table's columns, of any form."""
+class OrientationColumns:
+    """Columns of a table that contain orientations of S in any form."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Orientations:
             self._columns *= description.si_value(orientation.unit)
 
     def allocate_quaternions(self, count: int) -> Array:
-        """Return memory (count, 4) for quaternions of increasing rows; it may be the columns'."""
+        """Return an array (count, 4) for quaternions; writing it may overwrite earlier columns."""
         return self._columns[:count] if self._columns.shape[1] == 4 else np.empty((count, 4))
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:
@@ -138,7 +138,7 @@ class Orientations:
         if errors[worst] > ROTATION_TOLERANCE:
             row = self._table.line_in_file(rows[worst])
             raise DrakeTeleopError(
-                f"row {row} of {self._table.path.name} is not a rotation",
+                f"row {row} of {self._table.path.name} is not a rotation or unit quaternion",
                 where=self._where,
                 remedy=f"check the columns and their order; form is {self._orientation.form}",
             )

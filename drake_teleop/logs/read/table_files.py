@@ -36,7 +36,7 @@ _MAX_CELLS_IN_MEMORY = 2**24
 
 
 def read_table(path: Path, *, header: bool = True) -> Table:
-    """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
+    """Read a file with a suffix in `TABLE_READERS`; raise an error if it is invalid.
 
     The columns of a text file without header are named from "0" on.
     """
@@ -63,7 +63,7 @@ def _read_text(path: Path, header: bool = True) -> Table:
 def _strip_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
-        raise ValueError("two column names differ only in spaces")
+        raise ValueError("two column names differ only in spaces at their ends")
     return stripped
 
 
@@ -73,7 +73,7 @@ def _add_canonical_names(columns: dict[str, _Column]) -> dict[str, _Column]:
     return small | columns if canonical and not _CANONICAL_NAMES.issubset(columns) else columns
 
 
-def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
+def _read_frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
     import polars as pl
 
     kind = path.suffix.lower()
@@ -93,7 +93,7 @@ def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
 
 
 def columns_with_nested(frame: pl.LazyFrame) -> dict[str, NDArray]:
-    """Return the columns of a frame by name, and elements of lists and structures as columns.
+    """Return columns of a Polars frame by name, and elements of lists and structures as columns.
 
     Columns of text and binary data, such as images, are omitted.
     """
@@ -151,7 +151,7 @@ def _expand_nested_column(
 
 
 class _LazyColumns(UserDict[str, Any]):
-    """Columns of a frame, each read on access to limit memory."""
+    """Columns of a Polars frame, each read on access to limit memory."""
 
     def __init__(self, frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> None:
         super().__init__(columns)
@@ -216,14 +216,14 @@ def _read_npy(path: Path) -> dict[str, NDArray]:
     if array.dtype.names is not None:
         return {name: array[name] for name in array.dtype.names}
     if array.ndim != 2:
-        raise ValueError(f"it has {array.ndim} axes; give an array of rows and columns")
+        raise ValueError(f"its array has {array.ndim} dimensions; save one of rows and columns")
     return {str(k): array[:, k] for k in range(array.shape[1])}
 
 
-_Arrays = Callable[[Path], dict[str, NDArray]]
+_ArrayReader = Callable[[Path], dict[str, NDArray]]
 
 
-def _columns_reader(read: _Arrays) -> _Arrays:
+def _columns_reader(read: _ArrayReader) -> _ArrayReader:
     return lambda path: array_columns(read(path))
 
 
@@ -232,7 +232,7 @@ TABLE_READERS: Registry[Callable[[Path], MutableMapping[str, NDArray] | Table]] 
     {
         **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
         **dict.fromkeys(
-            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _frame_columns
+            (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx"), _read_frame_columns
         ),
         ".npz": _columns_reader(_read_npz),
         ".npy": _columns_reader(_read_npy),

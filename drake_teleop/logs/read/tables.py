@@ -31,7 +31,7 @@ class Table:
             row-major.
         first_row: number of the first data row in the file.
         absent: names of column groups that the file marks as not provided.
-        whole: table of all rows, if these are a part of them.
+        whole: table of all rows, if this one has only some of them.
         kept: row numbers in `whole`, counted from 0; None: all rows.
     """
 
@@ -43,7 +43,7 @@ class Table:
     kept: NDArray[np.intp] | None = None
 
     def line_in_file(self, row: int) -> int:
-        """Return the number in the file of a row of this table, for messages."""
+        """Return the number that a row of this table has in its file, for messages."""
         return self.first_row + int(row if self.kept is None else self.kept[row])
 
     def rows_with_numbers(self, names: Sequence[str | int]) -> Table:
