@@ -148,14 +148,16 @@ def shards(folder: Path, arguments: argparse.Namespace) -> dict[str, float]:
         rows = out / f"shards/{number}-of-{count}/runs.parquet"
         process = subprocess.Popen(words)
         if number in chosen and not rows.exists():
-            stored, last, stop = -1, 0.0, draw.randint(1, arguments.runs // count - 1)
-            while stored < stop:
+            # A file holds several runs; a shard that is faster than that is not killed.
+            stored, last, stop = -1, 0.0, draw.randint(1, max(1, arguments.runs // count // 8))
+            while stored < stop and process.poll() is None:
                 if (now := len(list(rows.glob("run_*.parquet")))) != stored:
                     stored, last = now, cpu_s_of(process.pid)
                 time.sleep(0.01)
             time.sleep(draw.uniform(0.0, 0.5))  # in the middle of a run
-            lost += cpu_s_of(process.pid) - last
-            process.send_signal(signal.SIGKILL)
+            if process.poll() is None:
+                lost += cpu_s_of(process.pid) - last
+                process.kill()
         process.wait()
     before = cpu_s()
     run(study, out, "--merge")
