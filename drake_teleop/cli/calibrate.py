@@ -43,7 +43,7 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `largest` is the range of the sensor: force [N], torque [N m].
+    `until` is the required accuracy of the load, `largest` the range of the sensor: [N, N m].
     """
     tolerance = read_tolerance(until)
     make_folder(out)

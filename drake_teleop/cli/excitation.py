@@ -62,13 +62,13 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Design, check and write an excitation trajectory; return the content of both JSON files.
+    """Design, check and write an excitation trajectory; return summary and session in one.
 
     Args:
         model: model file of another arm, with the scenario's sensor.
         sensor_frame: name of the sensor's frame, required with `model`.
-        until: tolerance, which replaces criterion, period and seconds.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
+        until: required accuracy of the load; replaces criterion, period and seconds.
+        quiet: True hides progress bars and tables; `progress` False hides only the bars.
     """
     tolerance = None if until is None else read_tolerance(until)
     setup = LoadScenario(scenario)
@@ -80,7 +80,7 @@ def excite_command(
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
             raise DrakeTeleopError(
-                "is missing, and the model does not contain the sensor's position",
+                "is required with --model, which does not contain the sensor's position",
                 where="--sensor-frame",
                 remedy="name the frame or link at which it measures",
             )
@@ -171,7 +171,7 @@ def _criterion_text(name: str, robot: Robot) -> str:
 
 
 def trajectory_table(found: Excitation) -> pl.DataFrame:
-    """Return the content of trajectory.csv: one period at 1 kHz, both ends included."""
+    """Return trajectory.csv: joint motion of one period at 1 kHz, both ends included."""
     period = found.trajectory.period
     t = np.linspace(0, period, round(period * RATE) + 1)
     columns = {"t": t}

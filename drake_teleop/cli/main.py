@@ -1,4 +1,4 @@
-"""Command line (long: all commands and their options). It imports large packages on demand."""
+"""All commands of `drake-teleop` and their options; large packages are imported on demand."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from drake_teleop.common.version import __version__
     type=option.PATH,
     multiple=True,
     metavar="FILE",
-    help="Import this Python file first, which registers own parts; may be repeated.",
+    help="Python file that registers your own parts (docs/extend.md); may be repeated.",
 )
 def cli(scripts: tuple[Path, ...]) -> None:
-    """Bilateral teleoperation with non-contact force scaling: simulate it, and use it on logs.
+    """Bilateral teleoperation with non-contact force scaling: simulate it, or use it on logs.
 
-    Every command with --out writes its figures by name into DIR/summary.json. A command with
+    Every command with --out writes its results by name into DIR/summary.json. A command with
     invalid input exits with status 2 and one error line.
 
     The Tab key completes commands, options, names and files in bash (zsh, fish: likewise) after
@@ -50,7 +50,8 @@ def cli(scripts: tuple[Path, ...]) -> None:
 def reproduce(out: Path, **options: Any) -> int:
     """Repeat the paper's experiments.
 
-    Writes the paper's figures and numbers beside the simulated ones, a 3D replay and report.html.
+    Writes figures and numbers of the paper (Kubus, Weidauer, Wahl 2009) and of the simulation, a
+    3D replay and report.html.
     The exit status is 1 if a number is outside its accepted range.
     """
     from drake_teleop.lab.reproduction.report import describe_unaccepted
@@ -68,14 +69,14 @@ def reproduce(out: Path, **options: Any) -> int:
     "--inputs",
     type=option.PATH,
     metavar="DIR",
-    help="Repeat the drive recorded in this folder, to the same bytes.",
+    help="Folder of `drive --record`; repeat this session with identical results.",
 )
 @option.out("run")
 @option.seed
-@click.option("--fresh", is_flag=True, help="Identify the load again, without the cache.")
+@click.option("--fresh", is_flag=True, help="Identify the load again; ignore the cache.")
 @option.quiet
 def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) -> None:
-    """Simulate one scenario, or repeat a recorded drive.
+    """Simulate one scenario, or repeat a session of `drive`.
 
     SCENARIO is a shipped name or a YAML file. Writes the log, pictures and a 3D replay. The load is
     identified first and kept in the user's cache folder, or in $DRAKE_TELEOP_CACHE_DIR.
@@ -83,7 +84,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
     from drake_teleop.lab.run import run_command
 
     if (scenario is None) == (inputs is None):
-        raise click.UsageError("give a SCENARIO, or --inputs with the folder of a drive")
+        raise click.UsageError("give either SCENARIO, or --inputs and a folder of `drive --record`")
     drive = None
     if inputs is not None:
         from drake_teleop.live.session import read_drive
@@ -94,7 +95,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO, default="contact_transition")
-@click.option("--record", type=option.PATH, metavar="DIR", help="Record the drive in this folder.")
+@click.option("--record", type=option.PATH, metavar="DIR", help="Record the session in DIR.")
 @click.option(
     "--port",
     type=option.Integer(0, 65535),
@@ -102,14 +103,14 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
     show_default="any free port",
     help="TCP port of the page on localhost.",
 )
-@click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
+@click.option("--no-browser", is_flag=True, help="Print the page's address; open no browser.")
 @click.option(
     "--device",
     metavar="ADDRESS",
     help="Haptic device of the operator: udp://127.0.0.1:PORT or haply://localhost:10001.",
 )
 @click.option(
-    "--study", metavar="FILE", help="Run this blind experiment with people; SCENARIO is unused."
+    "--study", metavar="FILE", help="Experiment with participants; SCENARIO is then unused."
 )
 @click.option(
     "--results",
@@ -117,19 +118,19 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
     default=Path("out/experiment"),
     show_default=True,
     metavar="DIR",
-    help="Results of --study; an experiment continues in the same folder.",
+    help="Folder for results of --study; the same folder continues an experiment.",
 )
 @click.option(
     "--participant",
     type=option.Integer(1, 9999),
     show_default="the first with trials left, or a new one",
-    help="Number of the participant of --study.",
+    help="Number that identifies the participant of --study.",
 )
 @click.option(
     "--simulated",
     type=option.Integer(0, 9999),
     default=0,
-    help="Number of simulated participants of --study, without a page.",
+    help="Number of participants to simulate in --study; 0: people, on the page.",
 )
 def drive(
     scenario: str,
@@ -143,10 +144,10 @@ def drive(
 ) -> None:
     """Drive a station live in the browser.
 
-    SCENARIO is a shipped name or a YAML file; only the grip of its operator is used. One page on
-    this machine moves the hand by mouse, keys, touch or gamepad, which vibrates in contact, and
-    shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a recorded drive. With --study, a
-    shipped experiment or a YAML file, the page asks participants which interval they felt.
+    SCENARIO is a shipped name or a YAML file; your hand replaces its operator's motion, not the
+    grip. One page on this machine moves the hand by mouse, keys, touch or gamepad (it vibrates in
+    contact), and shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a recorded session.
+    --study is the name or YAML file of an experiment, in which participants compare two intervals.
     """
     options["browser"] = not no_browser
     if study is None:
@@ -179,9 +180,9 @@ def print_scenario(name: str | None) -> None:
 
 @cli.command()
 def parts() -> None:
-    """List the parts that can be selected by name.
+    """List the names of all methods, formats and other parts.
 
-    Own parts are added by --register FILE: drake-teleop --register mine.py parts
+    --register FILE adds your own parts: drake-teleop --register mine.py parts
     """
     from drake_teleop.cli.printing import print_parts
 
@@ -191,7 +192,7 @@ def parts() -> None:
 @cli.command()
 @click.argument("folder", type=option.PATH)
 @click.option(
-    "--scenario", metavar="SCENARIO", help="Scenario of the log.  [default: the file beside it]"
+    "--scenario", metavar="SCENARIO", help="Scenario of the log.  [default: YAML file beside it]"
 )
 @option.out("replay")
 @option.quiet
@@ -214,7 +215,8 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
     type=option.Registered("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
     show_default=True,
-    help="Least squares; also weighted by noise; also without impacts; also physically consistent.",
+    help="Least squares; whitened: weighted by noise; robust: also without disturbed samples;"
+    " consistent: also possible for a rigid body.",
 )
 @option.out("identify")
 @option.cutoff
@@ -235,23 +237,25 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @click.argument("log", type=option.PATH)
 @option.load(required=True)
 @option.gripper
-@option.sigma("Scale of the non-contact wrench; of the gripper's with --gripper.")
+@option.sigma("Scale of the non-contact wrench; with --gripper, of the gripper's.")
 @click.option(
     "--sigma-object",
     type=option.SCALE,
-    help="Scale of the object's non-contact wrench, with --gripper.  [default: sigma]",
+    help="With --gripper: scale of the object's non-contact wrench.  [default: value of --sigma]",
 )
 @option.separate_sigmas
 @option.gamma
 @click.option(
-    "--eta", type=option.Number(0, 1), help="Share of a gripped object's wrench that is kept."
+    "--eta",
+    type=option.Number(0, 1),
+    help="Kept share of the object's wrench; replaces all scales.",
 )
 @click.option(
     "--offsets",
     type=click.Choice(["record", "load"]),
     default="record",
     show_default=True,
-    help="Sensor offsets: estimated from LOG, or those of the load file.",
+    help="Source of the sensor offsets: LOG (record) or the load file (load).",
 )
 @click.option(
     "--untouched",
@@ -259,19 +263,20 @@ def identify(log: Path, out: Path, **options: Any) -> None:
     type=option.Number(0, 36000),
     nargs=2,
     metavar="START STOP",
-    help="Seconds of LOG without contact, which determine the offsets.  [default: all]",
+    help="Contact-free time of LOG [s], which determines the offsets.  [default: the whole LOG]",
 )
 @click.option(
     "--causal",
     type=click.Choice(["delayed", "predicted"]),
-    help="Also eliminate causally: with the lag of the low-pass, or extrapolated over it.",
+    help="Add a causal result: late by the lag of the low-pass, or extrapolated over this lag.",
 )
 @click.option(
     "--causal-tare",
     "causal_tare_s",
     type=option.Number(0, 36000, min_open=True),
     metavar="SECONDS",
-    help="With --causal: contact-free start that gives the offsets.  [default: the load file's]",
+    help="With --causal: length of the contact-free start of LOG that determines the offsets [s]."
+    "  [default: offsets of the load file]",
 )
 @option.free
 @option.out("eliminate")
@@ -281,8 +286,8 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
     """Eliminate or scale non-contact forces in a log.
 
-    LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Writes the log of the
-    contact wrench and of the scaled wrench.
+    LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Writes a table of the
+    contact wrench and the scaled wrench.
     """
     from drake_teleop.cli.logs import eliminate_command
 
@@ -298,7 +303,7 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
     type=click.Choice(["level", "cusum", "glr"]),
     default="level",
     show_default=True,
-    help="Wrench over its noise floor: its level, cumulative sum or likelihood ratio.",
+    help="Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.",
 )
 @option.out("detect")
 @option.cutoff
@@ -308,7 +313,7 @@ def detect(log: Path, out: Path, **options: Any) -> None:
     """Find contact in a log.
 
     LOG is a canonical log (.csv, .parquet) or a log description (.yaml). The load's own wrench is
-    eliminated; the noise floor of the remaining wrench rises with the acceleration.
+    eliminated; noise of the remaining wrench is modelled as rising with the acceleration.
     """
     from drake_teleop.cli.logs import detect_command
 
@@ -325,7 +330,7 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 
     LOG is a canonical log, a log description (.yaml), or a table of any columns, for which a draft
     description is written; OTHERS are further tables of the same recording. Reports rates, gaps,
-    noise, saturation and errors of convention.
+    noise, saturation and suspicious signs, axes and units.
     """
     from drake_teleop.logs.inspection import inspect_command
 
@@ -335,12 +340,12 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 @cli.command()
 @click.argument("path", type=option.PATH)
 @option.load()
-@click.option("--identify", is_flag=True, help="Identify the load from the episodes.")
+@click.option("--identify", is_flag=True, help="Identify the load from all episodes.")
 @click.option(
     "--description",
     type=option.PATH,
     metavar="FILE",
-    help="Log description of an episode, without file.  [default: drafted from the episodes]",
+    help="Log description, for all episodes, without `file`.  [default: drafted from the episodes]",
 )
 @option.jobs
 @option.out("dataset")
@@ -360,7 +365,9 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @cli.command()
 @click.argument("source")
 @option.load(required=True)
-@click.option("--out", "sink", default="-", metavar="SINK", help="Destination.  [default: stdout]")
+@click.option(
+    "--out", "sink", default="-", metavar="SINK", help="Destination.  [default: -, stdout]"
+)
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
@@ -369,22 +376,22 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
     "rate_hz",
     type=option.POSITIVE,
     metavar="HZ",
-    help="Rate of the wrenches; known for a log, a UR and a NetBox.",
+    help="Rate of the wrenches; not needed for replay:, rtde:// and netft://.",
 )
-@click.option("--predicted", is_flag=True, help="Extrapolate over the lag of the low-pass.")
+@click.option("--predicted", is_flag=True, help="Extrapolate the results over the low-pass lag.")
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
 @click.option(
     "--free",
     type=option.PATH,
     metavar="LOG",
-    help="Flag contact by the noise floor of this log of free motion, as `detect` does.",
+    help="Log of free motion, whose noise sets the threshold of contact flags, as for `detect`.",
 )
-@click.option("--tare", is_flag=True, help="Set the offsets at the start, at rest without contact.")
+@click.option("--tare", is_flag=True, help="Tare at the start: keep the tool free, at rest.")
 @click.option(
     "--control",
     type=option.Integer(1, 65535),
     metavar="PORT",
-    help="UDP port on localhost for the command `tare`.",
+    help="UDP port on localhost that accepts the request `tare`.",
 )
 @option.stream
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
@@ -393,8 +400,8 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, ros2://TOPIC, zenoh://HOST/TOPIC, - for
     lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT, ros2://TOPIC,
     zenoh://HOST/TOPIC, foxglove://, - for stdout, or a .csv, .parquet or .mcap file.
-    Invalid wrenches are zero, with a flag. --cutoff is causal here. --delay is the
-    delay of the motion behind the wrench; auto: the value in the load file.
+    An invalid wrench is replaced by zero, with a flag. --cutoff is causal here. --delay is the
+    delay of the motion behind the wrench; auto starts with the value in the load file.
     The command ends with the source or with Ctrl-C.
     """
     from drake_teleop.robots.compensate import compensate_command
@@ -449,14 +456,14 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
     default="mass 0.5 %, com 0.5 mm, inertia 5 %",
     show_default=True,
     metavar="TOLERANCE",
-    help="Required accuracy of each parameter; parameters left out are not required.",
+    help="Required accuracy; mass, com or inertia may be left out.",
 )
 @click.option(
     "--seconds",
     type=option.Number(1, 36000),
     default=120.0,
     show_default=True,
-    help="Largest length of the record [s].",
+    help="Maximum duration of the recording [s].",
 )
 @option.stream
 @option.out("calibrate")
@@ -466,7 +473,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 
     SOURCE is as for `compensate`. Move the tool manually or by the motion of `excite`, without
     contact. The command ends when all tolerances are reached; it writes the log and the results of
-    `identify`. The exit status is 1 if it ends before.
+    `identify`. The exit status is 1 if the time ends before.
     """
     from drake_teleop.cli.calibrate import calibrate_command
 
@@ -485,7 +492,7 @@ _EXPORT_FORMATS = option.Registered(
 @cli.command()
 @click.argument("identification", type=option.PATH)
 @click.option("--to", required=True, type=_EXPORT_FORMATS, help="Robot or file format.")
-@option.sensor_pose("Sensor in the flange [m, deg].  [default: values in the sensor's frame]")
+@option.sensor_pose("Pose of the sensor in the flange [m, deg].  [default: same frames]")
 @click.option(
     "--sign",
     type=click.Choice(["-1", "1"]),
@@ -498,7 +505,7 @@ _EXPORT_FORMATS = option.Registered(
     "rate_hz",
     type=option.POSITIVE,
     metavar="HZ",
-    help="Rate of the readings; required by c99.",
+    help="Rate of the sensor's readings; required by c99, fmu and ros2_filter.",
 )
 @option.cutoff
 @option.sensor_range
@@ -513,9 +520,9 @@ def export(
     """Write a load for a robot, model or controller.
 
     Prints the load of an identification.json in the format, units and frame of a robot, a
-    compensation or a model. c99 writes the compensation itself into --out, as code of a controller
-    with --rate, --cutoff and --range. Values that are dropped or not identified are listed on
-    stderr.
+    compensation or a model. c99, fmu and ros2_filter write the compensation itself into --out, as
+    code of a controller with --rate, --cutoff and --range. Values that are dropped or not
+    identified are listed on stderr.
     """
     from drake_teleop.load.identification import Identification
 
@@ -573,8 +580,8 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command("compare-passivity")
-@click.option("--networks", type=option.Names(), help="Presets.  [default: lan to lunar]")
-@click.option("--methods", type=option.Names(), help="Methods.  [default: all]")
+@click.option("--networks", type=option.Names(), help="Network presets.  [default: all but ideal]")
+@click.option("--methods", type=option.Names(), help="Passivity methods.  [default: all]")
 @click.option(
     "--scenario",
     default="contact_transition",
@@ -590,9 +597,9 @@ def compare_passivity(
 ) -> None:
     """Compare passivity methods over networks with delay.
 
-    The station moves freely and presses on a soft and a stiff leaf. In one degree of freedom the
-    hand releases and taps, for increasing round trips. Writes a decision table, pictures and
-    report.html.
+    The station moves freely and presses on a soft and a stiff leaf spring. In a model with one
+    degree of freedom the hand lets go or taps, for increasing round trips. Writes a decision table,
+    pictures and report.html.
     """
     from drake_teleop.lab.comparison import compare_passivity as comparison
 
@@ -606,15 +613,15 @@ def compare_passivity(
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO)
-@click.option("--hands", type=option.Names(), help="Grips.  [default: light,firm]")
-@click.option("--walls", type=option.Names(), help="Stiffnesses [kN/m].  [default: 0.5,20]")
-@click.option("--network", help="Preset of the network.  [default: of the scenario]")
+@click.option("--hands", type=option.Names(), help="Grips of the operator.  [default: light,firm]")
+@click.option("--walls", type=option.Names(), help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option("--network", help="Network preset.  [default: that of the scenario]")
 @click.option(
     "--task",
     type=click.Choice(["press", "touch", "insert"]),
     default="press",
     show_default=True,
-    help="Task; it sets the required margin.",
+    help="Task; it sets the required stability margin of gamma.",
 )
 @option.jobs
 @option.out("tune")
@@ -642,13 +649,13 @@ def tune(
 @click.argument("study", type=option.STUDY)
 @option.jobs
 @option.cluster
-@click.option("--shard", metavar="K/N", help="Run part K of N, e.g. 3/8; see docs/cluster.md.")
+@click.option("--shard", metavar="K/N", help="Run only part K of N, e.g. 3/8; see docs/cluster.md.")
 @click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
 @option.yes
 @option.out("study")
 @option.quiet
 def study(study: Path, out: Path, **options: Any) -> None:
-    """Run a scenario over a design of its fields.
+    """Run a scenario for varied values of its fields.
 
     STUDY is a YAML file with factors, design, repeats and measures, or a shipped name. Writes one
     table with a row for each run, and pictures. After an interruption, repeat the command.
@@ -662,7 +669,7 @@ def study(study: Path, out: Path, **options: Any) -> None:
 @option.jobs
 @option.cluster
 @click.option(
-    "--repeats", type=option.Integer(1, 10**6), help="Seeds of each point.  [default: 12]"
+    "--repeats", type=option.Integer(1, 10**6), help="Runs per combination.  [default: 12]"
 )
 @option.yes
 @option.out("scaling-study")
@@ -670,8 +677,8 @@ def study(study: Path, out: Path, **options: Any) -> None:
 def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
 
-    Runs the operator's tasks over sigma, gamma and eta, about 1000 times. After an interruption,
-    repeat the command.
+    Simulates the operator's tasks for combinations of sigma, gamma and eta, in about 1000 runs.
+    After an interruption, repeat the command.
     """
     from drake_teleop.lab.studies.scaling_study import scaling_study_command
 
@@ -680,27 +687,29 @@ def scaling_study(out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=option.SCENARIO, default="identification")
-@click.option("--model", type=option.PATH, help="Another arm: URDF, SDF, MJCF or .dmd.yaml.")
+@click.option("--model", type=option.PATH, help="Other arm: URDF, SDF, MJCF or .dmd.yaml file.")
 @option.sensor_frame()
 @option.package_paths
 @click.option(
     "--acceleration",
     type=option.PositiveNumbers(),
     default=(),
-    help="Limits of the model's joints [rad/s^2], one for all or one for each.",
+    help="With --model: acceleration limits [rad/s^2], one for all joints or one for each.",
 )
 @click.option(
     "--payload",
     type=option.Number(0, 1e4, min_open=True),
     metavar="KG",
-    help="Heaviest load of the model [kg].  [default: 130 % of the model beyond the sensor]",
+    help="With --model: heaviest load of the sensor [kg]."
+    "  [default: 130 % of the model's mass beyond the sensor]",
 )
 @click.option(
     "--criterion",
     type=click.Choice(["kappa_w10", "kappa10", "kappa16", "A16", "D16"]),
     default="kappa_w10",
     show_default=True,
-    help="Condition number (whitened; in SI units; with offsets), or predicted errors.",
+    help="Condition number (kappa_w10: whitened; kappa10: SI units; kappa16: with offsets)"
+    " or predicted errors (A16: rms; D16: geometric mean).",
 )
 @click.option(
     "--period",
@@ -708,24 +717,24 @@ def scaling_study(out: Path, **options: Any) -> None:
     default=6.0,
     show_default=True,
     metavar="SECONDS",
-    help="Length of the motion.",
+    help="Duration of one period of the motion.",
 )
 @click.option(
     "--harmonics",
     type=option.Integer(2, 20),
-    help="Harmonics of each joint.  [default: 5, with --until 3]",
+    help="Number of harmonics.  [default: 5; 3 with --until]",
 )
 @click.option(
     "--until",
     metavar="TOLERANCE",
-    help='Find the shortest motion that reaches, e.g., "mass 0.5 %, com 0.5 mm, inertia 5 %".',
+    help='Find the shortest motion for an accuracy such as "mass 0.5 %, com 0.5 mm, inertia 5 %".',
 )
 @click.option(
     "--time",
     "seconds",
     type=option.Number(0, 1e6, min_open=True),
     metavar="SECONDS",
-    help="CPU time of the optimiser.  [default: four starts, the same on every machine]",
+    help="CPU time of the optimiser.  [default: time for four starts, with reproducible results]",
 )
 @option.seed_0
 @option.out("excite")
@@ -759,7 +768,7 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
     default="phantom_premium_15",
     show_default=True,
     metavar="NAME",
-    help="Haptic device of the master.",
+    help="Preset of the master's haptic device.",
 )
 @click.option("--sensor", metavar="PRESET", help="Preset of the wrist sensor.")
 @option.quiet
@@ -767,7 +776,7 @@ def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
     """Create a station with your own arm.
 
     Writes FOLDER/station.yaml, a short commented scenario: start of the arm, scales that fit the
-    device, a wall below the tool. Then runs it once, into FOLDER/first_run.
+    device, a wall below the tool. Then simulates it once, into FOLDER/first_run.
     """
     from drake_teleop.lab.new_station import new_command
 
@@ -777,8 +786,8 @@ def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0, 2 for invalid input, 130 for Ctrl-C or SIGTERM.
 
-    A live session that the user ends has status 0. Status 1: `reproduce` finds an unaccepted
-    number, or `calibrate` ends before all tolerances are reached.
+    A live session that the user ends has status 0. Status 1: `reproduce` finds a number outside
+    its accepted range, or `calibrate` ends before all tolerances are reached.
     """
     install_handlers()
     atexit.register(gc.freeze)  # the last collection takes 1 s with Drake's objects

@@ -1,4 +1,4 @@
-"""Parameter types and options of several commands."""
+"""Parameter types, and options that several commands share."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class Names(click.ParamType):
 
 
 class Registered(click.Choice):
-    """Parameter type: one of the shipped names, or a registered part of this kind."""
+    """Parameter type: name of a part of this kind, shipped or registered by the user."""
 
     def __init__(self, kind: str, *shipped: str) -> None:
         super().__init__(shipped)
@@ -182,7 +182,7 @@ def _remove_empty_folders(new: list[Path]) -> None:
 
 
 _SEED = Integer(0, 2**32 - 1)
-seed = click.option("--seed", type=_SEED, help="Seed of the noise.  [default: the scenario's]")
+seed = click.option("--seed", type=_SEED, help="Seed of the noise.  [default: of the scenario]")
 seed_0 = click.option("--seed", type=_SEED, default=0, show_default=True, help="Random seed.")
 jobs = click.option(
     "--jobs",
@@ -193,7 +193,7 @@ jobs = click.option(
 cluster = click.option(
     "--cluster",
     metavar="ADDRESS",
-    help="Dask scheduler that runs the processes, or local for one on this machine.",
+    help="Dask scheduler that runs the processes; local: start one on this machine.",
 )
 quiet = click.option("--quiet", is_flag=True, help="Print no progress bars and no tables.")
 cutoff = click.option(
@@ -203,7 +203,7 @@ cutoff = click.option(
     default=30.0,
     show_default=True,
     metavar="HZ",
-    help="Low-pass on all signals [Hz]; zero-phase for logs, causal for live streams.",
+    help="Cutoff of the low-pass on all signals; zero-phase for logs, causal for live streams.",
 )
 sensor_range = click.option(
     "--range",
@@ -229,7 +229,7 @@ package_paths = click.option(
     type=PATH,
     multiple=True,
     metavar="DIR",
-    help="Folder of package:// addresses in the model; may be repeated.",
+    help="Folder to search for package:// files of the model; may be repeated.",
 )
 gripper = click.option(
     "--gripper",
@@ -268,7 +268,7 @@ def sigma(text: str) -> Callable[[Any], Any]:
 
 
 def separate_sigmas(command: Any) -> Any:
-    text = "Scale of the load's {} alone.  [default: sigma]"
+    text = "Scale of the load's {} alone.  [default: value of --sigma]"
     for part in ("inertia", "weight"):
         option = click.option(f"--sigma-{part}", type=SCALE, help=text.format(part))
         command = option(command)
@@ -308,7 +308,7 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         delay,
         cutoff,
-        click.option("--real-time", is_flag=True, help="Replay a log in real time."),
+        click.option("--real-time", is_flag=True, help="Replay a log at its recorded speed."),
         sensor_range,
         sensor_pose("Pose of the sensor in the frame of the streamed poses [m, deg]."),
         package_paths,
@@ -316,10 +316,10 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--model",
             type=PATH,
-            help="Model of the arm (URDF, SDF, MJCF), if the motion is that of its joints.",
+            help="Model of the arm (URDF, SDF, MJCF), if SOURCE gives joint angles, no poses.",
         ),
         click.option(
-            "--motion", metavar="SOURCE", help="Source of the motion, if it is not SOURCE."
+            "--motion", metavar="SOURCE", help="Another source of the motion, as for SOURCE."
         ),
     ):
         decorated = option(decorated)

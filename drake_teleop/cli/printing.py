@@ -1,4 +1,4 @@
-"""Tables of the log commands on the terminal."""
+"""Printed results of `identify`, `eliminate`, `detect` and `parts`."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
-    """Print the contacts, and the shares of time above the thresholds."""
+    """Print the table of contacts, and the shares of time above the thresholds."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -132,7 +132,7 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
-    """Print a table, the text `figures`, delay and notes, and the output folder."""
+    """Print a table, the text `figures`, the delay, the notes and the output folder."""
     from rich.console import Console
 
     lines = [figures]
