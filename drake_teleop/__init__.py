@@ -1,7 +1,6 @@
 """Bilateral teleoperation with non-contact force scaling, on Drake.
 
-The names that most users need are imported here, each at its first use: `import drake_teleop` is
-fast, and work with a log does not load the simulator.
+Its names are imported at their first use: work with a log does not load the simulator.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ def test_untraceable_references_raise(tmp_path, monkeypatch):
     (tmp_path / "reads_a_list.py").write_text(
         HEAD + "LIST = [1]\n\n@njit(cache=True)\ndef f():\n    return LIST[0]\n"
     )
-    with pytest.raises(TypeError, match=r"reads \[1\]"):
+    with pytest.raises(TypeError, match=r"uses \[1\], whose changes"):
         import_module("reads_a_list").f()
 
 

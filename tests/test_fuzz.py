@@ -31,7 +31,7 @@ SAID = {
     "inspect-no_stamp.npz": "",
     "inspect-lengths.npz": "'q_z' of case.npz has 160 rows where 80 are needed",
     "load-negative_variance.json": "covariance: has a negative variance",
-    "load-no_mass.json": "phi: has no mass",
+    "load-no_mass.json": "phi: has the mass 0",
     "log_parquet-panic.parquet": "cannot be read: it is damaged",
     "mjcf-latin_1.xml": "is not UTF-8 text (byte ",
     "mjcf-size.xml": "geom of l2: size '1e300 0.2 0.1' exceeds 1e+06",

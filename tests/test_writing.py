@@ -109,7 +109,7 @@ def test_impossible_folder_raises_one_line(tmp_path, monkeypatch):
         with pytest.raises(CannotWrite, match=f"cannot be made a folder .{reason}.; give another"):
             make_folder(tmp_path / folder)
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # which root never sees
-    with pytest.raises(CannotWrite, match="is a write-protected folder; give another"):
+    with pytest.raises(CannotWrite, match="is a folder without write permission; give another"):
         make_folder(tmp_path)
 
 

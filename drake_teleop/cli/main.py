@@ -147,7 +147,7 @@ def drive(
     SCENARIO is a shipped name or a YAML file; your hand replaces its operator's motion, not the
     grip. One page on this machine moves the hand by mouse, keys, touch or gamepad (it vibrates in
     contact), and shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a recorded session.
-    --study is the name or YAML file of an experiment, in which participants compare two intervals.
+    In an experiment (--study: name or YAML file) participants compare two intervals.
     """
     options["browser"] = not no_browser
     if study is None:
@@ -786,8 +786,7 @@ def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0, 2 for invalid input, 130 for Ctrl-C or SIGTERM.
 
-    A live session that the user ends has status 0. Status 1: `reproduce` finds a number outside
-    its accepted range, or `calibrate` ends before all tolerances are reached.
+    `reproduce` and `calibrate` can have status 1. A live session that the user ends has status 0.
     """
     install_handlers()
     atexit.register(gc.freeze)  # the last collection takes 1 s with Drake's objects

@@ -101,7 +101,6 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
-    """Print the table of contacts, and the shares of time above the thresholds."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -147,7 +146,6 @@ def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) 
 
 
 def print_parts() -> None:
-    """Print the names of all parts by kind; registered ones are marked with `*`."""
     import click
 
     from drake_teleop.common.registry import REGISTRIES

@@ -46,7 +46,7 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
 
 
 def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled function (address, arguments) that calls the function at an address."""
+    """Return a compiled function f(address, arguments) that calls machine code at an address."""
 
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
@@ -204,7 +204,7 @@ def _constant_text(value: Any) -> str:
         return _qualified_name(value)
     if isinstance(value, _PLAIN_TYPES):
         return repr(value)
-    raise TypeError(f"a compiled function reads {value!r}; its cache cannot see when that changes")
+    raise TypeError(f"a cached compiled function uses {value!r}, whose changes are not detected")
 
 
 def _qualified_name(value: Any) -> str:

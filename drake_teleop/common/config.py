@@ -62,7 +62,7 @@ def short_text(value: Any) -> str:
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Check field names and types of parsed YAML against a dataclass."""
+    """Check field names and types of parsed YAML by a dataclass; `tagged` allows a YAML tag."""
     if not isinstance(data, dict):
         raise DrakeTeleopError(
             f"expected a mapping of fields, found {short_text(data)}",
@@ -90,7 +90,7 @@ def check_name(schema: type, name: Any, where: str) -> None:
 
 
 def check_field(schema: type, name: str, value: Any, where: str) -> None:
-    """Raise DrakeTeleopError, with the place `where`, unless a field may have this value."""
+    """Raise DrakeTeleopError, for the place `where`, if the field cannot have this value."""
     check_name(schema, name, where)
     entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
     _check_value(entry, _kind_of_field(entry, _type_hints(schema)[name]), value, where)
@@ -162,9 +162,9 @@ def _field_names(schema: type) -> list[str]:
 
 
 class Kind(NamedTuple):
-    """Structure of a type: `list[A | B] | None` is (1, (A, B), True).
+    """Structure of a field's type: `list[A | B] | None` is (1, (A, B), True).
 
-    With `by_name` it is a mapping of names to items, `dict[str, A]`.
+    With `by_name` the type is a mapping of names to items, `dict[str, A]`.
     """
 
     lists: int
@@ -298,7 +298,7 @@ class FieldInfo:
 
 
 def settings(block: _Class) -> _Class:
-    """Make a dataclass check what it is assigned, and list its fields in its docstring.
+    """Decorate a dataclass: check assigned values, and list the fields in its docstring.
 
     Its module must not postpone annotations: `yaml_load_typed` reads the types of the fields.
     """
@@ -352,7 +352,6 @@ def unchecked_assignments() -> Iterator[None]:
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
-    """Return the descriptions of the fields of a settings dataclass or instance."""
     return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 
 

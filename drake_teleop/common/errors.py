@@ -73,7 +73,7 @@ def refuse_fork() -> None:
     del _POLARS_PROCESS[1:]
     if [os.getpid()] != _POLARS_PROCESS:
         raise DrakeTeleopError(
-            "this process was forked after tables were read or written, and would hang",
+            "polars would hang in this process, which was forked after tables were read or written",
             remedy='start processes by multiprocessing.get_context("spawn")',
         )
 
@@ -85,7 +85,6 @@ def suggest_name(name: object, names: Sequence[str], otherwise: str) -> str:
 
 
 def remedy_to_install_extra(name: str) -> str:
-    """Return the remedy for a missing library: installing this package's extra `name`."""
     return f"install the extra `{name}`: pip install '.[{name}]' in the clone of this project"
 
 

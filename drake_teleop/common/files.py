@@ -1,4 +1,4 @@
-"""Output files, each complete or absent, and folders of shipped files."""
+"""Output files, written completely or not at all, and folders of shipped files."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ LOG_PARTS_PATTERN = _PART_NAME_FORMAT.format(0).replace("0", "?")
 
 
 class CannotWrite(DrakeTeleopError):
-    """Error for a file that cannot be written."""
+    """Error for a file or folder that cannot be written."""
 
 
 @contextmanager
 def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -> Iterator[Path]:
     """Yield a temporary name to write under; then rename the file to `path`.
 
-    After a failure `path` is unchanged. With `shared` several processes may write the file.
+    After a failure `path` is unchanged. `aside` is another base of the temporary name; `shared`
+    allows several writing processes.
     """
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -92,7 +93,10 @@ def write_table(
 def output_folder(
     out: Path, last: str = "summary.json", *, kept: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create a command's output folder; the output is complete when the file `last` exists."""
+    """Create a command's output folder; the output is complete when the file `last` exists.
+
+    `kept` are names of earlier files that remain valid after a failure.
+    """
     make_folder(out)
     with wrap_write_errors(out / last):
         (out / last).unlink(missing_ok=True)
@@ -113,7 +117,7 @@ def make_folder(folder: Path) -> None:
         what = f"cannot be made a folder ({_reason_of_failure(error)})"
         raise CannotWrite(what, where=str(folder), remedy=remedy) from error
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise CannotWrite("is a write-protected folder", where=str(folder), remedy=remedy)
+        raise CannotWrite("is a folder without write permission", where=str(folder), remedy=remedy)
 
 
 def move_earlier_recordings(*paths: Path) -> Path | None:

@@ -39,7 +39,7 @@ def check_parquet_content(content: bytes | mmap.mmap) -> None:
 def _check_sizes(content: bytes | mmap.mmap) -> None:
     end = len(content) - _FOOTER_END_BYTES
     if end < len(_MAGIC) or content[-len(_MAGIC) :] != _MAGIC:
-        raise ValueError("it does not end as a Parquet file does")
+        raise ValueError("it does not end with PAR1, as a Parquet file does")
     start = end - int.from_bytes(content[end : end + 4], "little")
     _require_undamaged(start >= len(_MAGIC), "its footer is longer than the file")
     footer = _CompactReader(content[start:end]).read_struct()
@@ -47,11 +47,12 @@ def _check_sizes(content: bytes | mmap.mmap) -> None:
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
     _require_undamaged(
-        _read_size(footer, 3, "rows") == sum(rows), "its row groups do not add up to its rows"
+        _read_size(footer, 3, "rows") == sum(rows),
+        "its row groups have other numbers of rows than the file",
     )
     for group, count in zip(groups, rows, strict=True):
         _require_undamaged(
-            len(group[1]) == len(columns), "a row group has not the columns of the schema"
+            len(group[1]) == len(columns), "a row group and the schema have different columns"
         )
         for chunk, (name, is_flat) in zip(group[1], columns, strict=True):
             _check_column(content, start, chunk[3], name, count if is_flat else None)

@@ -1,4 +1,4 @@
-"""Tables of parts by name, which a script can extend (docs/extend.md)."""
+"""Tables of parts, such as estimators, by name; scripts can add parts (docs/extend.md)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Registry(dict[str, _Part]):
     """Parts of one kind by name; an unknown name raises DrakeTeleopError.
 
     Args:
-        kind: what the parts are, such as "passivity method".
+        kind: name of the kind of parts, such as "passivity method".
         shipped: parts of this package by name.
     """
 
@@ -44,7 +44,7 @@ class Registry(dict[str, _Part]):
             )
         if name in self.shipped:
             raise DrakeTeleopError(
-                f"'{name}' is a part of drake_teleop", where=self.kind, remedy="use another name"
+                f"'{name}' is the name of a shipped part", where=self.kind, remedy="use another"
             )
         self[name] = part
         return part
@@ -52,14 +52,14 @@ class Registry(dict[str, _Part]):
     def remove(self, name: str) -> None:
         if name in self.shipped:
             raise DrakeTeleopError(
-                f"'{name}' is a part of drake_teleop",
+                f"'{name}' is a shipped part and cannot be removed",
                 where=self.kind,
-                remedy="remove only registered parts",
+                remedy="remove only parts that you registered",
             )
         del self[self.check(name)]
 
     def check(self, name: Any, where: str = "", *others: str) -> str:
-        """Return the name; raise DrakeTeleopError unless it is in the table or in `others`."""
+        """Return the name; raise DrakeTeleopError unless it is registered or in `others`."""
         if isinstance(name, str) and (name in others or name in self):
             return name
         names = (*others, *self)

@@ -28,9 +28,10 @@ EULER_AXES = tuple(
 
 
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
-    """Return rotation matrices (N, 3, 3) from columns of a named form, without normalization.
+    """Return rotation matrices (N, 3, 3) from `columns` of a form in `NUM_COLUMNS_OF_FORM`.
 
-    Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad].
+    Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad]. Nothing is
+    normalized.
     """
     if form == "euler":
         from scipy.spatial.transform import Rotation

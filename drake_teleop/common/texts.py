@@ -1,7 +1,7 @@
-"""YAML and JSON files as plain data, without ambiguity.
+"""Conversion of YAML and JSON files to plain data and back.
 
 YAML has the core schema of version 1.2: `1:30` and `yes` are strings, `1e-3` is a number. Repeated
-keys and huge files are rejected. Tags never execute code.
+keys and huge files are errors. Tags never execute code.
 """
 
 from __future__ import annotations
@@ -97,7 +97,10 @@ def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
 def to_yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """Return YAML that `read_yaml` reads as the same data, with comments by field."""
+    """Return YAML that `read_yaml` reads as the same data.
+
+    `head` are comment lines at the top; `comments` are texts after fields, by "field.inner".
+    """
     lines, place, left = [f"# {to_one_line(text)}" for text in head], list[str](), comments or {}
     for line in yaml_scalar(data, flow=None).splitlines():
         inner = line.lstrip(" ")
@@ -194,7 +197,7 @@ class _NodeConverter:
                 raise _error_at_node("is defined twice", key, field)
             if key.value == "_tag":
                 raise _error_at_node(
-                    "there is no such field", key, field, "a kind is a tag: !Kind {...}"
+                    "there is no such field", key, field, "select a type by a YAML tag: !Type {...}"
                 )
             found[key.value] = self.convert_node(value, field)
         if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
@@ -223,9 +226,10 @@ def _scalar_data(node: Any, place: str) -> Any:
     digits = text.lstrip("+-")
     if digits.startswith("0") and digits != "0":
         remedy = f"write {digits.lstrip('0') or 0}, or '{text}' in quotes for a word"
-        raise _error_at_node(f"{_quote_value(text)} may be octal", node, place, remedy)
+        raise _error_at_node(f"{_quote_value(text)} may be octal or decimal", node, place, remedy)
     if len(digits) > _MAX_INTEGER_DIGITS:
-        raise _error_at_node(f"an integer of {len(digits)} digits is too long", node, place)
+        what = f"an integer of {len(digits)} digits is too long (maximum: {_MAX_INTEGER_DIGITS})"
+        raise _error_at_node(what, node, place)
     return int(text)
 
 

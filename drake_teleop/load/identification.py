@@ -135,11 +135,7 @@ class Identification:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write identification.json.
-
-        Raises:
-            DrakeTeleopError: if a number is not finite or the file cannot be written.
-        """
+        """Write identification.json; raise DrakeTeleopError if a number is not finite."""
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             finite_array(f"{path}:{name}", getattr(self, name), *shape)
         covariance = self.covariance.tolist()
@@ -167,18 +163,13 @@ class Identification:
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:
-        """Read identification.json.
-
-        Raises:
-            DrakeTeleopError: naming file and field, if a field is missing, unknown or malformed, or
-                contradicts phi.
-        """
+        """Read identification.json; raise DrakeTeleopError, with the field, for invalid content."""
         expect((str, Path), path, "load")
         document = _read_json(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
         for name in sorted((known ^ document.keys()) - (_OPTIONAL_FIELDS - document.keys())):
-            problem = "is missing" if name in known else "is not a field of an identification"
+            problem = "is missing" if name in known else "is not a field of identification.json"
             raise DrakeTeleopError(problem, where=f"{path}:{name}")
 
         def read_number_array(name: str, *shape: int, largest: float = np.inf) -> Array:
@@ -201,7 +192,7 @@ class Identification:
         }
         phi = check_identified(f"{path}:phi", read_number_array("phi", 10, largest=_MAX_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
-            raise _file_error("has no mass", f"{path}:phi")
+            raise _file_error("has the mass 0", f"{path}:phi")
         result = cls(
             phi=phi,
             offsets=read_number_array("offsets", 6, largest=_MAX_VALUE),
@@ -215,7 +206,9 @@ class Identification:
             **optional,
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
-            raise _file_error("contradicts phi, covariance and flags", f"{path}:verdicts")
+            raise _file_error(
+                "contradicts phi, covariance, identifiable or prior_dominated", f"{path}:verdicts"
+            )
         for name, value in result._derived_quantities().items():
             if isinstance(value, bool):
                 follows = document[name] is value
@@ -348,7 +341,7 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     deviations = np.sqrt(np.diag(covariance))
     if phi[0] < -SIGNIFICANT_DEVIATIONS * deviations[6] or phi[0] == 0.0:
         raise DrakeTeleopError(
-            f"total minus gripper leaves {phi[0]:.4g} kg for the object",
+            f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)",
             where="gripper",
             remedy="give the gripper alone as gripper, and the record with the object as the load",
         )
@@ -375,7 +368,7 @@ def _degrees_of_freedom_of_difference(total: Identification, gripper: Identifica
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return the smallest eigenvalue of the normalised pseudo-inertia and its deviation."""
+    """Return smallest eigenvalue of the normalised pseudo-inertia, and its standard deviation."""
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))
     length = np.sqrt(spread / mass) if spread > 0.0 else 1.0

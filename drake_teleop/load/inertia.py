@@ -42,7 +42,7 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
     m = float(phi[0])
     if m == 0.0:
         raise DrakeTeleopError(
-            "a load without mass has no centre of mass",
+            "the mass is 0, so the centre of mass is undefined",
             where="phi",
             remedy="give a mass phi[0] other than 0",
         )
@@ -80,7 +80,7 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     """Return whether a rigid body can have the parameters phi (10,), Eq. (T1).
 
-    `tolerance` is the accepted negative eigenvalue of the normalised pseudo-inertia.
+    Eigenvalues of the normalised pseudo-inertia may be as low as -`tolerance`.
     """
     J = pseudo_inertia(phi)
     if not J.any():

@@ -237,9 +237,6 @@ def identify(
             [SI]; (3,) zeros for omega, alpha at rest.
         noise: (6,) standard deviations of the wrench channels [N, N m]; None: equal weights.
         delay_s: delay [s] that was removed from the motion, only stored in the result.
-
-    Raises:
-        DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
     """
     equations = NormalEquations(noise)
     equations.add(wrench, s, omega, alpha)

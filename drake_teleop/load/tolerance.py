@@ -46,7 +46,7 @@ class Tolerance(NamedTuple):
 
     @property
     def required_entries(self) -> tuple[str, ...]:
-        """Names (k,) of the single required numbers, such as "com x"."""
+        """Names (k,) of the required numbers, such as "com x"."""
         return tuple(entry for name in self.required_quantities for entry in ENTRY_NAMES[name])
 
     def __str__(self) -> str:
@@ -68,7 +68,7 @@ def read_tolerance(text: str) -> Tolerance:
             value = 0.0
         if name not in QUANTITY_NAMES or (unit == "%") == (name == "com") or name in found:
             raise DrakeTeleopError(
-                f"{part.strip()!r} cannot be read as one tolerance per quantity",
+                f"{part.strip()!r} is not a quantity, a number and a unit, or repeats a quantity",
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
@@ -83,7 +83,7 @@ def read_tolerance(text: str) -> Tolerance:
 
 
 def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of the required numbers by [offsets; phi], over the tolerances."""
+    """Return derivatives (k, 16) of required numbers by [offsets; phi], divided by tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -106,7 +106,7 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of the required numbers, over the tolerances."""
+    """Return standard deviations (k,) of the required numbers, divided by their tolerances."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)

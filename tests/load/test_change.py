@@ -292,7 +292,7 @@ def test_a_slower_log(bench, tool):
     ("change", "words"),
     [
         ({"period": 0.0}, "period: has the value 0, which is not positive"),
-        ({"model_error": 1.0}, r"model_error: 1.0 is not at least 0 and below 1"),
+        ({"model_error": 1.0}, r"model_error: 1.0 is outside the range 0 <= model_error < 1"),
         ({"bound": -1.0}, "bound: has the value -1, which is not positive"),
         ({"wrench_std": np.zeros(6)}, "wrench_std: has the value 0, which is not positive"),
         ({"motion_std": np.zeros(6)}, "motion_std: has shape"),

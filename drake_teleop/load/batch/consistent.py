@@ -29,7 +29,7 @@ class Prior:
 
     Attributes:
         phi: (10,) prior load about So in S, of a body with extent in all directions.
-        weight: factor of the cost, a residual variance per sample.
+        weight: factor of the cost per sample, relative to squared normalised residuals.
         kind: cost of the pseudo-inertia J: "entropic" (Lee, Wensing, Park, T-RO 2020) or "geodesic"
             (Lee, Park, RA-L 2018).
     """
@@ -79,7 +79,7 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def constraint_row(self) -> Array:
-        """Return a (10,) such that a^T phi >= 0 for each phi whose mass is inside the ellipsoid."""
+        """Return the row a (10,) with a^T phi >= 0 if the mass of phi is inside the ellipsoid."""
         A, c = (
             finite_array("ellipsoid.matrix", self.matrix, 3, 3),
             finite_array("center", self.center, 3),
@@ -101,7 +101,7 @@ def consistent_least_squares(
     prior: Prior | None = None,
     ellipsoid: Ellipsoid | None = None,
 ) -> Array:
-    """Return the parameters [offsets; phi] (16,) with the best fit that a rigid body can have.
+    """Return [offsets; phi] (16,) of the rigid body that fits best.
 
     `theta` (16,) is the unconstrained solution of the weighted normal equations `gram` and
     `right`.
@@ -140,7 +140,6 @@ def _parameter_units(phi: Array) -> Array:
 def _solve_consistent_fit(
     H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None
 ) -> Array:
-    """Return phi / unit of the consistent load with the least phi^T H phi / 2 - b^T phi + prior."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(finite_array("prior.phi", prior.phi, 10) / unit))
@@ -198,7 +197,7 @@ def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
 
 
 def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return matrix and vector of the cone t >= |R x - d|, with R^T R = H and R^T d = b."""
+    """Return matrix and vector of the cone t >= |R x - d| with R^T R = H and R^T d = b."""
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale

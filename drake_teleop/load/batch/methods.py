@@ -1,4 +1,4 @@
-"""Batch estimators by name for the load and the sensor's offsets."""
+"""Batch estimators of the load and the sensor's offsets, by name."""
 
 from __future__ import annotations
 
@@ -186,6 +186,7 @@ def identify_batch(
     """Return load and sensor offsets of a free motion, by a batch estimator.
 
     Args:
+        wrench, s, omega, alpha, delay_s: as for `identify`.
         noise: noise of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
         shared_noise: True for averages over poses at rest: one noise for forces, one for torques.

@@ -53,7 +53,7 @@ class NormalForm(NamedTuple):
 def total_least_squares(
     moments: SecondMoments, noise: NoiseStd, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
-    """Return the load and offsets that allow for noise of the motion.
+    """Return the total least squares fit of load and offsets to the moments of a record.
 
     `wrench_noise` (6,) [N, N m] are standard deviations; `offsets` False fixes the offsets at 0.
     """
@@ -143,7 +143,7 @@ class EstimatorOptions:
 
 @dataclass(frozen=True, eq=False)
 class SampleRecord:
-    """Checked samples: wrench (N, 6), motion s, omega and alpha (N, 3)."""
+    """Validated samples of a record: wrench (N, 6), motion s, omega and alpha (N, 3)."""
 
     wrench: Array
     s: Array
@@ -170,7 +170,7 @@ class SampleRecord:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorFit:
-    """Result of an estimator: solution, noise (6,) [N, N m], rejected samples (N,), note."""
+    """Fit of an estimator: solution, wrench noise (6,) [N, N m], rejected samples (N,), note."""
 
     form: NormalForm
     wrench_noise: Array

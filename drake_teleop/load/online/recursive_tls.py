@@ -2,7 +2,7 @@
 
 The estimate minimises the squared residuals over their expected value (Kubus, Kroeger, Wahl, IROS
 2008). Row c of the regressor [E V] is T_c z with constant T_c; [G g] are the normal equations, and
-Z (19, 19) is the sum of z z^T:
+Z (19, 19) is the sum of z z^T, with w = omega:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
 """
@@ -43,7 +43,7 @@ _MIN_SCALE_SAMPLES = 20
 
 @cache
 def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
-    """Return nonzero terms of T: [channel, element of z, parameter] (n, 3), factors (n,)."""
+    """Return nonzero terms of T, [E V] = T z: indices (n, 3) of channel, z, parameter; factors."""
     T = regressor_coefficients()[:, :, _ORDER_OF_BATCH_MOMENTS].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
@@ -78,7 +78,6 @@ def write_products_vector(wrench, motion, z):
 
 @njit(cache=True)
 def add_outer_product(y, z, total):
-    """Add y z^T to `total` (19, 19)."""
     for i in range(19):
         for j in range(19):
             total[i, j] += y[i] * z[j]
@@ -97,7 +96,7 @@ def forget_samples(memory, theta, information, forgetting):
 
 @njit(cache=True)
 def residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L, L Z and S = L Z L^T (6, 6) for the residual r = F - [E V] theta = L z."""
+    """Write L, LZ = L Z and S = L Z L^T (6, 6), where r = F - [E V] theta = L z is the residual."""
     L[:] = 0.0
     LZ[:] = 0.0
     for c in range(6):
@@ -120,7 +119,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the expected noise of Z into Q."""
+    """Write the part of Z, the sum of z z^T, that noise is expected to cause into Q (19, 19)."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
@@ -138,7 +137,7 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 @njit(cache=True)
 def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z."""
+    """Write the sum of X^T W Y into G[:, first:]; Z sums y z^T, X and Y are [E V] of y and z."""
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
@@ -159,7 +158,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def weighted_right(LZ, W, index, factors, g):
-    """Write the right-hand side g (16,), the sum of X^T W r with X = [E V] of z."""
+    """Write the sum of X^T W r into g (16,); LZ sums r z^T, X is [E V] of z."""
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -199,7 +198,7 @@ def solve_linear_system(A):
 
 @njit(cache=True)
 def invert_matrix(S, A, W):
-    """Write S^-1 into W, both (6, 6); A (6, 12) is scratch."""
+    """Write S^-1 into W, both (6, 6); A (6, 12) is scratch memory."""
     for c in range(6):
         for d in range(6):
             A[c, d] = S[c, d]
@@ -212,7 +211,7 @@ def invert_matrix(S, A, W):
 
 
 class MomentEstimator(RecursiveEstimator):
-    """Recursive estimator whose memory is the sum of z z^T, and a row for the prior."""
+    """Recursive estimator whose memory is the sum of z z^T of Eq. (T18), and a row of the prior."""
 
     def initial_memory(self, theta: Array) -> Array:
         memory = np.zeros((20, 19))
@@ -231,7 +230,7 @@ class MomentEstimator(RecursiveEstimator):
 
 @njit(cache=True)
 def select_compensated(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise can be compensated, otherwise to 0."""
+    """Set `taper` (16,) to 1 for parameters whose noise N can be removed from G, otherwise to 0."""
     taper[:] = 1.0
     for i in range(16):
         for j in range(16):
@@ -263,7 +262,7 @@ def select_compensated(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write [G g] into G and the noise of G into N; return the noise scale."""
+    """Write [G g] into G, its part from noise into N; return the ratio of actual to given noise."""
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
     residual_products(Q, theta, index, factors, L, LZ, S)
@@ -354,7 +353,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance (16, 16); poorly excited directions have the prior's variance."""
+        """Return the covariance (16, 16); poorly excited directions keep the prior's variance."""
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
         root = np.linalg.inv(_cholesky_or_none(G + information))
