@@ -1,4 +1,4 @@
-"""All commands of `drake-teleop` and their options; large packages are imported on demand."""
+"""Commands of `drake-teleop` (long: with all options). Large packages are imported on demand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drake_teleop.common.version import __version__
 @click.option(
     "--register",
     "scripts",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     multiple=True,
     metavar="FILE",
     help="Python file that registers your own parts (docs/extend.md); may be repeated.",
@@ -38,13 +38,13 @@ def cli(scripts: tuple[Path, ...]) -> None:
     eval "$(_DRAKE_TELEOP_COMPLETE=bash_source drake-teleop)"
     """
     for script in scripts:
-        from drake_teleop.common.registry import register_from
+        from drake_teleop.common.registry import register_from_script
 
-        register_from(script)
+        register_from_script(script)
 
 
 @cli.command()
-@option.out("reproduce")
+@option.output_folder("reproduce")
 @option.seed
 @option.quiet
 def reproduce(out: Path, **options: Any) -> int:
@@ -64,14 +64,14 @@ def reproduce(out: Path, **options: Any) -> int:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO, required=False)
+@click.argument("scenario", type=option.SCENARIO_TYPE, required=False)
 @click.option(
     "--inputs",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     metavar="DIR",
     help="Folder of `drive --record`; repeat this session with identical results.",
 )
-@option.out("run")
+@option.output_folder("run")
 @option.seed
 @click.option("--fresh", is_flag=True, help="Identify the load again; ignore the cache.")
 @option.quiet
@@ -94,8 +94,8 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO, default="contact_transition")
-@click.option("--record", type=option.PATH, metavar="DIR", help="Record the session in DIR.")
+@click.argument("scenario", type=option.SCENARIO_TYPE, default="contact_transition")
+@click.option("--record", type=option.PATH_TYPE, metavar="DIR", help="Record the session in DIR.")
 @click.option(
     "--port",
     type=option.Integer(0, 65535),
@@ -114,7 +114,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 )
 @click.option(
     "--results",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     default=Path("out/experiment"),
     show_default=True,
     metavar="DIR",
@@ -161,7 +161,7 @@ def drive(
 
 
 @cli.command("scenario")
-@click.argument("name", type=option.SCENARIO, required=False)
+@click.argument("name", type=option.SCENARIO_TYPE, required=False)
 def print_scenario(name: str | None) -> None:
     """Print a scenario with every field, as a template.
 
@@ -190,11 +190,11 @@ def parts() -> None:
 
 
 @cli.command()
-@click.argument("folder", type=option.PATH)
+@click.argument("folder", type=option.PATH_TYPE)
 @click.option(
     "--scenario", metavar="SCENARIO", help="Scenario of the log.  [default: YAML file beside it]"
 )
-@option.out("replay")
+@option.output_folder("replay")
 @option.quiet
 def replay(folder: Path, out: Path, **options: Any) -> None:
     """Show a logged run in 3D.
@@ -208,18 +208,18 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@option.gripper
+@click.argument("log", type=option.PATH_TYPE)
+@option.gripper_file
 @click.option(
     "--method",
-    type=option.Registered("estimator", "ordinary", "whitened", "robust", "consistent"),
+    type=option.PartName("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
     show_default=True,
     help="Least squares; whitened: weighted by noise; robust: also without disturbed samples;"
     " consistent: also possible for a rigid body.",
 )
-@option.out("identify")
-@option.cutoff
+@option.output_folder("identify")
+@option.cutoff_hz
 @option.delay
 @option.quiet
 def identify(log: Path, out: Path, **options: Any) -> None:
@@ -234,21 +234,19 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@option.load(required=True)
-@option.gripper
+@click.argument("log", type=option.PATH_TYPE)
+@option.load_file(required=True)
+@option.gripper_file
 @option.sigma("Scale of the non-contact wrench; with --gripper, of the gripper's.")
 @click.option(
     "--sigma-object",
-    type=option.SCALE,
+    type=option.SCALE_TYPE,
     help="With --gripper: scale of the object's non-contact wrench.  [default: value of --sigma]",
 )
 @option.separate_sigmas
 @option.gamma
 @click.option(
-    "--eta",
-    type=option.Number(0, 1),
-    help="Kept share of the object's wrench; replaces all scales.",
+    "--eta", type=option.FiniteNumber(0, 1), help="Kept share of the object; excludes other scales."
 )
 @click.option(
     "--offsets",
@@ -260,7 +258,7 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @click.option(
     "--untouched",
     "untouched_s",
-    type=option.Number(0, 36000),
+    type=option.FiniteNumber(0, 36000),
     nargs=2,
     metavar="START STOP",
     help="Contact-free time of LOG [s], which determines the offsets.  [default: the whole LOG]",
@@ -273,14 +271,14 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 @click.option(
     "--causal-tare",
     "causal_tare_s",
-    type=option.Number(0, 36000, min_open=True),
+    type=option.FiniteNumber(0, 36000, min_open=True),
     metavar="SECONDS",
     help="With --causal: length of the contact-free start of LOG that determines the offsets [s]."
     "  [default: offsets of the load file]",
 )
-@option.free
-@option.out("eliminate")
-@option.cutoff
+@option.free_motion_log
+@option.output_folder("eliminate")
+@option.cutoff_hz
 @option.delay
 @option.quiet
 def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
@@ -295,9 +293,9 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@option.load(default="identified from LOG itself")
-@option.free
+@click.argument("log", type=option.PATH_TYPE)
+@option.load_file(default="identified from LOG itself")
+@option.free_motion_log
 @click.option(
     "--statistic",
     type=click.Choice(["level", "cusum", "glr"]),
@@ -305,8 +303,8 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
     show_default=True,
     help="Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.",
 )
-@option.out("detect")
-@option.cutoff
+@option.output_folder("detect")
+@option.cutoff_hz
 @option.delay
 @option.quiet
 def detect(log: Path, out: Path, **options: Any) -> None:
@@ -321,9 +319,9 @@ def detect(log: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@click.argument("others", type=option.PATH, nargs=-1)
-@option.out("inspect")
+@click.argument("log", type=option.PATH_TYPE)
+@click.argument("others", type=option.PATH_TYPE, nargs=-1)
+@option.output_folder("inspect")
 @option.quiet
 def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """List the contents and suspicious parts of a log.
@@ -338,17 +336,17 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 
 
 @cli.command()
-@click.argument("path", type=option.PATH)
-@option.load()
+@click.argument("path", type=option.PATH_TYPE)
+@option.load_file()
 @click.option("--identify", is_flag=True, help="Identify the load from all episodes.")
 @click.option(
     "--description",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     metavar="FILE",
     help="Log description, for all episodes, without `file`.  [default: drafted from the episodes]",
 )
 @option.jobs
-@option.out("dataset")
+@option.output_folder("dataset")
 @option.quiet
 def dataset(path: Path, out: Path, **options: Any) -> None:
     """Add contact wrenches to a robot-learning dataset.
@@ -364,17 +362,15 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("source")
-@option.load(required=True)
-@click.option(
-    "--out", "sink", default="-", metavar="SINK", help="Destination.  [default: -, stdout]"
-)
+@option.load_file(required=True)
+@click.option("--out", "sink", default="-", metavar="SINK", help="Destination.  [default: stdout]")
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
 @click.option(
     "--rate",
     "rate_hz",
-    type=option.POSITIVE,
+    type=option.POSITIVE_TYPE,
     metavar="HZ",
     help="Rate of the wrenches; not needed for replay:, rtde:// and netft://.",
 )
@@ -382,7 +378,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
 @click.option(
     "--free",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     metavar="LOG",
     help="Log of free motion, whose noise sets the threshold of contact flags, as for `detect`.",
 )
@@ -393,7 +389,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
     metavar="PORT",
     help="UDP port on localhost that accepts the request `tare`.",
 )
-@option.stream
+@option.stream_options
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Remove the load from a live wrench.
 
@@ -412,15 +408,15 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @cli.command()
 @click.argument("source")
 @click.argument("sink")
-@option.load(required=True)
+@option.load_file(required=True)
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
-@click.option("--rate", "rate_hz", type=option.POSITIVE, required=True, metavar="HZ",
+@click.option("--rate", "rate_hz", type=option.POSITIVE_TYPE, required=True, metavar="HZ",
               help="Rate of the wrenches.")  # fmt: skip
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
-@option.stream
-@option.out("ros2")
+@option.stream_options
+@option.output_folder("ros2")
 @click.pass_context
 def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **options: Any) -> None:
     """Remove the load from a live wrench, as a ROS 2 node.
@@ -460,13 +456,13 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
 )
 @click.option(
     "--seconds",
-    type=option.Number(1, 36000),
+    type=option.FiniteNumber(1, 36000),
     default=120.0,
     show_default=True,
     help="Maximum duration of the recording [s].",
 )
-@option.stream
-@option.out("calibrate")
+@option.stream_options
+@option.output_folder("calibrate")
 @option.quiet
 def calibrate(source: str, out: Path, **options: Any) -> int:
     """Identify a load from a live stream, with guidance.
@@ -482,7 +478,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 
 
 _CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
-_EXPORT_FORMATS = option.Registered(
+_EXPORT_FORMATS = option.PartName(
     "export format",
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
     *_CONTROLLER_FORMATS,
@@ -490,7 +486,7 @@ _EXPORT_FORMATS = option.Registered(
 
 
 @cli.command()
-@click.argument("identification", type=option.PATH)
+@click.argument("identification", type=option.PATH_TYPE)
 @click.option("--to", required=True, type=_EXPORT_FORMATS, help="Robot or file format.")
 @option.sensor_pose("Pose of the sensor in the flange [m, deg].  [default: same frames]")
 @click.option(
@@ -503,13 +499,13 @@ _EXPORT_FORMATS = option.Registered(
 @click.option(
     "--rate",
     "rate_hz",
-    type=option.POSITIVE,
+    type=option.POSITIVE_TYPE,
     metavar="HZ",
     help="Rate of the sensor's readings; required by c99, fmu and ros2_filter.",
 )
-@option.cutoff
+@option.cutoff_hz
 @option.sensor_range
-@option.out("export")
+@option.output_folder("export")
 def export(
     identification: Path,
     to: str,
@@ -543,7 +539,7 @@ def export(
 
 @cli.command("sample-log")
 @option.seed_0
-@option.out("sample-log")
+@option.output_folder("sample-log")
 @option.quiet
 def sample_log(out: Path, **options: Any) -> None:
     """Write a simulated log to try these commands on.
@@ -558,7 +554,7 @@ def sample_log(out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO)
+@click.argument("scenario", type=option.SCENARIO_TYPE)
 @click.option(
     "--direction",
     type=click.Choice(["x", "y", "z"]),
@@ -566,7 +562,7 @@ def sample_log(out: Path, **options: Any) -> None:
     show_default=True,
     help="Direction of the task, an axis of the world frame.",
 )
-@option.out("analyze")
+@option.output_folder("analyze")
 @option.quiet
 def analyze(scenario: str, out: Path, **options: Any) -> None:
     """Analyse stability and transparency of a scenario.
@@ -589,7 +585,7 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
     help="Scenario of the station: a shipped name or a YAML file.",
 )
 @option.jobs
-@option.out("compare-passivity")
+@option.output_folder("compare-passivity")
 @option.seed_0
 @option.quiet
 def compare_passivity(
@@ -612,7 +608,7 @@ def compare_passivity(
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO)
+@click.argument("scenario", type=option.SCENARIO_TYPE)
 @click.option("--hands", type=option.Names(), help="Grips of the operator.  [default: light,firm]")
 @click.option("--walls", type=option.Names(), help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
 @click.option("--network", help="Network preset.  [default: that of the scenario]")
@@ -624,7 +620,7 @@ def compare_passivity(
     help="Task; it sets the required stability margin of gamma.",
 )
 @option.jobs
-@option.out("tune")
+@option.output_folder("tune")
 @option.quiet
 def tune(
     scenario: str,
@@ -641,18 +637,18 @@ def tune(
     """
     from drake_teleop.lab.tuning.tune import tune as tune_station
 
-    stiffnesses = [option.POSITIVE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
-    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffnesses, **options)
+    stiffness = [option.POSITIVE_TYPE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
+    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffness, **options)
 
 
 @cli.command()
-@click.argument("study", type=option.STUDY)
+@click.argument("study", type=option.STUDY_TYPE)
 @option.jobs
-@option.cluster
+@option.dask_cluster
 @click.option("--shard", metavar="K/N", help="Run only part K of N, e.g. 3/8; see docs/cluster.md.")
 @click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
-@option.yes
-@option.out("study")
+@option.skip_question
+@option.output_folder("study")
 @option.quiet
 def study(study: Path, out: Path, **options: Any) -> None:
     """Run a scenario for varied values of its fields.
@@ -667,12 +663,12 @@ def study(study: Path, out: Path, **options: Any) -> None:
 
 @cli.command("scaling-study")
 @option.jobs
-@option.cluster
+@option.dask_cluster
 @click.option(
     "--repeats", type=option.Integer(1, 10**6), help="Runs per combination.  [default: 12]"
 )
-@option.yes
-@option.out("scaling-study")
+@option.skip_question
+@option.output_folder("scaling-study")
 @option.quiet
 def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
@@ -686,8 +682,8 @@ def scaling_study(out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO, default="identification")
-@click.option("--model", type=option.PATH, help="Other arm: URDF, SDF, MJCF or .dmd.yaml file.")
+@click.argument("scenario", type=option.SCENARIO_TYPE, default="identification")
+@click.option("--model", type=option.PATH_TYPE, help="Other arm: URDF, SDF, MJCF or .dmd.yaml.")
 @option.sensor_frame()
 @option.package_paths
 @click.option(
@@ -698,7 +694,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 )
 @click.option(
     "--payload",
-    type=option.Number(0, 1e4, min_open=True),
+    type=option.FiniteNumber(0, 1e4, min_open=True),
     metavar="KG",
     help="With --model: heaviest load of the sensor [kg]."
     "  [default: 130 % of the model's mass beyond the sensor]",
@@ -713,7 +709,7 @@ def scaling_study(out: Path, **options: Any) -> None:
 )
 @click.option(
     "--period",
-    type=option.Number(0.5, 600),
+    type=option.FiniteNumber(0.5, 600),
     default=6.0,
     show_default=True,
     metavar="SECONDS",
@@ -732,12 +728,12 @@ def scaling_study(out: Path, **options: Any) -> None:
 @click.option(
     "--time",
     "seconds",
-    type=option.Number(0, 1e6, min_open=True),
+    type=option.FiniteNumber(0, 1e6, min_open=True),
     metavar="SECONDS",
     help="CPU time of the optimiser.  [default: time for four starts, with reproducible results]",
 )
 @option.seed_0
-@option.out("excite")
+@option.output_folder("excite")
 @option.quiet
 def excite(scenario: str, out: Path, **options: Any) -> None:
     """Design a motion that excites all parameters of a load.
@@ -752,15 +748,18 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("folder", type=option.PATH)
+@click.argument("folder", type=option.PATH_TYPE)
 @click.option(
-    "--arm", required=True, type=option.PATH, help="Model of the arm: URDF, SDF, MJCF or .dmd.yaml."
+    "--arm",
+    required=True,
+    type=option.PATH_TYPE,
+    help="Arm model: URDF, SDF, MJCF or .dmd.yaml.",
 )
 @option.sensor_frame(required=True)
 @option.package_paths
 @click.option(
     "--tool",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     help="Model of the tool.  [default: the arm's model beyond the sensor, or a default tool]",
 )
 @click.option(

@@ -13,9 +13,9 @@ from pathlib import Path
 from threading import RLock
 from typing import Any
 
-_POLARS_PROCESS: list[int] = []  # PID of the process that first used polars
+_POLARS_PROCESS_ID: list[int] = []  # PID of the process that first used polars
 
-LONGEST_LINE = 1000
+MAX_LINE_LENGTH = 1000
 """Maximum length of an error line of the command line."""
 
 
@@ -31,10 +31,10 @@ class DrakeTeleopError(ValueError):
         text = f"{where}: {what}" if where else what
         if remedy:
             text = f"{text}; {remedy}"
-        super().__init__(to_one_line(text, LONGEST_LINE - len("error: ")))
+        super().__init__(to_one_line(text, MAX_LINE_LENGTH - len("error: ")))
 
 
-def to_one_line(text: str, max_length: int = LONGEST_LINE) -> str:
+def to_one_line(text: str, max_length: int = MAX_LINE_LENGTH) -> str:
     """Return the text as one printable line; the middle of a longer text is cut out."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
     if len(text) <= max_length:
@@ -69,9 +69,9 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
 
 def refuse_fork() -> None:
     """Raise DrakeTeleopError in a process forked after the first call: polars would hang there."""
-    _POLARS_PROCESS.append(os.getpid())
-    del _POLARS_PROCESS[1:]
-    if [os.getpid()] != _POLARS_PROCESS:
+    _POLARS_PROCESS_ID.append(os.getpid())
+    del _POLARS_PROCESS_ID[1:]
+    if [os.getpid()] != _POLARS_PROCESS_ID:
         raise DrakeTeleopError(
             "polars would hang in this process, which was forked after tables were read or written",
             remedy='start processes by multiprocessing.get_context("spawn")',
@@ -100,13 +100,13 @@ def field_place(where: str, name: Any) -> str:
 
 
 # stderr is global: two threads would restore it in the wrong order.
-_lock = RLock()
+_STDERR_LOCK = RLock()
 
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
     """Discard all output to stderr, also that of C and Rust code."""
-    with _lock:
+    with _STDERR_LOCK:
         try:
             sys.stderr.flush()
             saved = os.dup(2)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAX_LISTED_FILES = 6  # maximum number of listed files
-_RUST_ERROR = re.compile(r"([^:]+) \(os error \d+\)")
+_RUST_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _PART_NAME_FORMAT = "row_{:010d}.parquet"
 LOG_PARTS_PATTERN = _PART_NAME_FORMAT.format(0).replace("0", "?")
@@ -134,7 +134,7 @@ def move_earlier_recordings(*paths: Path) -> Path | None:
     return folder
 
 
-def part_of_log(folder: Path, first_row: int) -> Path:
+def log_part_path(folder: Path, first_row: int) -> Path:
     return folder / _PART_NAME_FORMAT.format(first_row)
 
 
@@ -155,7 +155,7 @@ def remove_log(path: Path) -> None:
 
 
 def _reason_of_failure(error: OSError) -> str:
-    if found := _RUST_ERROR.search(str(error)):
+    if found := _RUST_ERROR_PATTERN.search(str(error)):
         return found[1].strip()
     return error.strerror or str(error) or type(error).__name__
 
@@ -184,17 +184,17 @@ def _join_names(names: Sequence[str]) -> str:
     return ", ".join(names[:_MAX_LISTED_FILES]) + more
 
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+_PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def models_dir() -> Path:
-    packaged = _PACKAGE / "models"
-    return packaged if packaged.is_dir() else _PACKAGE.parent / "models"
+    packaged = _PACKAGE_FOLDER / "models"
+    return packaged if packaged.is_dir() else _PACKAGE_FOLDER.parent / "models"
 
 
 def scenarios_dir() -> Path:
-    return _PACKAGE / "station" / "scenarios"
+    return _PACKAGE_FOLDER / "station" / "scenarios"
 
 
 def studies_dir() -> Path:
-    return _PACKAGE / "lab" / "studies"
+    return _PACKAGE_FOLDER / "lab" / "studies"

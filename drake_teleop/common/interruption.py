@@ -16,7 +16,7 @@ class _DelayedSignalState(threading.local):
     depth, received = 0, 0  # open contexts, and the last signal in them
 
 
-_DELAYED = _DelayedSignalState()
+_DELAYED_SIGNALS = _DelayedSignalState()
 
 
 def install_handlers() -> None:
@@ -44,8 +44,8 @@ def handled_sigint() -> Iterator[None]:
 
 def _raise_interrupt(number: int, _frame: Any) -> None:
     INTERRUPTED_EVENT.set()
-    if _DELAYED.depth:
-        _DELAYED.received = number
+    if _DELAYED_SIGNALS.depth:
+        _DELAYED_SIGNALS.received = number
         return
     if number == signal.SIGTERM:
         raise KeyboardInterrupt("SIGTERM")
@@ -56,10 +56,10 @@ class delayed_signals(ContextDecorator):
     """Context or decorator that delays the KeyboardInterrupt of `install_handlers` to its end."""
 
     def __enter__(self) -> None:
-        _DELAYED.depth += 1
+        _DELAYED_SIGNALS.depth += 1
 
     def __exit__(self, *_: object) -> None:
-        _DELAYED.depth -= 1
-        if _DELAYED.received and not _DELAYED.depth:
-            number, _DELAYED.received = _DELAYED.received, 0
+        _DELAYED_SIGNALS.depth -= 1
+        if _DELAYED_SIGNALS.received and not _DELAYED_SIGNALS.depth:
+            number, _DELAYED_SIGNALS.received = _DELAYED_SIGNALS.received, 0
             _raise_interrupt(number, None)

@@ -122,7 +122,7 @@ def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]
     ]
 
 
-def narrowest_half(x: Array) -> tuple[Array, Array]:
+def narrowest_half_interval(x: Array) -> tuple[Array, Array]:
     """Return width and centre (k,) of the narrowest interval with half of the samples x (N, k)."""
     ordered = np.sort(x, axis=0)
     half = len(ordered) // 2

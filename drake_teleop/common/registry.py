@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 
 _Part = TypeVar("_Part")
-_SCRIPTS = "DRAKE_TELEOP_REGISTER"  # paths, which the processes of a study inherit
+_SCRIPTS_ENV = "DRAKE_TELEOP_REGISTER"  # paths, which the processes of a study inherit
 REGISTRIES: dict[str, Registry[Any]] = {}
 """All tables by the kind of their parts, as far as their modules are imported."""
 
@@ -67,13 +67,13 @@ class Registry(dict[str, _Part]):
         raise DrakeTeleopError(f"there is no {self.kind} {name!r}", where=where, remedy=remedy)
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or (_run_scripts() and super().__contains__(name))
+        return super().__contains__(name) or (_import_scripts() and super().__contains__(name))
 
     def __missing__(self, name: str) -> _Part:
         return self[self.check(name)]
 
 
-def register_from(script: Path) -> None:
+def register_from_script(script: Path) -> None:
     """Import a Python file that registers parts, here and in the processes of studies."""
     script = script.absolute()
     if script.suffix != ".py" or not script.is_file():
@@ -92,13 +92,13 @@ def register_from(script: Path) -> None:
     if module.__file__ != str(script):
         what = f"has the name of the module {module.__file__ or script.stem}"
         raise DrakeTeleopError(what, where=str(script), remedy="rename the file")
-    paths = os.environ.get(_SCRIPTS, "").split(os.pathsep)
-    os.environ[_SCRIPTS] = os.pathsep.join(dict.fromkeys([*filter(None, paths), str(script)]))
+    paths = os.environ.get(_SCRIPTS_ENV, "").split(os.pathsep)
+    os.environ[_SCRIPTS_ENV] = os.pathsep.join(dict.fromkeys([*filter(None, paths), str(script)]))
 
 
-def _run_scripts() -> bool:
-    paths = [Path(path) for path in os.environ.get(_SCRIPTS, "").split(os.pathsep) if path]
+def _import_scripts() -> bool:
+    paths = [Path(path) for path in os.environ.get(_SCRIPTS_ENV, "").split(os.pathsep) if path]
     new = [path for path in paths if path.stem not in sys.modules]
     for path in new:
-        register_from(path)
+        register_from_script(path)
     return bool(new)

@@ -186,7 +186,7 @@ def normalized_quaternion(a):
 
 
 @njit(cache=True)
-def quaternion_of(R):
+def quaternion_of_matrix(R):
     """Return the unit quaternion of a rotation matrix (3, 3) (Shepperd 1978)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     largest = max(trace, R[0, 0], R[1, 1], R[2, 2])

@@ -30,7 +30,7 @@ MAX_IDENTIFIED_DEVIATION = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
 _MAX_WEAKLY_IDENTIFIED_DEVIATION, _MIN_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
-_MAX_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
+_MAX_FILE_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
 _OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
@@ -165,7 +165,7 @@ class Identification:
     def load(cls, path: str | Path) -> Identification:
         """Read identification.json; raise DrakeTeleopError, with the field, for invalid content."""
         expect((str, Path), path, "load")
-        document = _read_json(path)
+        document = _read_document(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
         for name in sorted((known ^ document.keys()) - (_OPTIONAL_FIELDS - document.keys())):
@@ -190,17 +190,17 @@ class Identification:
         optional = {
             k: read(f"{path}:{k}", document[k]) for k, read in readers.items() if k in document
         }
-        phi = check_identified(f"{path}:phi", read_number_array("phi", 10, largest=_MAX_VALUE))
+        phi = check_identified(f"{path}:phi", read_number_array("phi", 10, largest=_MAX_FILE_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise _file_error("has the mass 0", f"{path}:phi")
         result = cls(
             phi=phi,
-            offsets=read_number_array("offsets", 6, largest=_MAX_VALUE),
+            offsets=read_number_array("offsets", 6, largest=_MAX_FILE_VALUE),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
             condition_number=float(read_number_array("condition_number")),
-            delay_s=float(read_number_array("delay_s", largest=_MAX_VALUE)),
-            residual_rms=read_number_array("residual_rms", 6, largest=_MAX_VALUE),
+            delay_s=float(read_number_array("delay_s", largest=_MAX_FILE_VALUE)),
+            residual_rms=read_number_array("residual_rms", 6, largest=_MAX_FILE_VALUE),
             method=document["method"],
             samples=int(read_number_array("samples")),
             **optional,
@@ -259,7 +259,7 @@ def natural_scales(phi: Array) -> Array:
     return scale
 
 
-def _read_json(path: str | Path) -> dict[str, Any]:
+def _read_document(path: str | Path) -> dict[str, Any]:
     from drake_teleop.common.texts import read_json  # the import of PyYAML is slow
 
     if not os.path.exists(path):
@@ -327,7 +327,7 @@ def _read_degrees(where: str, value: Any) -> Array:
 SIGNIFICANT_DEVIATIONS = 3.0
 """Standard deviations below zero at which a mass counts as negative."""
 
-_IS_PHI = np.arange(16) >= 6
+_IS_LOAD_PARAMETER = np.arange(16) >= 6
 
 
 def load_of_object(total: Identification, gripper: Identification) -> Identification:
@@ -353,13 +353,13 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
         covariance=covariance,
         identifiable=identifiable,
         degrees_of_freedom=_degrees_of_freedom_of_difference(total, gripper),
-        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_PHI,
+        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_LOAD_PARAMETER,
     )
 
 
 def _degrees_of_freedom_of_difference(total: Identification, gripper: Identification) -> Array:
     a, b = (np.diag(load.covariance) for load in (total, gripper))
-    b = np.where(_IS_PHI, b, 0.0)
+    b = np.where(_IS_LOAD_PARAMETER, b, 0.0)
     finite = np.isfinite(a + b) & (a + b > 0.0)
     a, b = np.where(finite, a, 1.0), np.where(finite, b, 0.0)
     with np.errstate(divide="ignore"):

@@ -68,7 +68,7 @@ def read_tolerance(text: str) -> Tolerance:
             value = 0.0
         if name not in QUANTITY_NAMES or (unit == "%") == (name == "com") or name in found:
             raise DrakeTeleopError(
-                f"{part.strip()!r} is not a quantity, a number and a unit, or repeats a quantity",
+                f"{part.strip()!r} is not a tolerance (quantity, number and unit) or repeats a quantity",
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
@@ -114,7 +114,7 @@ def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
     return np.where(is_undetermined, np.inf, np.sqrt(np.maximum(variances, 0.0)))
 
 
-def values_of_required(tolerance: Tolerance, phi: Array) -> Array:
+def required_values(tolerance: Tolerance, phi: Array) -> Array:
     """Return the values (k,) of the required numbers of load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}

@@ -20,7 +20,7 @@ from drake_teleop.common.errors import (
     remedy_to_install_extra,
     wrap_read_errors,
 )
-from drake_teleop.common.files import LOG_PARTS_PATTERN, make_folder, part_of_log, write_table
+from drake_teleop.common.files import LOG_PARTS_PATTERN, log_part_path, make_folder, write_table
 from drake_teleop.common.numeric import float_array
 from drake_teleop.common.parquet_sizes import check_parquet
 
@@ -257,7 +257,7 @@ class SimulationResult:
             folder: folder of the log, prepared by `remove_log`.
             first_row: index of this result's first row in the whole log.
         """
-        part = part_of_log(folder, first_row)
+        part = log_part_path(folder, first_row)
         if len(self.t) or not part.exists():
             make_folder(folder)
             self._write_parquet_file(part, aside=folder)

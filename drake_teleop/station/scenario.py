@@ -11,7 +11,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.common.config import (
     check_field,
-    check_name,
+    check_field_name,
     check_ranges,
     check_structure,
     choice,
@@ -271,7 +271,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     expect(Scenario, scenario, "scenario")
     for name, value in changes.items():
         block, _, inner = name.partition("__")
-        check_name(Scenario, block, f"scenario:{block}")
+        check_field_name(Scenario, block, f"scenario:{block}")
         if inner:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):

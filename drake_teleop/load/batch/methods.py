@@ -46,7 +46,7 @@ _MIN_NOISE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
-_NORMAL_MAD = 1.4826
+_STD_PER_NORMAL_MAD = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
 _MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
@@ -275,7 +275,7 @@ def _relative_residuals(record: SampleRecord, theta: Array, shared: bool) -> Arr
     if shared:
         median = np.median(magnitudes.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
     rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    scale = np.maximum(_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
+    scale = np.maximum(_STD_PER_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
     for start in range(0, n, CHUNK_ROWS):

@@ -32,7 +32,7 @@ _MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
 CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
-_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
+_PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 # Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
 # coefficient that is rounding.
 _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
@@ -84,8 +84,8 @@ class Combination:
     words: str
 
     def __str__(self) -> str:
-        numbers = f"{self.value:.4g} +- {self.standard_deviation:.2g} {_UNITS[self.leading]}"
-        return f"{self.words} = {numbers}"
+        unit = _PARAMETER_UNITS[self.leading]
+        return f"{self.words} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
 
 
 @dataclass(frozen=True, eq=False)

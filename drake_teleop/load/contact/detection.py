@@ -262,7 +262,7 @@ def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 # Lower limit of a noise floor [N, N m], as in `logs.contact`.
-_RESOLUTION = np.repeat([1e-3, 1e-4], 3)
+_MIN_NOISE_STD = np.repeat([1e-3, 1e-4], 3)
 _MAX_FITS, _FIT_TOLERANCE = 20, 1e-4
 _MAX_LAG_ONE_CORRELATION, _MIN_WIDTH, _RARE_SHARE = 0.999, 0.1, 1e-3
 
@@ -297,13 +297,13 @@ def fit_noise_floor(
     for c in range(6):
         square, explained = rows[0][:, c] ** 2, parameter_std[:, c] ** 2
         terms = np.stack([np.ones(len(square)), *held[:, :, c] ** 2], axis=1)
-        variance = np.full(len(square), max(float(square.mean()), _RESOLUTION[c] ** 2))
+        variance = np.full(len(square), max(float(square.mean()), _MIN_NOISE_STD[c] ** 2))
         for _ in range(_MAX_FITS):
             previous = fitted[c].copy()
             weighted = np.column_stack([terms, square - explained]) / variance[:, None]
             R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem with four rows
             fitted[c] = nnls(R[:, :3], R[:, 3])[0]
-            fitted[c, 0] = max(fitted[c, 0], _RESOLUTION[c] ** 2)
+            fitted[c, 0] = max(fitted[c, 0], _MIN_NOISE_STD[c] ** 2)
             variance = terms @ fitted[c] + explained
             if np.allclose(fitted[c], previous, rtol=_FIT_TOLERANCE, atol=0.0):
                 break

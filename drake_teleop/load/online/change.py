@@ -54,7 +54,7 @@ _CHI_SQUARED_SLACK, _ALARM_SUM, _RETURN_TO_KNOWN_SUM = 12.0, 60.0, -30.0
 # Factor of the bound for first moments relative to that of the mass, and smallest size [m].
 _MOMENT_FACTOR, _MIN_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
-_IMPOSSIBLE_DEVIATIONS = 4.0
+_MAX_NEGATIVE_DEVIATIONS = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
@@ -84,7 +84,7 @@ MEMORY_SIZE = _KNOWN_FILTER_START + 816
 """Length of the memory of `update_change_detector`."""
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
-_RESOLUTION = 1e-10
+_MIN_RELATIVE_VARIANCE = 1e-10
 
 
 @njit(cache=True)
@@ -143,7 +143,7 @@ def update_estimate(estimate, V, wrench, root):
             gain[i] = value
             predicted += row[i] * value
             uncorrelated += row[i] * row[i] * P[i, i]
-        total = max(1.0, _RESOLUTION * uncorrelated) + predicted
+        total = max(1.0, _MIN_RELATIVE_VARIANCE * uncorrelated) + predicted
         chi += innovation * innovation / total
         for i in range(16):
             theta[i] += gain[i] * innovation / total
@@ -268,7 +268,7 @@ def _test_block(memory, block, noise, window, hold, bound):
         memory[_NEW_FILTER_START + 6],
         math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6]),
     )
-    if memory[_SUM] > _ALARM_SUM or mass < -_IMPOSSIBLE_DEVIATIONS * deviation:
+    if memory[_SUM] > _ALARM_SUM or mass < -_MAX_NEGATIVE_DEVIATIONS * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
         _restart_new_estimate(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
@@ -360,7 +360,7 @@ def known_load_in_memory(memory):
 
 
 @njit(cache=True)
-def change_state(memory):
+def current_change_state(memory):
     """Return the state as index into `STATE_NAMES`; a new load becomes known once identified."""
     return (
         STATE_KNOWN

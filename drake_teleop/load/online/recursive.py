@@ -33,7 +33,7 @@ MAX_SETTLED_STD = 0.05
 """Default of `bound`, relative to the natural scale."""
 
 # Smallest relative eigenvalue that is not rounding.
-_ROUNDING = 1e-16
+_MIN_RELATIVE_EIGENVALUE = 1e-16
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
 _MIN_RELATIVE_VARIANCE = 1e-10
@@ -231,7 +231,8 @@ class RecursiveEstimator(ABC):
         information = np.linalg.inv(self.covariance)
         scale = 1.0 / np.sqrt(np.diag(information))
         eigenvalues = np.linalg.eigvalsh(information * np.outer(scale, scale))
-        return float(np.sqrt(eigenvalues[-1] / max(eigenvalues[0], _ROUNDING * eigenvalues[-1])))
+        smallest = max(eigenvalues[0], _MIN_RELATIVE_EIGENVALUE * eigenvalues[-1])
+        return float(np.sqrt(eigenvalues[-1] / smallest))
 
 
 class RecursiveLeastSquares(RecursiveEstimator):

@@ -34,9 +34,9 @@ RELATIVE_RIDGE = 1e-13
 _WRENCH, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
-_MIN_EXCESS = 4.0
+_MIN_INFORMATION_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
-_MIN_PIVOT = 1e-13
+_MIN_RELATIVE_PIVOT = 1e-13
 # Fewest samples for the noise scale from residuals.
 _MIN_SCALE_SAMPLES = 20
 
@@ -229,7 +229,7 @@ class MomentEstimator(RecursiveEstimator):
 
 
 @njit(cache=True)
-def select_compensated(G, N, strength, K, taper):
+def select_compensated_parameters(G, N, strength, K, taper):
     """Set `taper` (16,) to 1 for parameters whose noise N can be removed from G, otherwise to 0."""
     taper[:] = 1.0
     for i in range(16):
@@ -238,7 +238,7 @@ def select_compensated(G, N, strength, K, taper):
     eliminate_rows(K)
     definite = True
     for i in range(16):
-        definite &= K[i, i] > _MIN_PIVOT * G[i, i]
+        definite &= K[i, i] > _MIN_RELATIVE_PIVOT * G[i, i]
     if definite:
         return
     for i in range(16):
@@ -252,9 +252,9 @@ def select_compensated(G, N, strength, K, taper):
             total = G[i, i] - strength * taper[i] * N[i, i]
             for k in range(i):
                 total -= K[i, k] * K[i, k]
-            if total > _MIN_PIVOT * G[i, i]:
+            if total > _MIN_RELATIVE_PIVOT * G[i, i]:
                 break
-        if not total > _MIN_PIVOT * G[i, i]:
+        if not total > _MIN_RELATIVE_PIVOT * G[i, i]:
             taper[:] = 0.0
             return
         K[i, i] = math.sqrt(total)
@@ -304,9 +304,9 @@ def rtls_update(
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        gain = 1.0 - _MIN_EXCESS * math.sqrt(2.0 / Z[0, 0])
+        gain = 1.0 - _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
-            select_compensated(G, N, scale / gain, K, taper)
+            select_compensated_parameters(G, N, scale / gain, K, taper)
             for i in range(6, 16):
                 for j in range(6, 16):
                     G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
@@ -356,15 +356,15 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         """Return the covariance (16, 16); poorly excited directions keep the prior's variance."""
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
-        root = np.linalg.inv(_cholesky_or_none(G + information))
+        root = np.linalg.inv(_regularized_cholesky(G + information))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        excited = (shares < _MIN_PIVOT) | (
-            excess > _MIN_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
+        excited = (shares < _MIN_RELATIVE_PIVOT) | (
+            excess > _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
         )
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
-        factor = inverse @ _cholesky_or_none(scale * G + information)
+        factor = inverse @ _regularized_cholesky(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
         return self._limit_to_prior(factor @ factor.T + unknown @ unknown.T)
@@ -388,8 +388,8 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         rtls_update(theta, memory, samples, *options, *nonzero_regressor_terms())
 
 
-def _cholesky_or_none(A: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))
+def _regularized_cholesky(A: Array) -> Array:
+    return np.asarray(np.linalg.cholesky(A + _MIN_RELATIVE_PIVOT * np.diag(np.diag(A))))
 
 
 METHODS: Registry[type[RecursiveEstimator]] = Registry(
