@@ -68,7 +68,7 @@ def read_tolerance(text: str) -> Tolerance:
             value = 0.0
         if name not in QUANTITY_NAMES or (unit == "%") == (name == "com") or name in found:
             raise DrakeTeleopError(
-                f"{part.strip()!r} is not a tolerance (quantity, number and unit) or repeats a quantity",
+                f"{part.strip()!r} is no tolerance (quantity, number, unit), or repeats a quantity",
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
