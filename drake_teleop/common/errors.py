@@ -43,7 +43,7 @@ def to_one_line(text: str, max_length: int = MAX_LINE_LENGTH) -> str:
     return f"{text[: max_length - end - 5]} ... {text[-end:]}"
 
 
-def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
+def expect_type(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
     """Raise DrakeTeleopError for argument `where` unless the value has type `kind`."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import write_json
 from drake_teleop.common.numeric import Array, check_identified, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
@@ -164,7 +164,7 @@ class Identification:
     @classmethod
     def load(cls, path: str | Path) -> Identification:
         """Read identification.json; raise DrakeTeleopError, with the field, for invalid content."""
-        expect((str, Path), path, "load")
+        expect_type((str, Path), path, "load")
         document = _read_document(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}

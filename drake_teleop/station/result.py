@@ -15,7 +15,7 @@ import numpy as np
 
 from drake_teleop.common.errors import (
     DrakeTeleopError,
-    expect,
+    expect_type,
     refuse_fork,
     remedy_to_install_extra,
     wrap_read_errors,
@@ -64,7 +64,7 @@ class Signal:
         units = (units,) * len(self.components) if isinstance(units, str) else tuple(units)
         object.__setattr__(self, "units", units)
         for text in (self.name, self.description, *self.components, *units):
-            expect(str, text, "signal")
+            expect_type(str, text, "signal")
         if len(units) != len(self.components):
             raise DrakeTeleopError(
                 f"{len(self.components)} components, but {len(units)} units",
@@ -284,7 +284,7 @@ class SimulationResult:
         """
         import polars as pl
 
-        expect((str, Path), path, "result")
+        expect_type((str, Path), path, "result")
         path = Path(path)
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
         parts = _log_parts(path)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, broadcast_to_rows, to_float
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
@@ -194,7 +194,7 @@ def identify_batch(
         gain_std: relative standard deviation of the sensor's 36 gains.
     """
     METHODS.check(method, "method")
-    expect((NoiseStd, type(None)), noise, "noise")
+    expect_type((NoiseStd, type(None)), noise, "noise")
     if not to_float("gain_std", gain_std) >= 0.0:
         raise DrakeTeleopError(f"{gain_std} is negative", where="gain_std", remedy="give 0 or more")
     if method != "consistent" and (prior, ellipsoid) != (None, None):
