@@ -34,8 +34,8 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     Tolerance,
     read_tolerance,
+    required_values,
     tolerances_in_units,
-    values_of_required,
 )
 from drake_teleop.robots.calibration import Evaluation, calibrate
 from drake_teleop.robots.recording import ReadingRecorder
@@ -151,7 +151,7 @@ def judged(at: Evaluation, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
     assert at.found is not None
     found = at.found.identification.phi
     error = np.abs(
-        values_of_required(tolerance, found) - values_of_required(tolerance, phi)
+        required_values(tolerance, found) - required_values(tolerance, phi)
     ) / tolerances_in_units(tolerance, phi)
     return {"t": at.t, "error": error.tolist(), "held": (error <= at.half).tolist()}
 

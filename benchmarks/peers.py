@@ -43,7 +43,7 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.uncertainty import confidence_intervals
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench, regressor
-from drake_teleop.load.tolerance import read_tolerance, tolerances_in_units, values_of_required
+from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
 from drake_teleop.logs.processing import identify_log, usable_phi
 from drake_teleop.logs.read.alignment import choose_delay, low_pass, remove_delay
 from drake_teleop.logs.read.canonical import Log, write_log
@@ -157,7 +157,7 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
         }
         at = evaluate_record(path, ASKED, None, cutoff_hz=30.0, delay="auto")
         for name, each in found.items():
-            error = np.abs(values_of_required(ASKED, each.phi) - values_of_required(ASKED, phi))
+            error = np.abs(required_values(ASKED, each.phi) - required_values(ASKED, phi))
             relative = (
                 error / tolerances_in_units(ASKED, phi) * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])
             )

@@ -36,8 +36,8 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     read_tolerance,
+    required_values,
     tolerances_in_units,
-    values_of_required,
 )
 from drake_teleop.robots.calibration import half_widths
 
@@ -165,9 +165,7 @@ class Tables:
         """(3, k) which numbers are inside the intervals of 95 and 99.98 %, and the tolerance."""
         tolerance = read_tolerance(UNTIL)
         half, wide, _ = half_widths(SimpleNamespace(identification=found), tolerance)  # type: ignore[arg-type]
-        error = np.abs(
-            values_of_required(tolerance, found.phi) - values_of_required(tolerance, self.phi)
-        )
+        error = np.abs(required_values(tolerance, found.phi) - required_values(tolerance, self.phi))
         error /= tolerances_in_units(tolerance, self.phi)
         return np.array([error <= half, error <= wide, error <= 1.0])
 

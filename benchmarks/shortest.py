@@ -31,8 +31,8 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     Tolerance,
     read_tolerance,
+    required_values,
     tolerances_in_units,
-    values_of_required,
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario
@@ -80,13 +80,13 @@ def reached(
     )
     samples, within = np.empty((len(truth), 22)), 0
     rng = np.random.default_rng(0)
-    true, sizes = values_of_required(tolerance, phi), tolerances_in_units(tolerance, phi)
+    true, sizes = required_values(tolerance, phi), tolerances_in_units(tolerance, phi)
     for _ in range(records):
         noise = rng.standard_normal((len(truth) // SAMPLES_PER_NOISE_BLOCK + 1, NOISE_SIZE))
         record(constants, memory.copy(), estimator, remembered.copy(), table, truth, noise, samples)
         parts = (samples[:, part] for part in np.split(np.r_[:15], [6, 9, 12]))
         load = identify(*parts, noise=sensor.wrench_std())
-        within += int((np.abs(values_of_required(tolerance, load.phi) - true) <= sizes).all())
+        within += int((np.abs(required_values(tolerance, load.phi) - true) <= sizes).all())
     return within / records
 
 

@@ -1,7 +1,6 @@
 """Bilateral teleoperation with non-contact force scaling, on Drake.
 
-The names that most users need are imported here, each at its first use: `import drake_teleop` is
-fast, and work with a log does not load the simulator.
+Its names are imported at their first use: work with a log does not load the simulator.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ __all__ = [
     "tune",
 ]
 
-_HOMES = {
+_NAMES_BY_MODULE = {
     "lab.identification": ("identify_load",),
     "lab.run": ("run_scenario",),
     "lab.tuning.tune": ("tune",),
@@ -85,13 +84,13 @@ _HOMES = {
     "station.slave_side": ("MakeSlaveSide",),
     "station.station": ("MakeIdentificationStation", "MakeTeleopStation"),
 }
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+_MODULE_BY_NAME = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULE_BY_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    value = getattr(import_module(f"{__name__}.{_MODULE_BY_NAME[name]}"), name)
     globals()[name] = value  # the next access is an ordinary one
     return value
 

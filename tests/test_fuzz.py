@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
 
 pytestmark = pytest.mark.checks
 
@@ -31,7 +31,7 @@ SAID = {
     "inspect-no_stamp.npz": "",
     "inspect-lengths.npz": "'q_z' of case.npz has 160 rows where 80 are needed",
     "load-negative_variance.json": "covariance: has a negative variance",
-    "load-no_mass.json": "phi: has no mass",
+    "load-no_mass.json": "phi: has the mass 0",
     "log_parquet-panic.parquet": "cannot be read: it is damaged",
     "mjcf-latin_1.xml": "is not UTF-8 text (byte ",
     "mjcf-size.xml": "geom of l2: size '1e300 0.2 0.1' exceeds 1e+06",
@@ -94,7 +94,7 @@ def test_what_was_found_is_one_line(name: str, fuzz: ModuleType, tmp_path: Path,
         except DrakeTeleopError as error:
             line = str(error)
     assert SAID[name] in line and bool(SAID[name]) == bool(line)
-    assert len(line) <= LONGEST_LINE and len(line.splitlines()) <= 1
+    assert len(line) <= MAX_LINE_LENGTH and len(line.splitlines()) <= 1
     assert capfd.readouterr().err == ""
 
 

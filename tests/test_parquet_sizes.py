@@ -86,8 +86,8 @@ def test_the_part_of_a_log_that_is_damaged_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"PAR1", "does not end as a Parquet file"),
-        (b"no table at all", "does not end as a Parquet file"),
+        (b"PAR1", "does not end with PAR1, as a Parquet file"),
+        (b"no table at all", "does not end with PAR1, as a Parquet file"),
         (b"PAR1" + b"\xff\xff\xff\x7fPAR1", "its footer is longer than the file"),
         (b"PAR1" + b"\x1c" * 100 + b"\x64\x00\x00\x00PAR1", "its metadata is nested too deeply"),
         (b"PAR1" + b"\x15" + b"\xff" * 20 + b"\x15\x00\x00\x00PAR1", "is too long"),

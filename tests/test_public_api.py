@@ -36,7 +36,7 @@ def test_type_checkers_see_the_names_where_they_are_at_run_time():
         for statement in guarded.body
         for alias in statement.names
     }
-    assert seen == drake_teleop._HOME
+    assert seen == drake_teleop._MODULE_BY_NAME
     eager = {"DrakeTeleopError", "__version__"}
     assert sorted(seen.keys() | eager) == sorted(drake_teleop.__all__)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.vectors import quaternion_of
+from drake_teleop.common.vectors import quaternion_of_matrix
 
 
 @pytest.mark.parametrize(
@@ -15,6 +15,6 @@ from drake_teleop.common.vectors import quaternion_of
 def test_quaternion_of_a_rotation_about_any_axis(axis):
     """A small rotation and nearly 180 deg about each axis cover all branches."""
     turn = Rotation.from_rotvec(axis)
-    found = np.array(quaternion_of(turn.as_matrix()))
+    found = np.array(quaternion_of_matrix(turn.as_matrix()))
     wanted = np.roll(turn.as_quat(), 1)
     np.testing.assert_allclose(found * np.sign(found @ wanted), wanted, atol=1e-12)

@@ -14,7 +14,7 @@ from shown import type_in
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.registry import REGISTRIES, Registry, register_from
+from drake_teleop.common.registry import REGISTRIES, Registry, register_from_script
 from drake_teleop.lab.identification import true_load
 from drake_teleop.live.inputs import Inputs, csv_header, csv_row, read_inputs
 from drake_teleop.live.scenarios import chosen_scenario
@@ -100,7 +100,7 @@ def test_the_command_line_runs_registered_parts_and_refuses_removed_ones(folder,
 
 
 def test_a_scenario_with_a_removed_method_names_it(folder):
-    register_from(folder / "parts.py")
+    register_from_script(folder / "parts.py")
     scenario = LoadScenario(folder / "share.yaml")
     METHODS.remove("share")
     with pytest.raises(DrakeTeleopError, match=r"passivity\.method: there is no passivity method"):
@@ -110,7 +110,7 @@ def test_a_scenario_with_a_removed_method_names_it(folder):
 @pytest.mark.slow
 def test_the_registered_share_scales_the_wrench(folder):
     """All of the wrench is what there is without a method, none of it is none."""
-    register_from(folder / "parts.py")
+    register_from_script(folder / "parts.py")
 
     def force(**passivity):
         data = {
@@ -128,7 +128,7 @@ def test_the_registered_share_scales_the_wrench(folder):
 
 
 def test_parameters_of_a_registered_method_are_checked(folder):
-    register_from(folder / "parts.py")
+    register_from_script(folder / "parts.py")
     for values, says in (
         ({"share": 2.0}, r"mine:passivity\.registered\.share: 2 is outside 0 to 1"),
         ({"shar": 0.5}, r"there is no such field; did you mean 'share'"),
@@ -142,7 +142,7 @@ def test_parameters_of_a_registered_method_are_checked(folder):
 
 def test_a_live_session_records_the_registered_name(folder):
     before = Inputs().with_changes({"method": 99}).method
-    register_from(folder / "parts.py")
+    register_from_script(folder / "parts.py")
     inputs = Inputs().with_changes({"method": 99})
     assert inputs.method == before + 1
     assert chosen_scenario(Scenario(), None, inputs).passivity.method == "share"
@@ -155,7 +155,7 @@ def test_a_live_session_records_the_registered_name(folder):
 
 
 def test_export_source_and_sink_by_their_registered_names(folder):
-    register_from(folder / "parts.py")
+    register_from_script(folder / "parts.py")
     rng = np.random.default_rng(1)
     s, omega, alpha = rng.normal(size=(3, 200, 3)) * [[[9.0]], [[2.0]], [[5.0]]]
     wrench = np.arange(6.0) + non_contact_wrench(s, omega, alpha, PHI)
@@ -208,11 +208,11 @@ def test_a_file_that_registers_nothing_is_one_line(folder, name, text, says):
     if text is not None:
         (folder / name).write_text(text)
     with pytest.raises(DrakeTeleopError, match=says):
-        register_from(folder / name)
+        register_from_script(folder / name)
 
 
 def test_another_process_registers_the_same_parts_when_a_name_is_unknown(folder):
-    register_from(folder / "parts.py")
+    register_from_script(folder / "parts.py")
     METHODS.remove("share")
     assert "share" not in METHODS  # registered once, then removed
     del sys.modules["parts"]

@@ -9,7 +9,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError, to_one_line
+from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError, to_one_line
 from drake_teleop.common.texts import parse_yaml, read_json, read_yaml, to_yaml_text
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.load.identification import Identification
@@ -53,7 +53,7 @@ def message(read, path, text: str) -> str:
         read(path)
     line = str(caught.value)
     assert line.startswith(str(path))
-    assert len(line) <= LONGEST_LINE and len(line.splitlines()) == 1
+    assert len(line) <= MAX_LINE_LENGTH and len(line.splitlines()) == 1
     return line
 
 
@@ -203,7 +203,7 @@ def test_overlong_integers_raise():
 
 def test_shortened_line_keeps_beginning_and_end():
     line = to_one_line("begin\n" + "x" * 1000 + " \x1b[31m end")
-    assert len(line) == LONGEST_LINE
+    assert len(line) == MAX_LINE_LENGTH
     assert line.startswith("begin x") and line.endswith("x ?[31m end")
 
 

@@ -16,7 +16,7 @@ import polars as pl
 import pytest
 from matplotlib.figure import Figure
 
-from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
 from drake_teleop.common.files import (
     CannotWrite,
     make_folder,
@@ -109,7 +109,7 @@ def test_impossible_folder_raises_one_line(tmp_path, monkeypatch):
         with pytest.raises(CannotWrite, match=f"cannot be made a folder .{reason}.; give another"):
             make_folder(tmp_path / folder)
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # which root never sees
-    with pytest.raises(CannotWrite, match="is a write-protected folder; give another"):
+    with pytest.raises(CannotWrite, match="is a folder without write permission; give another"):
         make_folder(tmp_path)
 
 
@@ -196,7 +196,7 @@ def test_full_disk_at_any_file(tmp_path, monkeypatch, little_work, name):
             except DrakeTeleopError as error:
                 said = str(error)
         assert "cannot be written (No space left on device)" in said
-        assert said.count(str(out)) >= 1 and len(said) <= LONGEST_LINE
+        assert said.count(str(out)) >= 1 and len(said) <= MAX_LINE_LENGTH
         if write == 2:
             assert third in said
         there = {path for path in out.rglob("*") if path.is_file()}

@@ -1,4 +1,4 @@
-"""Command line: commands and their tables on the terminal."""
+"""Command line `drake-teleop`: commands, options and printed tables."""
 
 import sys
 

@@ -20,8 +20,8 @@ from drake_teleop.load.tolerance import (
     QUANTITY_UNITS,
     Tolerance,
     read_tolerance,
+    required_values,
     tolerances_in_units,
-    values_of_required,
 )
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, Evaluation, calibrate
 from drake_teleop.robots.connections import open_recording
@@ -43,7 +43,7 @@ def calibrate_command(
 ) -> dict[str, Any]:
     """Identify a load from a live source; write the results into `out` and return the summary.
 
-    `largest` is the range of the sensor: force [N], torque [N m].
+    `until` is the required accuracy of the load, `largest` the range of the sensor: [N, N m].
     """
     tolerance = read_tolerance(until)
     make_folder(out)
@@ -56,7 +56,7 @@ def calibrate_command(
         with Live(console=console, auto_refresh=False) as live:
 
             def show_progress(at: Evaluation) -> None:
-                live.update(progress_table(at, tolerance), refresh=True)
+                live.update(make_progress_table(at, tolerance), refresh=True)
 
             looks = calibrate(
                 stream, recorder, path, tolerance, seconds=seconds, show=show_progress, **processing
@@ -85,7 +85,7 @@ def calibrate_command(
     return summary
 
 
-def progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
+def make_progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
@@ -101,13 +101,13 @@ def progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
     values = sizes = np.full(len(units), np.nan)
     if at.found is not None:
         phi = at.found.identification.phi
-        values, sizes = values_of_required(tolerance, phi), tolerances_in_units(tolerance, phi)
+        values, sizes = required_values(tolerance, phi), tolerances_in_units(tolerance, phi)
     for k, entry in enumerate(tolerance.required_entries):
         half = at.half[k]
         numbers = [f"{x:.4g}" if np.isfinite(x) else "?" for x in (values[k], half * sizes[k])]
         table.add_row(
             *(entry, *numbers, f"{sizes[k]:.3g}" if np.isfinite(sizes[k]) else "?", units[k]),
-            *(_progress_bar(half, bool(at.known[k])), _parameter_verdict(at, k)),
+            *(_make_progress_bar(half, bool(at.known[k])), _parameter_verdict(at, k)),
         )
     lines = [Text(line, style="red") for line in (*at.doubts, *([at.why] if at.why else []))]
     if at.advice:
@@ -115,7 +115,7 @@ def progress_table(at: Evaluation, tolerance: Tolerance) -> Group:
     return Group(table, *lines)
 
 
-def _progress_bar(half: float, known: bool) -> Text:
+def _make_progress_bar(half: float, known: bool) -> Text:
     share = 1.0 - np.log10(max(half, 1.0)) / _BAR_DECADES if np.isfinite(half) else 0.0
     cells = int(np.clip(share, 0.0, 1.0) * _BAR_CELLS)
     return Text("█" * cells + "·" * (_BAR_CELLS - cells), style="green" if known else "yellow")

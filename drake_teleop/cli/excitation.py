@@ -39,9 +39,9 @@ CRITERION_TEXTS = {
     "A16": "rms of predicted errors over acceptable ones",
     "D16": "geometric mean of predicted errors over acceptable ones",
 }
-_OFFSETS = ("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz")
-_PHI = ("m", "m_cx", "m_cy", "m_cz", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
-_UNITS = (*3 * ["N"], *3 * ["N m"], "kg", *3 * ["kg m"], *6 * ["kg m^2"])
+_OFFSET_NAMES = ("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz")
+_PHI_NAMES = ("m", "m_cx", "m_cy", "m_cz", "I_xx", "I_xy", "I_xz", "I_yy", "I_yz", "I_zz")
+_PARAMETER_UNITS = (*3 * ["N"], *3 * ["N m"], "kg", *3 * ["kg m"], *6 * ["kg m^2"])
 
 
 def excite_command(
@@ -62,13 +62,13 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Design, check and write an excitation trajectory; return the content of both JSON files.
+    """Design, check and write an excitation trajectory; return summary and session in one.
 
     Args:
         model: model file of another arm, with the scenario's sensor.
         sensor_frame: name of the sensor's frame, required with `model`.
-        until: tolerance, which replaces criterion, period and seconds.
-        quiet: True hides progress bars and tables; `progress` False only the bars.
+        until: required accuracy of the load; replaces criterion, period and seconds.
+        quiet: True hides progress bars and tables; `progress` False hides only the bars.
     """
     tolerance = None if until is None else read_tolerance(until)
     setup = LoadScenario(scenario)
@@ -80,7 +80,7 @@ def excite_command(
             robot = RobotFromScenario(setup)
         elif sensor_frame is None:
             raise DrakeTeleopError(
-                "is missing, and the model does not contain the sensor's position",
+                "is required with --model, which does not contain the sensor's position",
                 where="--sensor-frame",
                 remedy="name the frame or link at which it measures",
             )
@@ -120,7 +120,7 @@ def excite_command(
             found = result.excitation
             shares = dict(zip(tolerance.required_entries, result.reached.tolist(), strict=True))
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE_PROBABILITY}
-    summary = summarise(found) | reached | {"seed": seed}
+    summary = summarize_excitation(found) | reached | {"seed": seed}
     session = {"design_s": found.seconds}
     with output_folder(out):
         write_table(out / "trajectory.csv", trajectory_table(found))
@@ -130,7 +130,7 @@ def excite_command(
         write_json(out / "session.json", session)
         write_json(out / "summary.json", summary)
     if not quiet:
-        _print(summary, out)
+        _print_summary(summary, out)
     return summary | session
 
 
@@ -143,9 +143,9 @@ def _refuse_model_options(*options: object) -> None:
             )
 
 
-def summarise(found: Excitation) -> dict[str, Any]:
+def summarize_excitation(found: Excitation) -> dict[str, Any]:
     robot, trajectory = found.robot, found.trajectory
-    names = (*_OFFSETS, *_PHI)
+    names = (*_OFFSET_NAMES, *_PHI_NAMES)
     return {
         "robot": robot.name,
         "criterion": found.criterion,
@@ -158,7 +158,7 @@ def summarise(found: Excitation) -> dict[str, Any]:
         },
         "predicted_std": {
             f"{name} [{unit}]": float(std)
-            for name, unit, std in zip(names, _UNITS, found.deviations, strict=True)
+            for name, unit, std in zip(names, _PARAMETER_UNITS, found.deviations, strict=True)
         },
         "noise": {"force [N]": robot.scales.noise[0], "torque [N m]": robot.scales.noise[1]},
         "heaviest_load_kg": float(robot.limits.phi[0]),
@@ -171,7 +171,7 @@ def _criterion_text(name: str, robot: Robot) -> str:
 
 
 def trajectory_table(found: Excitation) -> pl.DataFrame:
-    """Return the content of trajectory.csv: one period at 1 kHz, both ends included."""
+    """Return trajectory.csv: joint motion of one period at 1 kHz, both ends included."""
     period = found.trajectory.period
     t = np.linspace(0, period, round(period * RATE) + 1)
     columns = {"t": t}
@@ -228,7 +228,7 @@ def _draw_wrench(forces: Axes, torques: Axes, found: Excitation) -> None:
     torques.set_xlabel("t [s]")
 
 
-def _print(summary: dict[str, Any], out: Path) -> None:
+def _print_summary(summary: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 

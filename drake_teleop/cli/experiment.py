@@ -24,7 +24,7 @@ def experiment_command(
     simulated: int = 0,
     **page: Any,
 ) -> pl.DataFrame:
-    """Continue an experiment and return its result table.
+    """Continue the experiment in folder `out` and return its result table.
 
     `simulated` is the total number of simulated participants, 0 for people.
     """
@@ -55,7 +55,7 @@ def next_participant(store: Store, trials: int, wanted: int | None = None) -> in
     number = max(known, default=0) + 1
     if number > MAX_PARTICIPANT:
         raise DrakeTeleopError(
-            f"participant numbers 1 to {MAX_PARTICIPANT} are used",
+            f"all participant numbers from 1 to {MAX_PARTICIPANT} are used",
             where=str(store.folder),
             remedy="choose another folder",
         )

@@ -111,7 +111,7 @@ def eliminate_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Write contact_wrench.parquet, contact_wrench.png and summary.json; return the summary."""
+    """Remove the load's wrench from a log, write the contact wrench, return the summary."""
     load_file = Identification.load(load)
     scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
     scales |= dict(sigma_weight=sigma_weight, sigma_inertia=sigma_inertia)
@@ -190,7 +190,7 @@ def detect_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Write detection.parquet, detection.png and summary.json; return the summary."""
+    """Detect contact in a log, write statistics and contact flags, return the summary."""
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated
     summary = common_figures(log, eliminated, cutoff_hz, eliminated.delay_s) | {

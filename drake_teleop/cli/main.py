@@ -1,4 +1,4 @@
-"""Command line (long: all commands and their options). It imports large packages on demand."""
+"""Commands of `drake-teleop` (long: with all options). Large packages are imported on demand."""
 
 from __future__ import annotations
 
@@ -23,34 +23,35 @@ from drake_teleop.common.version import __version__
 @click.option(
     "--register",
     "scripts",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     multiple=True,
     metavar="FILE",
-    help="Import this Python file first, which registers own parts; may be repeated.",
+    help="Python file that registers your own parts (docs/extend.md); may be repeated.",
 )
 def cli(scripts: tuple[Path, ...]) -> None:
-    """Bilateral teleoperation with non-contact force scaling: simulate it, and use it on logs.
+    """Bilateral teleoperation with non-contact force scaling: simulate it, or use it on logs.
 
-    Every command with --out writes its figures by name into DIR/summary.json. A command with
+    Every command with --out writes its results by name into DIR/summary.json. A command with
     invalid input exits with status 2 and one error line.
 
     The Tab key completes commands, options, names and files in bash (zsh, fish: likewise) after
     eval "$(_DRAKE_TELEOP_COMPLETE=bash_source drake-teleop)"
     """
     for script in scripts:
-        from drake_teleop.common.registry import register_from
+        from drake_teleop.common.registry import register_from_script
 
-        register_from(script)
+        register_from_script(script)
 
 
 @cli.command()
-@option.out("reproduce")
+@option.output_folder("reproduce")
 @option.seed
 @option.quiet
 def reproduce(out: Path, **options: Any) -> int:
     """Repeat the paper's experiments.
 
-    Writes the paper's figures and numbers beside the simulated ones, a 3D replay and report.html.
+    Writes figures and numbers of the paper (Kubus, Weidauer, Wahl 2009) and of the simulation, a
+    3D replay and report.html.
     The exit status is 1 if a number is outside its accepted range.
     """
     from drake_teleop.lab.reproduction.report import describe_unaccepted
@@ -63,19 +64,19 @@ def reproduce(out: Path, **options: Any) -> int:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO, required=False)
+@click.argument("scenario", type=option.SCENARIO_TYPE, required=False)
 @click.option(
     "--inputs",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     metavar="DIR",
-    help="Repeat the drive recorded in this folder, to the same bytes.",
+    help="Folder of `drive --record`; repeat this session with identical results.",
 )
-@option.out("run")
+@option.output_folder("run")
 @option.seed
-@click.option("--fresh", is_flag=True, help="Identify the load again, without the cache.")
+@click.option("--fresh", is_flag=True, help="Identify the load again; ignore the cache.")
 @option.quiet
 def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) -> None:
-    """Simulate one scenario, or repeat a recorded drive.
+    """Simulate one scenario, or repeat a session of `drive`.
 
     SCENARIO is a shipped name or a YAML file. Writes the log, pictures and a 3D replay. The load is
     identified first and kept in the user's cache folder, or in $DRAKE_TELEOP_CACHE_DIR.
@@ -83,7 +84,7 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
     from drake_teleop.lab.run import run_command
 
     if (scenario is None) == (inputs is None):
-        raise click.UsageError("give a SCENARIO, or --inputs with the folder of a drive")
+        raise click.UsageError("give either SCENARIO, or --inputs and a folder of `drive --record`")
     drive = None
     if inputs is not None:
         from drake_teleop.live.session import read_drive
@@ -93,8 +94,8 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO, default="contact_transition")
-@click.option("--record", type=option.PATH, metavar="DIR", help="Record the drive in this folder.")
+@click.argument("scenario", type=option.SCENARIO_TYPE, default="contact_transition")
+@click.option("--record", type=option.PATH_TYPE, metavar="DIR", help="Record the session in DIR.")
 @click.option(
     "--port",
     type=option.Integer(0, 65535),
@@ -102,34 +103,34 @@ def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) ->
     show_default="any free port",
     help="TCP port of the page on localhost.",
 )
-@click.option("--no-browser", is_flag=True, help="Print the page's address, and open no browser.")
+@click.option("--no-browser", is_flag=True, help="Print the page's address; open no browser.")
 @click.option(
     "--device",
     metavar="ADDRESS",
     help="Haptic device of the operator: udp://127.0.0.1:PORT or haply://localhost:10001.",
 )
 @click.option(
-    "--study", metavar="FILE", help="Run this blind experiment with people; SCENARIO is unused."
+    "--study", metavar="FILE", help="Experiment with participants; SCENARIO is then unused."
 )
 @click.option(
     "--results",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     default=Path("out/experiment"),
     show_default=True,
     metavar="DIR",
-    help="Results of --study; an experiment continues in the same folder.",
+    help="Folder for results of --study; the same folder continues an experiment.",
 )
 @click.option(
     "--participant",
     type=option.Integer(1, 9999),
     show_default="the first with trials left, or a new one",
-    help="Number of the participant of --study.",
+    help="Number that identifies the participant of --study.",
 )
 @click.option(
     "--simulated",
     type=option.Integer(0, 9999),
     default=0,
-    help="Number of simulated participants of --study, without a page.",
+    help="Number of participants to simulate in --study; 0: people, on the page.",
 )
 def drive(
     scenario: str,
@@ -143,10 +144,10 @@ def drive(
 ) -> None:
     """Drive a station live in the browser.
 
-    SCENARIO is a shipped name or a YAML file; only the grip of its operator is used. One page on
-    this machine moves the hand by mouse, keys, touch or gamepad, which vibrates in contact, and
-    shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a recorded drive. With --study, a
-    shipped experiment or a YAML file, the page asks participants which interval they felt.
+    SCENARIO is a shipped name or a YAML file; your hand replaces its operator's motion, not the
+    grip. One page on this machine moves the hand by mouse, keys, touch or gamepad (it vibrates in
+    contact), and shows forces, sigma, gamma and eta. `run --inputs DIR` repeats a recorded session.
+    In an experiment (--study: name or YAML file) participants compare two intervals.
     """
     options["browser"] = not no_browser
     if study is None:
@@ -160,7 +161,7 @@ def drive(
 
 
 @cli.command("scenario")
-@click.argument("name", type=option.SCENARIO, required=False)
+@click.argument("name", type=option.SCENARIO_TYPE, required=False)
 def print_scenario(name: str | None) -> None:
     """Print a scenario with every field, as a template.
 
@@ -179,9 +180,9 @@ def print_scenario(name: str | None) -> None:
 
 @cli.command()
 def parts() -> None:
-    """List the parts that can be selected by name.
+    """List the names of all methods, formats and other parts.
 
-    Own parts are added by --register FILE: drake-teleop --register mine.py parts
+    --register FILE adds your own parts: drake-teleop --register mine.py parts
     """
     from drake_teleop.cli.printing import print_parts
 
@@ -189,11 +190,11 @@ def parts() -> None:
 
 
 @cli.command()
-@click.argument("folder", type=option.PATH)
+@click.argument("folder", type=option.PATH_TYPE)
 @click.option(
-    "--scenario", metavar="SCENARIO", help="Scenario of the log.  [default: the file beside it]"
+    "--scenario", metavar="SCENARIO", help="Scenario of the log.  [default: YAML file beside it]"
 )
-@option.out("replay")
+@option.output_folder("replay")
 @option.quiet
 def replay(folder: Path, out: Path, **options: Any) -> None:
     """Show a logged run in 3D.
@@ -207,17 +208,18 @@ def replay(folder: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@option.gripper
+@click.argument("log", type=option.PATH_TYPE)
+@option.gripper_file
 @click.option(
     "--method",
-    type=option.Registered("estimator", "ordinary", "whitened", "robust", "consistent"),
+    type=option.PartName("estimator", "ordinary", "whitened", "robust", "consistent"),
     default="consistent",
     show_default=True,
-    help="Least squares; also weighted by noise; also without impacts; also physically consistent.",
+    help="Least squares; whitened: weighted by noise; robust: also without disturbed samples;"
+    " consistent: also possible for a rigid body.",
 )
-@option.out("identify")
-@option.cutoff
+@option.output_folder("identify")
+@option.cutoff_hz
 @option.delay
 @option.quiet
 def identify(log: Path, out: Path, **options: Any) -> None:
@@ -232,57 +234,58 @@ def identify(log: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@option.load(required=True)
-@option.gripper
-@option.sigma("Scale of the non-contact wrench; of the gripper's with --gripper.")
+@click.argument("log", type=option.PATH_TYPE)
+@option.load_file(required=True)
+@option.gripper_file
+@option.sigma("Scale of the non-contact wrench; with --gripper, of the gripper's.")
 @click.option(
     "--sigma-object",
-    type=option.SCALE,
-    help="Scale of the object's non-contact wrench, with --gripper.  [default: sigma]",
+    type=option.SCALE_TYPE,
+    help="With --gripper: scale of the object's non-contact wrench.  [default: value of --sigma]",
 )
 @option.separate_sigmas
 @option.gamma
 @click.option(
-    "--eta", type=option.Number(0, 1), help="Share of a gripped object's wrench that is kept."
+    "--eta", type=option.FiniteNumber(0, 1), help="Kept share of the object; excludes other scales."
 )
 @click.option(
     "--offsets",
     type=click.Choice(["record", "load"]),
     default="record",
     show_default=True,
-    help="Sensor offsets: estimated from LOG, or those of the load file.",
+    help="Source of the sensor offsets: LOG (record) or the load file (load).",
 )
 @click.option(
     "--untouched",
     "untouched_s",
-    type=option.Number(0, 36000),
+    type=option.FiniteNumber(0, 36000),
     nargs=2,
     metavar="START STOP",
-    help="Seconds of LOG without contact, which determine the offsets.  [default: all]",
+    help="Contact-free time of LOG [s], which determines the offsets.  [default: the whole LOG]",
 )
 @click.option(
     "--causal",
     type=click.Choice(["delayed", "predicted"]),
-    help="Also eliminate causally: with the lag of the low-pass, or extrapolated over it.",
+    help="Add a causal result: late by the lag of the low-pass, or extrapolated over this lag.",
 )
 @click.option(
     "--causal-tare",
     "causal_tare_s",
-    type=option.Number(0, 36000, min_open=True),
+    type=option.FiniteNumber(0, 36000, min_open=True),
     metavar="SECONDS",
-    help="With --causal: contact-free start that gives the offsets.  [default: the load file's]",
+    help="With --causal: length of the contact-free start of LOG that determines the offsets [s]."
+    "  [default: offsets of the load file]",
 )
-@option.free
-@option.out("eliminate")
-@option.cutoff
+@option.free_motion_log
+@option.output_folder("eliminate")
+@option.cutoff_hz
 @option.delay
 @option.quiet
 def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
     """Eliminate or scale non-contact forces in a log.
 
-    LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Writes the log of the
-    contact wrench and of the scaled wrench.
+    LOG is a canonical log (.csv, .parquet) or a log description (.yaml). Writes a table of the
+    contact wrench and the scaled wrench.
     """
     from drake_teleop.cli.logs import eliminate_command
 
@@ -290,25 +293,25 @@ def eliminate(log: Path, load: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@option.load(default="identified from LOG itself")
-@option.free
+@click.argument("log", type=option.PATH_TYPE)
+@option.load_file(default="identified from LOG itself")
+@option.free_motion_log
 @click.option(
     "--statistic",
     type=click.Choice(["level", "cusum", "glr"]),
     default="level",
     show_default=True,
-    help="Wrench over its noise floor: its level, cumulative sum or likelihood ratio.",
+    help="Level, cumulative sum or likelihood ratio of the wrench, relative to its noise.",
 )
-@option.out("detect")
-@option.cutoff
+@option.output_folder("detect")
+@option.cutoff_hz
 @option.delay
 @option.quiet
 def detect(log: Path, out: Path, **options: Any) -> None:
     """Find contact in a log.
 
     LOG is a canonical log (.csv, .parquet) or a log description (.yaml). The load's own wrench is
-    eliminated; the noise floor of the remaining wrench rises with the acceleration.
+    eliminated; noise of the remaining wrench is modelled as rising with the acceleration.
     """
     from drake_teleop.cli.logs import detect_command
 
@@ -316,16 +319,16 @@ def detect(log: Path, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("log", type=option.PATH)
-@click.argument("others", type=option.PATH, nargs=-1)
-@option.out("inspect")
+@click.argument("log", type=option.PATH_TYPE)
+@click.argument("others", type=option.PATH_TYPE, nargs=-1)
+@option.output_folder("inspect")
 @option.quiet
 def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """List the contents and suspicious parts of a log.
 
     LOG is a canonical log, a log description (.yaml), or a table of any columns, for which a draft
     description is written; OTHERS are further tables of the same recording. Reports rates, gaps,
-    noise, saturation and errors of convention.
+    noise, saturation and suspicious signs, axes and units.
     """
     from drake_teleop.logs.inspection import inspect_command
 
@@ -333,17 +336,17 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 
 
 @cli.command()
-@click.argument("path", type=option.PATH)
-@option.load()
-@click.option("--identify", is_flag=True, help="Identify the load from the episodes.")
+@click.argument("path", type=option.PATH_TYPE)
+@option.load_file()
+@click.option("--identify", is_flag=True, help="Identify the load from all episodes.")
 @click.option(
     "--description",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     metavar="FILE",
-    help="Log description of an episode, without file.  [default: drafted from the episodes]",
+    help="Log description, for all episodes, without `file`.  [default: drafted from the episodes]",
 )
 @option.jobs
-@option.out("dataset")
+@option.output_folder("dataset")
 @option.quiet
 def dataset(path: Path, out: Path, **options: Any) -> None:
     """Add contact wrenches to a robot-learning dataset.
@@ -359,7 +362,7 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("source")
-@option.load(required=True)
+@option.load_file(required=True)
 @click.option("--out", "sink", default="-", metavar="SINK", help="Destination.  [default: stdout]")
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
@@ -367,34 +370,34 @@ def dataset(path: Path, out: Path, **options: Any) -> None:
 @click.option(
     "--rate",
     "rate_hz",
-    type=option.POSITIVE,
+    type=option.POSITIVE_TYPE,
     metavar="HZ",
-    help="Rate of the wrenches; known for a log, a UR and a NetBox.",
+    help="Rate of the wrenches; not needed for replay:, rtde:// and netft://.",
 )
-@click.option("--predicted", is_flag=True, help="Extrapolate over the lag of the low-pass.")
+@click.option("--predicted", is_flag=True, help="Extrapolate the results over the low-pass lag.")
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
 @click.option(
     "--free",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     metavar="LOG",
-    help="Flag contact by the noise floor of this log of free motion, as `detect` does.",
+    help="Log of free motion, whose noise sets the threshold of contact flags, as for `detect`.",
 )
-@click.option("--tare", is_flag=True, help="Set the offsets at the start, at rest without contact.")
+@click.option("--tare", is_flag=True, help="Tare at the start: keep the tool free, at rest.")
 @click.option(
     "--control",
     type=option.Integer(1, 65535),
     metavar="PORT",
-    help="UDP port on localhost for the command `tare`.",
+    help="UDP port on localhost that accepts the request `tare`.",
 )
-@option.stream
+@option.stream_options
 def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     """Remove the load from a live wrench.
 
     SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, ros2://TOPIC, zenoh://HOST/TOPIC, - for
     lines of JSON on stdin, or replay:LOG; SINK is udp://HOST:PORT, ros2://TOPIC,
     zenoh://HOST/TOPIC, foxglove://, - for stdout, or a .csv, .parquet or .mcap file.
-    Invalid wrenches are zero, with a flag. --cutoff is causal here. --delay is the
-    delay of the motion behind the wrench; auto: the value in the load file.
+    An invalid wrench is replaced by zero, with a flag. --cutoff is causal here. --delay is the
+    delay of the motion behind the wrench; auto starts with the value in the load file.
     The command ends with the source or with Ctrl-C.
     """
     from drake_teleop.robots.compensate import compensate_command
@@ -405,15 +408,15 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @cli.command()
 @click.argument("source")
 @click.argument("sink")
-@option.load(required=True)
+@option.load_file(required=True)
 @option.sigma("Scale of the non-contact wrench.")
 @option.separate_sigmas
 @option.gamma
-@click.option("--rate", "rate_hz", type=option.POSITIVE, required=True, metavar="HZ",
+@click.option("--rate", "rate_hz", type=option.POSITIVE_TYPE, required=True, metavar="HZ",
               help="Rate of the wrenches.")  # fmt: skip
 @click.option("--watch", is_flag=True, help="Flag contact, and a change of the load.")
-@option.stream
-@option.out("ros2")
+@option.stream_options
+@option.output_folder("ros2")
 @click.pass_context
 def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **options: Any) -> None:
     """Remove the load from a live wrench, as a ROS 2 node.
@@ -449,24 +452,24 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
     default="mass 0.5 %, com 0.5 mm, inertia 5 %",
     show_default=True,
     metavar="TOLERANCE",
-    help="Required accuracy of each parameter; parameters left out are not required.",
+    help="Required accuracy; mass, com or inertia may be left out.",
 )
 @click.option(
     "--seconds",
-    type=option.Number(1, 36000),
+    type=option.FiniteNumber(1, 36000),
     default=120.0,
     show_default=True,
-    help="Largest length of the record [s].",
+    help="Maximum duration of the recording [s].",
 )
-@option.stream
-@option.out("calibrate")
+@option.stream_options
+@option.output_folder("calibrate")
 @option.quiet
 def calibrate(source: str, out: Path, **options: Any) -> int:
     """Identify a load from a live stream, with guidance.
 
     SOURCE is as for `compensate`. Move the tool manually or by the motion of `excite`, without
     contact. The command ends when all tolerances are reached; it writes the log and the results of
-    `identify`. The exit status is 1 if it ends before.
+    `identify`. The exit status is 1 if the time ends before.
     """
     from drake_teleop.cli.calibrate import calibrate_command
 
@@ -475,7 +478,7 @@ def calibrate(source: str, out: Path, **options: Any) -> int:
 
 
 _CONTROLLER_FORMATS = ("c99", "fmu", "ros2_filter")
-_EXPORT_FORMATS = option.Registered(
+_EXPORT_FORMATS = option.PartName(
     "export format",
     *("ur", "franka", "xarm", "kth", "ft_tools", "ros2-admittance", "bota", "urdf", "sdf", "mjcf"),
     *_CONTROLLER_FORMATS,
@@ -483,9 +486,9 @@ _EXPORT_FORMATS = option.Registered(
 
 
 @cli.command()
-@click.argument("identification", type=option.PATH)
+@click.argument("identification", type=option.PATH_TYPE)
 @click.option("--to", required=True, type=_EXPORT_FORMATS, help="Robot or file format.")
-@option.sensor_pose("Sensor in the flange [m, deg].  [default: values in the sensor's frame]")
+@option.sensor_pose("Pose of the sensor in the flange [m, deg].  [default: same frames]")
 @click.option(
     "--sign",
     type=click.Choice(["-1", "1"]),
@@ -496,13 +499,13 @@ _EXPORT_FORMATS = option.Registered(
 @click.option(
     "--rate",
     "rate_hz",
-    type=option.POSITIVE,
+    type=option.POSITIVE_TYPE,
     metavar="HZ",
-    help="Rate of the readings; required by c99.",
+    help="Rate of the sensor's readings; required by c99, fmu and ros2_filter.",
 )
-@option.cutoff
+@option.cutoff_hz
 @option.sensor_range
-@option.out("export")
+@option.output_folder("export")
 def export(
     identification: Path,
     to: str,
@@ -513,9 +516,9 @@ def export(
     """Write a load for a robot, model or controller.
 
     Prints the load of an identification.json in the format, units and frame of a robot, a
-    compensation or a model. c99 writes the compensation itself into --out, as code of a controller
-    with --rate, --cutoff and --range. Values that are dropped or not identified are listed on
-    stderr.
+    compensation or a model. c99, fmu and ros2_filter write the compensation itself into --out, as
+    code of a controller with --rate, --cutoff and --range. Values that are dropped or not
+    identified are listed on stderr.
     """
     from drake_teleop.load.identification import Identification
 
@@ -536,7 +539,7 @@ def export(
 
 @cli.command("sample-log")
 @option.seed_0
-@option.out("sample-log")
+@option.output_folder("sample-log")
 @option.quiet
 def sample_log(out: Path, **options: Any) -> None:
     """Write a simulated log to try these commands on.
@@ -551,7 +554,7 @@ def sample_log(out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO)
+@click.argument("scenario", type=option.SCENARIO_TYPE)
 @click.option(
     "--direction",
     type=click.Choice(["x", "y", "z"]),
@@ -559,7 +562,7 @@ def sample_log(out: Path, **options: Any) -> None:
     show_default=True,
     help="Direction of the task, an axis of the world frame.",
 )
-@option.out("analyze")
+@option.output_folder("analyze")
 @option.quiet
 def analyze(scenario: str, out: Path, **options: Any) -> None:
     """Analyse stability and transparency of a scenario.
@@ -573,8 +576,8 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command("compare-passivity")
-@click.option("--networks", type=option.Names(), help="Presets.  [default: lan to lunar]")
-@click.option("--methods", type=option.Names(), help="Methods.  [default: all]")
+@click.option("--networks", type=option.Names(), help="Network presets.  [default: all but ideal]")
+@click.option("--methods", type=option.Names(), help="Passivity methods.  [default: all]")
 @click.option(
     "--scenario",
     default="contact_transition",
@@ -582,7 +585,7 @@ def analyze(scenario: str, out: Path, **options: Any) -> None:
     help="Scenario of the station: a shipped name or a YAML file.",
 )
 @option.jobs
-@option.out("compare-passivity")
+@option.output_folder("compare-passivity")
 @option.seed_0
 @option.quiet
 def compare_passivity(
@@ -590,9 +593,9 @@ def compare_passivity(
 ) -> None:
     """Compare passivity methods over networks with delay.
 
-    The station moves freely and presses on a soft and a stiff leaf. In one degree of freedom the
-    hand releases and taps, for increasing round trips. Writes a decision table, pictures and
-    report.html.
+    The station moves freely and presses on a soft and a stiff leaf spring. In a model with one
+    degree of freedom the hand lets go or taps, for increasing round trips. Writes a decision table,
+    pictures and report.html.
     """
     from drake_teleop.lab.comparison import compare_passivity as comparison
 
@@ -605,19 +608,19 @@ def compare_passivity(
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO)
-@click.option("--hands", type=option.Names(), help="Grips.  [default: light,firm]")
-@click.option("--walls", type=option.Names(), help="Stiffnesses [kN/m].  [default: 0.5,20]")
-@click.option("--network", help="Preset of the network.  [default: of the scenario]")
+@click.argument("scenario", type=option.SCENARIO_TYPE)
+@click.option("--hands", type=option.Names(), help="Grips of the operator.  [default: light,firm]")
+@click.option("--walls", type=option.Names(), help="Wall stiffnesses [kN/m].  [default: 0.5,20]")
+@click.option("--network", help="Network preset.  [default: that of the scenario]")
 @click.option(
     "--task",
     type=click.Choice(["press", "touch", "insert"]),
     default="press",
     show_default=True,
-    help="Task; it sets the required margin.",
+    help="Task; it sets the required stability margin of gamma.",
 )
 @option.jobs
-@option.out("tune")
+@option.output_folder("tune")
 @option.quiet
 def tune(
     scenario: str,
@@ -634,21 +637,21 @@ def tune(
     """
     from drake_teleop.lab.tuning.tune import tune as tune_station
 
-    stiffnesses = [option.POSITIVE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
-    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffnesses, **options)
+    stiffness = [option.POSITIVE_TYPE.convert(wall, None, None) for wall in walls or ("0.5", "20")]
+    tune_station(scenario, out, hands=hands or ("light", "firm"), walls=stiffness, **options)
 
 
 @cli.command()
-@click.argument("study", type=option.STUDY)
+@click.argument("study", type=option.STUDY_TYPE)
 @option.jobs
-@option.cluster
-@click.option("--shard", metavar="K/N", help="Run part K of N, e.g. 3/8; see docs/cluster.md.")
+@option.dask_cluster
+@click.option("--shard", metavar="K/N", help="Run only part K of N, e.g. 3/8; see docs/cluster.md.")
 @click.option("--merge", is_flag=True, help="Collect the runs of all shards in --out.")
-@option.yes
-@option.out("study")
+@option.skip_question
+@option.output_folder("study")
 @option.quiet
 def study(study: Path, out: Path, **options: Any) -> None:
-    """Run a scenario over a design of its fields.
+    """Run a scenario for varied values of its fields.
 
     STUDY is a YAML file with factors, design, repeats and measures, or a shipped name. Writes one
     table with a row for each run, and pictures. After an interruption, repeat the command.
@@ -660,18 +663,18 @@ def study(study: Path, out: Path, **options: Any) -> None:
 
 @cli.command("scaling-study")
 @option.jobs
-@option.cluster
+@option.dask_cluster
 @click.option(
-    "--repeats", type=option.Integer(1, 10**6), help="Seeds of each point.  [default: 12]"
+    "--repeats", type=option.Integer(1, 10**6), help="Runs per combination.  [default: 12]"
 )
-@option.yes
-@option.out("scaling-study")
+@option.skip_question
+@option.output_folder("scaling-study")
 @option.quiet
 def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
 
-    Runs the operator's tasks over sigma, gamma and eta, about 1000 times. After an interruption,
-    repeat the command.
+    Simulates the operator's tasks for combinations of sigma, gamma and eta, in about 1000 runs.
+    After an interruption, repeat the command.
     """
     from drake_teleop.lab.studies.scaling_study import scaling_study_command
 
@@ -679,56 +682,58 @@ def scaling_study(out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("scenario", type=option.SCENARIO, default="identification")
-@click.option("--model", type=option.PATH, help="Another arm: URDF, SDF, MJCF or .dmd.yaml.")
+@click.argument("scenario", type=option.SCENARIO_TYPE, default="identification")
+@click.option("--model", type=option.PATH_TYPE, help="Other arm: URDF, SDF, MJCF or .dmd.yaml.")
 @option.sensor_frame()
 @option.package_paths
 @click.option(
     "--acceleration",
     type=option.PositiveNumbers(),
     default=(),
-    help="Limits of the model's joints [rad/s^2], one for all or one for each.",
+    help="With --model: acceleration limits [rad/s^2], one for all joints or one for each.",
 )
 @click.option(
     "--payload",
-    type=option.Number(0, 1e4, min_open=True),
+    type=option.FiniteNumber(0, 1e4, min_open=True),
     metavar="KG",
-    help="Heaviest load of the model [kg].  [default: 130 % of the model beyond the sensor]",
+    help="With --model: heaviest load of the sensor [kg]."
+    "  [default: 130 % of the model's mass beyond the sensor]",
 )
 @click.option(
     "--criterion",
     type=click.Choice(["kappa_w10", "kappa10", "kappa16", "A16", "D16"]),
     default="kappa_w10",
     show_default=True,
-    help="Condition number (whitened; in SI units; with offsets), or predicted errors.",
+    help="Condition number (kappa_w10: whitened; kappa10: SI units; kappa16: with offsets)"
+    " or predicted errors (A16: rms; D16: geometric mean).",
 )
 @click.option(
     "--period",
-    type=option.Number(0.5, 600),
+    type=option.FiniteNumber(0.5, 600),
     default=6.0,
     show_default=True,
     metavar="SECONDS",
-    help="Length of the motion.",
+    help="Duration of one period of the motion.",
 )
 @click.option(
     "--harmonics",
     type=option.Integer(2, 20),
-    help="Harmonics of each joint.  [default: 5, with --until 3]",
+    help="Number of harmonics.  [default: 5; 3 with --until]",
 )
 @click.option(
     "--until",
     metavar="TOLERANCE",
-    help='Find the shortest motion that reaches, e.g., "mass 0.5 %, com 0.5 mm, inertia 5 %".',
+    help='Find the shortest motion for an accuracy such as "mass 0.5 %, com 0.5 mm, inertia 5 %".',
 )
 @click.option(
     "--time",
     "seconds",
-    type=option.Number(0, 1e6, min_open=True),
+    type=option.FiniteNumber(0, 1e6, min_open=True),
     metavar="SECONDS",
-    help="CPU time of the optimiser.  [default: four starts, the same on every machine]",
+    help="CPU time of the optimiser.  [default: time for four starts, with reproducible results]",
 )
 @option.seed_0
-@option.out("excite")
+@option.output_folder("excite")
 @option.quiet
 def excite(scenario: str, out: Path, **options: Any) -> None:
     """Design a motion that excites all parameters of a load.
@@ -743,15 +748,18 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
 
 
 @cli.command()
-@click.argument("folder", type=option.PATH)
+@click.argument("folder", type=option.PATH_TYPE)
 @click.option(
-    "--arm", required=True, type=option.PATH, help="Model of the arm: URDF, SDF, MJCF or .dmd.yaml."
+    "--arm",
+    required=True,
+    type=option.PATH_TYPE,
+    help="Arm model: URDF, SDF, MJCF or .dmd.yaml.",
 )
 @option.sensor_frame(required=True)
 @option.package_paths
 @click.option(
     "--tool",
-    type=option.PATH,
+    type=option.PATH_TYPE,
     help="Model of the tool.  [default: the arm's model beyond the sensor, or a default tool]",
 )
 @click.option(
@@ -759,7 +767,7 @@ def excite(scenario: str, out: Path, **options: Any) -> None:
     default="phantom_premium_15",
     show_default=True,
     metavar="NAME",
-    help="Haptic device of the master.",
+    help="Preset of the master's haptic device.",
 )
 @click.option("--sensor", metavar="PRESET", help="Preset of the wrist sensor.")
 @option.quiet
@@ -767,7 +775,7 @@ def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
     """Create a station with your own arm.
 
     Writes FOLDER/station.yaml, a short commented scenario: start of the arm, scales that fit the
-    device, a wall below the tool. Then runs it once, into FOLDER/first_run.
+    device, a wall below the tool. Then simulates it once, into FOLDER/first_run.
     """
     from drake_teleop.lab.new_station import new_command
 
@@ -777,8 +785,7 @@ def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0, 2 for invalid input, 130 for Ctrl-C or SIGTERM.
 
-    A live session that the user ends has status 0. Status 1: `reproduce` finds an unaccepted
-    number, or `calibrate` ends before all tolerances are reached.
+    `reproduce` and `calibrate` can have status 1. A live session that the user ends has status 0.
     """
     install_handlers()
     atexit.register(gc.freeze)  # the last collection takes 1 s with Drake's objects

@@ -1,4 +1,4 @@
-"""Parameter types and options of several commands."""
+"""Parameter types, and options that several commands share."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class ShippedOrPath(Utf8Path):
         return fitting + super().shell_complete(ctx, param, incomplete)
 
 
-PATH = Utf8Path(path_type=Path)
-SCENARIO = ShippedOrPath(scenarios_dir(), str)
-STUDY = ShippedOrPath(studies_dir(), Path)
+PATH_TYPE = Utf8Path(path_type=Path)
+SCENARIO_TYPE = ShippedOrPath(scenarios_dir(), str)
+STUDY_TYPE = ShippedOrPath(studies_dir(), Path)
 
 
 def _check_range(
@@ -66,7 +66,7 @@ def _check_range(
         kind.fail(f"{short_text(number)} is {relation} {short_text(low)}", param, ctx)
 
 
-class Number(click.FloatRange):
+class FiniteNumber(click.FloatRange):
     """Parameter type of finite numbers in a range; click's type accepts nan and inf."""
 
     name = "number"
@@ -92,7 +92,7 @@ class Integer(click.IntRange):
         return number
 
 
-class Delay(click.ParamType):
+class DelayOrAuto(click.ParamType):
     """Parameter type of a number of seconds, or "auto"."""
 
     name = "auto|SECONDS"
@@ -100,11 +100,11 @@ class Delay(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
+        return "auto" if value == "auto" else FiniteNumber(-10, 10).convert(value, param, ctx)
 
 
-SCALE = Number(0, 100)
-POSITIVE = Number(0, 1e5, min_open=True)
+SCALE_TYPE = FiniteNumber(0, 100)
+POSITIVE_TYPE = FiniteNumber(0, 1e5, min_open=True)
 
 
 class Names(click.ParamType):
@@ -120,8 +120,8 @@ class Names(click.ParamType):
         return tuple(name.strip() for name in value.split(","))
 
 
-class Registered(click.Choice):
-    """Parameter type: one of the shipped names, or a registered part of this kind."""
+class PartName(click.Choice):
+    """Parameter type: name of a part of this kind, shipped or registered by the user."""
 
     def __init__(self, kind: str, *shipped: str) -> None:
         super().__init__(shipped)
@@ -147,23 +147,23 @@ class PositiveNumbers(click.ParamType):
     ) -> tuple[float, ...]:
         if isinstance(value, tuple):
             return value
-        return tuple(POSITIVE.convert(part, param, ctx) for part in value.split(","))
+        return tuple(POSITIVE_TYPE.convert(part, param, ctx) for part in value.split(","))
 
 
-def out(command: str) -> Callable[[Any], Any]:
+def output_folder(command: str) -> Callable[[Any], Any]:
     """Return the option `--out DIR`; a command that fails leaves no new empty folder there."""
     return click.option(
         "--out",
-        type=PATH,
+        type=PATH_TYPE,
         default=Path("out") / command,
         show_default=True,
         metavar="DIR",
         help="Output folder.",
-        callback=_remove_empty_at_failure,
+        callback=_clean_up_after_failure,
     )
 
 
-def _remove_empty_at_failure(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
+def _clean_up_after_failure(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
     new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     if new:
         ctx.call_on_close(lambda: _remove_empty_folders(new))
@@ -181,64 +181,64 @@ def _remove_empty_folders(new: list[Path]) -> None:
             return
 
 
-_SEED = Integer(0, 2**32 - 1)
-seed = click.option("--seed", type=_SEED, help="Seed of the noise.  [default: the scenario's]")
-seed_0 = click.option("--seed", type=_SEED, default=0, show_default=True, help="Random seed.")
+_SEED_TYPE = Integer(0, 2**32 - 1)
+seed = click.option("--seed", type=_SEED_TYPE, help="Seed of noise.  [default: the scenario's]")
+seed_0 = click.option("--seed", type=_SEED_TYPE, default=0, show_default=True, help="Random seed.")
 jobs = click.option(
     "--jobs",
     type=Integer(1, 4096),
     callback=lambda _ctx, _param, count: count or -1,
     help="Number of parallel processes.  [default: one for each core]",
 )
-cluster = click.option(
+dask_cluster = click.option(
     "--cluster",
     metavar="ADDRESS",
-    help="Dask scheduler that runs the processes, or local for one on this machine.",
+    help="Dask scheduler that runs the processes; local: start one on this machine.",
 )
 quiet = click.option("--quiet", is_flag=True, help="Print no progress bars and no tables.")
-cutoff = click.option(
+cutoff_hz = click.option(
     "--cutoff",
     "cutoff_hz",
-    type=POSITIVE,
+    type=POSITIVE_TYPE,
     default=30.0,
     show_default=True,
     metavar="HZ",
-    help="Low-pass on all signals [Hz]; zero-phase for logs, causal for live streams.",
+    help="Cutoff of the low-pass on all signals; zero-phase for logs, causal for live streams.",
 )
 sensor_range = click.option(
     "--range",
     "largest",
-    type=POSITIVE,
+    type=POSITIVE_TYPE,
     nargs=2,
     metavar="N NM",
     help="Range of the sensor [N, N m]; readings at its limits are not used.",
 )
 delay = click.option(
     "--delay",
-    type=Delay(),
+    type=DelayOrAuto(),
     default="auto",
     show_default=True,
     help="Delay of the motion behind the wrench [s], or auto to estimate it.",
 )
 gamma = click.option(
-    "--gamma", type=SCALE, default=1.0, show_default=True, help="Scale of the contact wrench."
+    "--gamma", type=SCALE_TYPE, default=1.0, show_default=True, help="Scale of the contact wrench."
 )
 package_paths = click.option(
     "--package-path",
     "package_paths",
-    type=PATH,
+    type=PATH_TYPE,
     multiple=True,
     metavar="DIR",
-    help="Folder of package:// addresses in the model; may be repeated.",
+    help="Folder to search for package:// files of the model; may be repeated.",
 )
-gripper = click.option(
+gripper_file = click.option(
     "--gripper",
-    type=PATH,
+    type=PATH_TYPE,
     help="identification.json of the gripper without the object, in the same sensor frame.",
 )
-free = click.option(
+free_motion_log = click.option(
     "--free",
-    type=PATH,
+    type=PATH_TYPE,
     metavar="LOG",
     help="Log of free motion with this load, for the threshold of contact."
     "  [default: quiet parts of LOG]",
@@ -250,7 +250,7 @@ def confirm_at_terminal(question: str) -> bool:
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
-yes = click.option(
+skip_question = click.option(
     "--yes",
     is_flag=True,
     callback=lambda _ctx, _param, is_set: is_set or confirm_at_terminal,
@@ -258,19 +258,19 @@ yes = click.option(
 )
 
 
-def load(*, required: bool = False, default: str = "") -> Callable[[Any], Any]:
+def load_file(*, required: bool = False, default: str = "") -> Callable[[Any], Any]:
     text = "identification.json of the load." + (f"  [default: {default}]" if default else "")
-    return click.option("--load", type=PATH, required=required, help=text)
+    return click.option("--load", type=PATH_TYPE, required=required, help=text)
 
 
 def sigma(text: str) -> Callable[[Any], Any]:
-    return click.option("--sigma", type=SCALE, default=0.0, show_default=True, help=text)
+    return click.option("--sigma", type=SCALE_TYPE, default=0.0, show_default=True, help=text)
 
 
 def separate_sigmas(command: Any) -> Any:
-    text = "Scale of the load's {} alone.  [default: sigma]"
+    text = "Scale of the load's {} alone.  [default: value of --sigma]"
     for part in ("inertia", "weight"):
-        option = click.option(f"--sigma-{part}", type=SCALE, help=text.format(part))
+        option = click.option(f"--sigma-{part}", type=SCALE_TYPE, help=text.format(part))
         command = option(command)
     return command
 
@@ -284,13 +284,13 @@ def sensor_pose(text: str) -> Callable[[Any], Any]:
     return click.option(
         "--sensor-pose",
         nargs=6,
-        type=Number(-1e3, 1e3),
+        type=FiniteNumber(-1e3, 1e3),
         metavar="X Y Z ROLL PITCH YAW",
         help=text,
     )
 
 
-def stream(command: Callable[..., Any]) -> Callable[..., Any]:
+def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of a live SOURCE; those of the arm's model become the argument `arm`."""
 
     @wraps(command)
@@ -307,19 +307,19 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
     decorated: Callable[..., Any] = with_arm
     for option in (
         delay,
-        cutoff,
-        click.option("--real-time", is_flag=True, help="Replay a log in real time."),
+        cutoff_hz,
+        click.option("--real-time", is_flag=True, help="Replay a log at its recorded speed."),
         sensor_range,
         sensor_pose("Pose of the sensor in the frame of the streamed poses [m, deg]."),
         package_paths,
         sensor_frame(),
         click.option(
             "--model",
-            type=PATH,
-            help="Model of the arm (URDF, SDF, MJCF), if the motion is that of its joints.",
+            type=PATH_TYPE,
+            help="Model of the arm (URDF, SDF, MJCF), if SOURCE gives joint angles, no poses.",
         ),
         click.option(
-            "--motion", metavar="SOURCE", help="Source of the motion, if it is not SOURCE."
+            "--motion", metavar="SOURCE", help="Another source of the motion, as for SOURCE."
         ),
     ):
         decorated = option(decorated)

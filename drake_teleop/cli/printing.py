@@ -1,4 +1,4 @@
-"""Tables of the log commands on the terminal."""
+"""Printed results of `identify`, `eliminate`, `detect` and `parts`."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
     print_results(table, figures, summary, out)
 
 
-_Row: TypeAlias = tuple[str, float, float, float, str, str]
+_TableRow: TypeAlias = tuple[str, float, float, float, str, str]
 """Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
-def _load_rows(load: dict[str, Any]) -> list[_Row]:
-    rows: list[_Row] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
+def _load_rows(load: dict[str, Any]) -> list[_TableRow]:
+    rows: list[_TableRow] = [("mass", load["mass"], load["mass_std"], 1.0, "kg", "m")]
     rows += [
         (f"com {axis}", load["com"][i], load["com_std"][i], 1e3, "mm", f"m c_{axis}")
         for i, axis in enumerate("xyz")
@@ -54,7 +54,7 @@ def _load_rows(load: dict[str, Any]) -> list[_Row]:
     ]
 
 
-def _add_rows(table: Any, rows: list[_Row], identifiable: list[str]) -> None:
+def _add_rows(table: Any, rows: list[_TableRow], identifiable: list[str]) -> None:
     for label, value, std, scale, unit, name in rows:
         # The centre of mass is the moment over the mass.
         needed = {"m", name} if name.startswith("m c") else {name}
@@ -101,7 +101,6 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
-    """Print the contacts, and the shares of time above the thresholds."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -132,7 +131,7 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
-    """Print a table, the text `figures`, delay and notes, and the output folder."""
+    """Print a table, the text `figures`, the delay, the notes and the output folder."""
     from rich.console import Console
 
     lines = [figures]
@@ -147,7 +146,6 @@ def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) 
 
 
 def print_parts() -> None:
-    """Print the names of all parts by kind; registered ones are marked with `*`."""
     import click
 
     from drake_teleop.common.registry import REGISTRIES

@@ -25,13 +25,13 @@ def weak_callback(method: Any) -> Callable[..., None]:
 
 
 class DoubleOnly:
-    """Base class of systems for double only; a scalar conversion raises one clear error."""
+    """Base class of Drake systems without AutoDiffXd or symbolic version; a conversion raises."""
 
     __slots__ = ONE_DICT
 
     def _refuse_scalar_conversion(self, *_: Any) -> NoReturn:
         raise DrakeTeleopError(
-            "computes with compiled code for double only",
+            "has no AutoDiffXd or symbolic version: compiled code is for double only",
             where=type(self).__name__,
             remedy="use NonContactWrench or WrenchScaling, or linearize numerically",
         )
@@ -44,7 +44,7 @@ LARGEST_PORT_VALUE = 1e6
 
 
 class Fault(IntEnum):
-    """Causes of a suppressed force at the hand, by priority."""
+    """Faults that suppress the force at the operator's hand, by priority."""
 
     NONE = 0
     STALE = 1
@@ -57,12 +57,12 @@ class Fault(IntEnum):
 
 
 FAULT_MEANINGS = {
-    Fault.STALE: "the wrist sensor's last sample is too old, or of another time",
-    Fault.READING: "the wrist sensor gives no reading, or one that no sensor survives",
-    Fault.JOINTS: "the slave's joint angles are no numbers",
-    Fault.LOAD: "the load estimate is no number",
-    Fault.WRENCH: "the wrench that comes to the hand is none",
-    Fault.HAND: "the hand's joint angles are no numbers",
+    Fault.STALE: "the wrist sensor's last sample is too old or too new",
+    Fault.READING: "the wrist sensor gives no reading, or an impossibly large one",
+    Fault.JOINTS: "the slave's joint angles are not finite or too large",
+    Fault.LOAD: "the load estimate is not finite or too large",
+    Fault.WRENCH: "the wrench for the hand is not finite or too large",
+    Fault.HAND: "the hand's joint angles are not finite or too large",
     Fault.RESUMING: "the force at the hand comes back after a fault",
 }
 """Warning text of each fault."""

@@ -39,14 +39,14 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
         dispatcher = numba.njit(**options | {"cache": False, "no_cfunc_wrapper": True})(function)
         if options.get("cache") and isinstance(dispatcher, Dispatcher):
             with suppress(RuntimeError):  # no writable folder: each process compiles again
-                dispatcher._cache = _Cache(function, dispatcher)
+                dispatcher._cache = _DispatcherCache(function, dispatcher)
         return dispatcher
 
     return compile_function
 
 
 def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled function (address, arguments) that calls the function at an address."""
+    """Return a compiled function f(address, arguments) that calls machine code at an address."""
 
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
@@ -72,12 +72,12 @@ def make_call_at_address(arguments: tuple[types.Type, ...]) -> Any:
     return call
 
 
-def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
+def address_of_function(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 
 
-class _Cache(FunctionCache):
+class _DispatcherCache(FunctionCache):
     def __init__(self, function: FunctionType, dispatcher: Dispatcher) -> None:
         super().__init__(function)
         self._cache_file = _CacheFiles(Path(self.cache_path), dispatcher)
@@ -98,7 +98,7 @@ class _CacheFiles:
             suppress(OSError, EOFError, pickle.UnpicklingError),
             self._path_of_key(key).open("rb") as file,
         ):
-            if not _is_trusted(os.fstat(file.fileno())):
+            if not _is_trusted_file(os.fstat(file.fileno())):
                 return None
             stored_key, code = pickle.loads(file.read())
             return code if stored_key == key else None
@@ -128,7 +128,7 @@ class _CacheFiles:
                 path.unlink(missing_ok=True)
 
 
-def _is_trusted(file: os.stat_result) -> bool:
+def _is_trusted_file(file: os.stat_result) -> bool:
     owners = {os.getuid(), 0, Path(__file__).stat().st_uid}
     return file.st_uid in owners and not file.st_mode & stat.S_IWOTH
 
@@ -204,7 +204,7 @@ def _constant_text(value: Any) -> str:
         return _qualified_name(value)
     if isinstance(value, _PLAIN_TYPES):
         return repr(value)
-    raise TypeError(f"a compiled function reads {value!r}; its cache cannot see when that changes")
+    raise TypeError(f"a cached compiled function uses {value!r}, whose changes are not detected")
 
 
 def _qualified_name(value: Any) -> str:

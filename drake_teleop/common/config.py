@@ -19,9 +19,9 @@ from typing import Any, NamedTuple, TypeVar
 from drake_teleop.common.errors import DrakeTeleopError, field_place, suggest_name
 from drake_teleop.common.registry import Registry
 
-KIND_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
+TYPE_NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
 """Name of each value type in messages."""
-_checks_assignments = ContextVar("checks_assignments", default=True)
+_assignment_checks_enabled = ContextVar("checks_assignments", default=True)
 
 
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
@@ -62,7 +62,7 @@ def short_text(value: Any) -> str:
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Check field names and types of parsed YAML against a dataclass."""
+    """Check field names and types of parsed YAML by a dataclass; `tagged` allows a YAML tag."""
     if not isinstance(data, dict):
         raise DrakeTeleopError(
             f"expected a mapping of fields, found {short_text(data)}",
@@ -78,11 +78,11 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
         if key == "_tag":
             continue
         place = field_place(where, key)
-        check_name(schema, key, place)
+        check_field_name(schema, key, place)
         _check_type(kinds[key], value, place, from_file=True)
 
 
-def check_name(schema: type, name: Any, where: str) -> None:
+def check_field_name(schema: type, name: Any, where: str) -> None:
     names = _field_names(schema)
     if name not in names:
         remedy = suggest_name(name, names, f"fields: {', '.join(names)}")
@@ -90,10 +90,10 @@ def check_name(schema: type, name: Any, where: str) -> None:
 
 
 def check_field(schema: type, name: str, value: Any, where: str) -> None:
-    """Raise DrakeTeleopError, with the place `where`, unless a field may have this value."""
-    check_name(schema, name, where)
+    """Raise DrakeTeleopError, for the place `where`, if the field cannot have this value."""
+    check_field_name(schema, name, where)
     entry = schema.__dataclass_fields__[name]  # type: ignore[attr-defined]
-    _check_value(entry, _kind_of_field(entry, _type_hints(schema)[name]), value, where)
+    _check_value(entry, _type_of_field(entry, _type_hints(schema)[name]), value, where)
 
 
 def check_ranges(config: Any, where: str) -> None:
@@ -107,7 +107,7 @@ def check_ranges(config: Any, where: str) -> None:
                 check_ranges(item, f"{place}[{index}]" if isinstance(value, list) else place)
 
 
-def _check_value(field: Any, kind: Kind, value: Any, place: str) -> None:
+def _check_value(field: Any, kind: FieldType, value: Any, place: str) -> None:
     metadata = field.metadata
     _check_type(kind, value, place, from_file=False)
     if "choices" in metadata:
@@ -140,9 +140,9 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
             )
 
 
-def _field_types(schema: type) -> dict[str, Kind]:
+def _field_types(schema: type) -> dict[str, FieldType]:
     hints, entries = _type_hints(schema), dataclasses.fields(schema)
-    return {entry.name: _kind_of_field(entry, hints[entry.name]) for entry in entries}
+    return {entry.name: _type_of_field(entry, hints[entry.name]) for entry in entries}
 
 
 @functools.cache
@@ -150,8 +150,8 @@ def _type_hints(schema: type) -> dict[str, Any]:
     return typing.get_type_hints(schema)
 
 
-def _kind_of_field(entry: dataclasses.Field[Any], hint: Any) -> Kind:
-    registry, kind = entry.metadata.get("registry"), kind_of(hint)
+def _type_of_field(entry: dataclasses.Field[Any], hint: Any) -> FieldType:
+    registry, kind = entry.metadata.get("registry"), field_type_of(hint)
     if registry is None or "choices" in entry.metadata:
         return kind
     return kind._replace(items=tuple(registry.values()))
@@ -161,10 +161,10 @@ def _field_names(schema: type) -> list[str]:
     return [field.name for field in dataclasses.fields(schema)]
 
 
-class Kind(NamedTuple):
-    """Structure of a type: `list[A | B] | None` is (1, (A, B), True).
+class FieldType(NamedTuple):
+    """Structure of a field's type: `list[A | B] | None` is (1, (A, B), True).
 
-    With `by_name` it is a mapping of names to items, `dict[str, A]`.
+    With `by_name` the type is a mapping of names to items, `dict[str, A]`.
     """
 
     lists: int
@@ -174,46 +174,46 @@ class Kind(NamedTuple):
 
 
 @functools.cache
-def kind_of(hint: Any) -> Kind:
+def field_type_of(hint: Any) -> FieldType:
     if typing.get_origin(hint) is list:
-        inner = kind_of(typing.get_args(hint)[0])
-        return Kind(inner.lists + 1, inner.items, False)
+        inner = field_type_of(typing.get_args(hint)[0])
+        return FieldType(inner.lists + 1, inner.items, False)
     if typing.get_origin(hint) is dict:
-        return Kind(0, kind_of(typing.get_args(hint)[1]).items, False, by_name=True)
+        return FieldType(0, field_type_of(typing.get_args(hint)[1]).items, False, by_name=True)
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
-        return Kind(0, (hint,), False)
+        return FieldType(0, (hint,), False)
     options = tuple(option for option in typing.get_args(hint) if option is not type(None))
-    inner = kind_of(options[0]) if len(options) == 1 else Kind(0, options, False)
+    inner = field_type_of(options[0]) if len(options) == 1 else FieldType(0, options, False)
     return inner._replace(optional=len(options) < len(typing.get_args(hint)))
 
 
-def _check_type(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
+def _check_type(kind: FieldType, value: Any, place: str, *, from_file: bool) -> None:
     first = kind.items[0]
     if value is None and kind.optional:
         return
     if kind.by_name:
         if not isinstance(value, dict) or "_tag" in value:
-            raise _kind_error("a mapping of names", value, place, "write {name: value}")
+            raise _type_error("a mapping of names", value, place, "write {name: value}")
         for name, item in value.items():
             inner = kind._replace(by_name=False)
             _check_type(inner, item, f"{place}.{name}", from_file=from_file)
     elif kind.lists:
         if not isinstance(value, list):
-            raise _kind_error("a list", value, place, "write it in brackets: [...]")
-        inner = Kind(kind.lists - 1, kind.items, False)
+            raise _type_error("a list", value, place, "write it in brackets: [...]")
+        inner = FieldType(kind.lists - 1, kind.items, False)
         for index, item in enumerate(value):
             _check_type(inner, item, f"{place}[{index}]", from_file=from_file)
-    elif first in KIND_NAMES:
-        if not _is_value_of_kind(first, value, from_file=from_file):
+    elif first in TYPE_NAMES:
+        if not _has_value_type(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"
-            raise _kind_error(KIND_NAMES[first], value, place, remedy if first is float else "")
+            raise _type_error(TYPE_NAMES[first], value, place, remedy if first is float else "")
     elif from_file:
         several = len(kind.items) > 1
         check_structure(_selected_block(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
         fields = ", ".join(_field_names(first))
         remedy = f"make one: {first.__name__}(...), with fields {fields}"
-        raise _kind_error(" or ".join(block.__name__ for block in kind.items), value, place, remedy)
+        raise _type_error(" or ".join(block.__name__ for block in kind.items), value, place, remedy)
 
 
 def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
@@ -225,7 +225,7 @@ def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     return blocks[names.index(tag) if tag else 0]
 
 
-def _is_value_of_kind(kind: type, value: Any, *, from_file: bool) -> bool:
+def _has_value_type(kind: type, value: Any, *, from_file: bool) -> bool:
     if kind in (bool, str):
         return isinstance(value, kind)
     if isinstance(value, bool):
@@ -243,7 +243,7 @@ def _is_numeric_text(value: Any) -> bool:
     return True
 
 
-def _kind_error(expected: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _type_error(expected: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
     shown = f"'{found}'" if isinstance(found, str) else reprlib.repr(found)
     return DrakeTeleopError(f"expected {expected}, found {shown}", where=place, remedy=remedy)
 
@@ -298,7 +298,7 @@ class FieldInfo:
 
 
 def settings(block: _Class) -> _Class:
-    """Make a dataclass check what it is assigned, and list its fields in its docstring.
+    """Decorate a dataclass: check assigned values, and list the fields in its docstring.
 
     Its module must not postpone annotations: `yaml_load_typed` reads the types of the fields.
     """
@@ -334,35 +334,34 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
     # Drake's `yaml_load_typed` sets an optional field to float(), list() etc. before the value of
     # the file. Such a value is checked again when a station is made.
     is_created = getattr(self, name, value) is None and not value
-    if _checks_assignments.get() and not is_created:
+    if _assignment_checks_enabled.get() and not is_created:
         check_field(type(self), name, value, place)
     else:
-        check_name(type(self), name, place)
+        check_field_name(type(self), name, place)
     object.__setattr__(self, name, value)
 
 
 @contextmanager
 def unchecked_assignments() -> Iterator[None]:
     """Disable the checks of assigned values in this context."""
-    token = _checks_assignments.set(False)
+    token = _assignment_checks_enabled.set(False)
     try:
         yield
     finally:
-        _checks_assignments.reset(token)
+        _assignment_checks_enabled.reset(token)
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
-    """Return the descriptions of the fields of a settings dataclass or instance."""
     return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 
 
 def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
-    lists, items, optional, by_name = _kind_of_field(entry, entry.type)
-    blocks = tuple(item for item in items if item not in KIND_NAMES)
+    lists, items, optional, by_name = _type_of_field(entry, entry.type)
+    blocks = tuple(item for item in items if item not in TYPE_NAMES)
     metadata = entry.metadata
     return FieldInfo(
         name=entry.name,
-        kind="block" if blocks else KIND_NAMES[items[0]].removeprefix("a "),
+        kind="block" if blocks else TYPE_NAMES[items[0]].removeprefix("a "),
         lists=lists,
         length=metadata.get("length"),
         optional=optional,

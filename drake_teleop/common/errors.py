@@ -13,9 +13,9 @@ from pathlib import Path
 from threading import RLock
 from typing import Any
 
-_POLARS_PROCESS: list[int] = []  # PID of the process that first used polars
+_POLARS_PROCESS_ID: list[int] = []  # PID of the process that first used polars
 
-LONGEST_LINE = 1000
+MAX_LINE_LENGTH = 1000
 """Maximum length of an error line of the command line."""
 
 
@@ -31,10 +31,10 @@ class DrakeTeleopError(ValueError):
         text = f"{where}: {what}" if where else what
         if remedy:
             text = f"{text}; {remedy}"
-        super().__init__(to_one_line(text, LONGEST_LINE - len("error: ")))
+        super().__init__(to_one_line(text, MAX_LINE_LENGTH - len("error: ")))
 
 
-def to_one_line(text: str, max_length: int = LONGEST_LINE) -> str:
+def to_one_line(text: str, max_length: int = MAX_LINE_LENGTH) -> str:
     """Return the text as one printable line; the middle of a longer text is cut out."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
     if len(text) <= max_length:
@@ -43,7 +43,7 @@ def to_one_line(text: str, max_length: int = LONGEST_LINE) -> str:
     return f"{text[: max_length - end - 5]} ... {text[-end:]}"
 
 
-def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
+def expect_type(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
     """Raise DrakeTeleopError for argument `where` unless the value has type `kind`."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
@@ -69,11 +69,11 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
 
 def refuse_fork() -> None:
     """Raise DrakeTeleopError in a process forked after the first call: polars would hang there."""
-    _POLARS_PROCESS.append(os.getpid())
-    del _POLARS_PROCESS[1:]
-    if [os.getpid()] != _POLARS_PROCESS:
+    _POLARS_PROCESS_ID.append(os.getpid())
+    del _POLARS_PROCESS_ID[1:]
+    if [os.getpid()] != _POLARS_PROCESS_ID:
         raise DrakeTeleopError(
-            "this process was forked after tables were read or written, and would hang",
+            "polars would hang in this process, which was forked after tables were read or written",
             remedy='start processes by multiprocessing.get_context("spawn")',
         )
 
@@ -85,7 +85,6 @@ def suggest_name(name: object, names: Sequence[str], otherwise: str) -> str:
 
 
 def remedy_to_install_extra(name: str) -> str:
-    """Return the remedy for a missing library: installing this package's extra `name`."""
     return f"install the extra `{name}`: pip install '.[{name}]' in the clone of this project"
 
 
@@ -101,13 +100,13 @@ def field_place(where: str, name: Any) -> str:
 
 
 # stderr is global: two threads would restore it in the wrong order.
-_lock = RLock()
+_STDERR_LOCK = RLock()
 
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
     """Discard all output to stderr, also that of C and Rust code."""
-    with _lock:
+    with _STDERR_LOCK:
         try:
             sys.stderr.flush()
             saved = os.dup(2)

@@ -1,4 +1,4 @@
-"""Output files, each complete or absent, and folders of shipped files."""
+"""Output files, written completely or not at all, and folders of shipped files."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAX_LISTED_FILES = 6  # maximum number of listed files
-_RUST_ERROR = re.compile(r"([^:]+) \(os error \d+\)")
+_RUST_ERROR_PATTERN = re.compile(r"([^:]+) \(os error \d+\)")
 
 _PART_NAME_FORMAT = "row_{:010d}.parquet"
 LOG_PARTS_PATTERN = _PART_NAME_FORMAT.format(0).replace("0", "?")
 
 
 class CannotWrite(DrakeTeleopError):
-    """Error for a file that cannot be written."""
+    """Error for a file or folder that cannot be written."""
 
 
 @contextmanager
 def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -> Iterator[Path]:
     """Yield a temporary name to write under; then rename the file to `path`.
 
-    After a failure `path` is unchanged. With `shared` several processes may write the file.
+    After a failure `path` is unchanged. `aside` is another base of the temporary name; `shared`
+    allows several writing processes.
     """
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -92,7 +93,10 @@ def write_table(
 def output_folder(
     out: Path, last: str = "summary.json", *, kept: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create a command's output folder; the output is complete when the file `last` exists."""
+    """Create a command's output folder; the output is complete when the file `last` exists.
+
+    `kept` are names of earlier files that remain valid after a failure.
+    """
     make_folder(out)
     with wrap_write_errors(out / last):
         (out / last).unlink(missing_ok=True)
@@ -113,7 +117,7 @@ def make_folder(folder: Path) -> None:
         what = f"cannot be made a folder ({_reason_of_failure(error)})"
         raise CannotWrite(what, where=str(folder), remedy=remedy) from error
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise CannotWrite("is a write-protected folder", where=str(folder), remedy=remedy)
+        raise CannotWrite("is a folder without write permission", where=str(folder), remedy=remedy)
 
 
 def move_earlier_recordings(*paths: Path) -> Path | None:
@@ -130,7 +134,7 @@ def move_earlier_recordings(*paths: Path) -> Path | None:
     return folder
 
 
-def part_of_log(folder: Path, first_row: int) -> Path:
+def log_part_path(folder: Path, first_row: int) -> Path:
     return folder / _PART_NAME_FORMAT.format(first_row)
 
 
@@ -151,7 +155,7 @@ def remove_log(path: Path) -> None:
 
 
 def _reason_of_failure(error: OSError) -> str:
-    if found := _RUST_ERROR.search(str(error)):
+    if found := _RUST_ERROR_PATTERN.search(str(error)):
         return found[1].strip()
     return error.strerror or str(error) or type(error).__name__
 
@@ -180,17 +184,17 @@ def _join_names(names: Sequence[str]) -> str:
     return ", ".join(names[:_MAX_LISTED_FILES]) + more
 
 
-_PACKAGE = Path(__file__).resolve().parents[1]
+_PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def models_dir() -> Path:
-    packaged = _PACKAGE / "models"
-    return packaged if packaged.is_dir() else _PACKAGE.parent / "models"
+    packaged = _PACKAGE_FOLDER / "models"
+    return packaged if packaged.is_dir() else _PACKAGE_FOLDER.parent / "models"
 
 
 def scenarios_dir() -> Path:
-    return _PACKAGE / "station" / "scenarios"
+    return _PACKAGE_FOLDER / "station" / "scenarios"
 
 
 def studies_dir() -> Path:
-    return _PACKAGE / "lab" / "studies"
+    return _PACKAGE_FOLDER / "lab" / "studies"

@@ -33,7 +33,6 @@ def render_page(package: str, template: str, **values: Any) -> str:
 
 
 def png_data_url(path: Path) -> str:
-    """Return a PNG file as a data: URL."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
 
 

@@ -16,11 +16,11 @@ class _DelayedSignalState(threading.local):
     depth, received = 0, 0  # open contexts, and the last signal in them
 
 
-_DELAYED = _DelayedSignalState()
+_DELAYED_SIGNALS = _DelayedSignalState()
 
 
 def install_handlers() -> None:
-    """Handle SIGTERM, and SIGINT unless ignored, by KeyboardInterrupt and `INTERRUPTED_EVENT`."""
+    """Let SIGTERM, and SIGINT unless ignored, raise KeyboardInterrupt; set `INTERRUPTED_EVENT`."""
     signal.signal(signal.SIGTERM, _raise_interrupt)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _raise_interrupt)
@@ -28,7 +28,7 @@ def install_handlers() -> None:
 
 @contextmanager
 def handled_sigint() -> Iterator[None]:
-    """Install the handler of SIGINT for a context, if Python's own is installed."""
+    """Handle SIGINT as `install_handlers` does, in this context and only instead of Python."""
     before = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()
     if before is not signal.default_int_handler or not in_main_thread:
@@ -44,8 +44,8 @@ def handled_sigint() -> Iterator[None]:
 
 def _raise_interrupt(number: int, _frame: Any) -> None:
     INTERRUPTED_EVENT.set()
-    if _DELAYED.depth:
-        _DELAYED.received = number
+    if _DELAYED_SIGNALS.depth:
+        _DELAYED_SIGNALS.received = number
         return
     if number == signal.SIGTERM:
         raise KeyboardInterrupt("SIGTERM")
@@ -53,13 +53,13 @@ def _raise_interrupt(number: int, _frame: Any) -> None:
 
 
 class delayed_signals(ContextDecorator):
-    """Delay the KeyboardInterrupt of these handlers to the end of the context; also a decorator."""
+    """Context or decorator that delays the KeyboardInterrupt of `install_handlers` to its end."""
 
     def __enter__(self) -> None:
-        _DELAYED.depth += 1
+        _DELAYED_SIGNALS.depth += 1
 
     def __exit__(self, *_: object) -> None:
-        _DELAYED.depth -= 1
-        if _DELAYED.received and not _DELAYED.depth:
-            number, _DELAYED.received = _DELAYED.received, 0
+        _DELAYED_SIGNALS.depth -= 1
+        if _DELAYED_SIGNALS.received and not _DELAYED_SIGNALS.depth:
+            number, _DELAYED_SIGNALS.received = _DELAYED_SIGNALS.received, 0
             _raise_interrupt(number, None)

@@ -43,7 +43,7 @@ def float_array(name: str, value: ArrayLike, remedy: str = "") -> Array:
 
 
 def broadcast_to_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
-    """Return the common leading shape, and each array (..., n) as a contiguous table (N, n)."""
+    """Broadcast arrays, given as name=(array, n); return leading shape and tables (N, n)."""
     tables = {
         name: finite_array(name, value, n, leading=True) for name, (value, n) in arrays.items()
     }
@@ -80,7 +80,7 @@ def to_float(name: str, value: Any) -> float:
 def check_identified(name: str, phi: Array) -> Array:
     if not phi.any():
         raise DrakeTeleopError(
-            "is zero throughout, so this load is not identified",
+            "is zero, so this load is not identified",
             where=name,
             remedy="identify it first: identify_load for a scenario, identify_log for a log",
         )
@@ -109,7 +109,7 @@ def one_blas_thread() -> AbstractContextManager[object]:
 
 
 def find_runs_of_true(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the first index of each run of set flags (N,), and the one after its last, (k, 2)."""
+    """Return start and stop index (k, 2) of each run of True in flags (N,); stop is excluded."""
     ends = np.zeros(1, bool)
     return np.flatnonzero(np.diff(np.concatenate([ends, flags, ends]))).reshape(-1, 2)
 
@@ -122,8 +122,8 @@ def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]
     ]
 
 
-def narrowest_half(x: Array) -> tuple[Array, Array]:
-    """Return the widths (k,) of the narrowest half of samples x (N, k), and its centres (k,)."""
+def narrowest_half_interval(x: Array) -> tuple[Array, Array]:
+    """Return width and centre (k,) of the narrowest interval with half of the samples x (N, k)."""
     ordered = np.sort(x, axis=0)
     half = len(ordered) // 2
     widths = ordered[half:] - ordered[: len(ordered) - half]

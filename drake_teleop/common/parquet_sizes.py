@@ -7,17 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-_MAGIC = b"PAR1"
+_MAGIC_BYTES = b"PAR1"
 _FOOTER_END_BYTES = 8  # bytes: length of the footer, and magic
 _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
-_REPEATED = 2
+_REPEATED_FIELD = 2
 # Type codes of Thrift.
 _TRUE, _FALSE, _BYTE_TYPE, _DOUBLE_TYPE, _BINARY_TYPE, _STRUCT_TYPE = 1, 2, 3, 7, 8, 12
 _INTEGER_TYPES, _LIST_TYPES = (4, 5, 6), (9, 10)
-_MAX_DEPTH = 32
-_MAX_NUMBER_BYTES = 10
+_MAX_NESTING = 32
+_MAX_VARINT_BYTES = 10
 
-_Struct = dict[int, Any]
+_ThriftStruct = dict[int, Any]
 
 
 def check_parquet(path: Path) -> None:
@@ -38,33 +38,34 @@ def check_parquet_content(content: bytes | mmap.mmap) -> None:
 
 def _check_sizes(content: bytes | mmap.mmap) -> None:
     end = len(content) - _FOOTER_END_BYTES
-    if end < len(_MAGIC) or content[-len(_MAGIC) :] != _MAGIC:
-        raise ValueError("it does not end as a Parquet file does")
+    if end < len(_MAGIC_BYTES) or content[-len(_MAGIC_BYTES) :] != _MAGIC_BYTES:
+        raise ValueError("it does not end with PAR1, as a Parquet file does")
     start = end - int.from_bytes(content[end : end + 4], "little")
-    _require_undamaged(start >= len(_MAGIC), "its footer is longer than the file")
-    footer = _CompactReader(content[start:end]).read_struct()
+    _require_undamaged(start >= len(_MAGIC_BYTES), "its footer is longer than the file")
+    footer = _ThriftReader(content[start:end]).read_struct()
     columns = list(_leaf_columns(footer[2]))
     groups = footer.get(4, [])
     rows = [_read_size(group, 3, "rows in a row group") for group in groups]
     _require_undamaged(
-        _read_size(footer, 3, "rows") == sum(rows), "its row groups do not add up to its rows"
+        _read_size(footer, 3, "rows") == sum(rows),
+        "its row groups have other numbers of rows than the file",
     )
     for group, count in zip(groups, rows, strict=True):
         _require_undamaged(
-            len(group[1]) == len(columns), "a row group has not the columns of the schema"
+            len(group[1]) == len(columns), "a row group and the schema have different columns"
         )
         for chunk, (name, is_flat) in zip(group[1], columns, strict=True):
             _check_column(content, start, chunk[3], name, count if is_flat else None)
 
 
-def _leaf_columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
+def _leaf_columns(schema: list[_ThriftStruct]) -> Iterator[tuple[str, bool]]:
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
             above.pop()
         left, is_flat = above[-1]
         above[-1] = left - 1, is_flat
-        is_flat = is_flat and element.get(3) != _REPEATED
+        is_flat = is_flat and element.get(3) != _REPEATED_FIELD
         if children := _read_size(element, 5, "children", 0):
             above.append((children, is_flat))
         elif element is not schema[0]:
@@ -72,7 +73,7 @@ def _leaf_columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
 
 
 def _check_column(
-    content: bytes | mmap.mmap, end: int, column: _Struct, name: str, rows: int | None
+    content: bytes | mmap.mmap, end: int, column: _ThriftStruct, name: str, rows: int | None
 ) -> None:
     values = _read_size(column, 5, f"values in {name}")
     _require_undamaged(rows in (None, values), f"{name} has {values} values in {rows} rows")
@@ -85,7 +86,7 @@ def _check_column(
     _require_undamaged(at + length <= end, f"{name} goes beyond the end of the file")
     found, where = 0, f"a page of {name}"
     while found < values:
-        reader = _CompactReader(content, at)
+        reader = _ThriftReader(content, at)
         page = reader.read_struct()
         length = _read_size(page, 3, f"bytes in {where}")
         at = reader.at + length
@@ -99,7 +100,7 @@ def _check_column(
     )
 
 
-def _count_values_of_page(page: _Struct, length: int, where: str) -> int:
+def _count_values_of_page(page: _ThriftStruct, length: int, where: str) -> int:
     kind, what = page[1], f"values in {where}"
     if kind == _DATA_PAGE:
         return _read_size(page[5], 1, what)
@@ -122,7 +123,7 @@ def _count_values_of_page(page: _Struct, length: int, where: str) -> int:
     return values
 
 
-def _read_size(struct: _Struct, number: int, what: str, default: int | None = None) -> int:
+def _read_size(struct: _ThriftStruct, number: int, what: str, default: int | None = None) -> int:
     size = struct[number] if default is None else struct.get(number, default)
     _require_undamaged(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
     return int(size)
@@ -133,13 +134,13 @@ def _require_undamaged(condition: bool, otherwise: str) -> None:
         raise ValueError(f"it is damaged: {otherwise}")
 
 
-class _CompactReader:
+class _ThriftReader:
     def __init__(self, content: bytes | mmap.mmap, at: int = 0) -> None:
         self._content, self.at = content, at
 
-    def read_struct(self, depth: int = 0) -> _Struct:
-        _require_undamaged(depth < _MAX_DEPTH, "its metadata is nested too deeply")
-        fields: _Struct = {}
+    def read_struct(self, depth: int = 0) -> _ThriftStruct:
+        _require_undamaged(depth < _MAX_NESTING, "its metadata is nested too deeply")
+        fields: _ThriftStruct = {}
         number = 0
         while head := self._read_byte():
             number = number + (head >> 4) if head >> 4 else self._read_integer()
@@ -162,7 +163,7 @@ class _CompactReader:
         return self._read_bytes(8)
 
     def _read_list(self, depth: int) -> list[Any]:
-        _require_undamaged(depth < _MAX_DEPTH, "its metadata is nested too deeply")
+        _require_undamaged(depth < _MAX_NESTING, "its metadata is nested too deeply")
         head = self._read_byte()
         size = head >> 4 if head >> 4 < 15 else self._read_varint()
         return [self._read_value(head & 15, depth + 1) for _ in range(size)]
@@ -184,7 +185,7 @@ class _CompactReader:
         if (byte := self._read_byte()) < 128:
             return byte
         number = byte & 127
-        for place in range(1, _MAX_NUMBER_BYTES):
+        for place in range(1, _MAX_VARINT_BYTES):
             byte = self._read_byte()
             number |= (byte & 127) << 7 * place
             if byte < 128:

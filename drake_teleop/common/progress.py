@@ -11,11 +11,10 @@ from typing import TypeAlias
 UpdateProgress: TypeAlias = Callable[..., None]
 """Function that displays a completed fraction, 0 to 1, and an optional status text."""
 StartStage: TypeAlias = Callable[[str], UpdateProgress]
-"""Function that begins a stage of work by its name, and returns its `Progress`."""
+"""Function that begins a stage of work by its name, and returns its `UpdateProgress`."""
 
 
 def show_no_progress(name: str) -> UpdateProgress:
-    """Return a progress function that shows nothing."""
     return lambda fraction, words="": None
 
 

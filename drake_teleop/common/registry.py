@@ -1,4 +1,4 @@
-"""Tables of parts by name, which a script can extend (docs/extend.md)."""
+"""Tables of parts, such as estimators, by name; scripts can add parts (docs/extend.md)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from drake_teleop.common.errors import DrakeTeleopError, suggest_name
 
 _Part = TypeVar("_Part")
-_SCRIPTS = "DRAKE_TELEOP_REGISTER"  # paths, which the processes of a study inherit
+_SCRIPTS_ENV = "DRAKE_TELEOP_REGISTER"  # paths, which the processes of a study inherit
 REGISTRIES: dict[str, Registry[Any]] = {}
 """All tables by the kind of their parts, as far as their modules are imported."""
 
@@ -23,7 +23,7 @@ class Registry(dict[str, _Part]):
     """Parts of one kind by name; an unknown name raises DrakeTeleopError.
 
     Args:
-        kind: what the parts are, such as "passivity method".
+        kind: name of the kind of parts, such as "passivity method".
         shipped: parts of this package by name.
     """
 
@@ -44,7 +44,7 @@ class Registry(dict[str, _Part]):
             )
         if name in self.shipped:
             raise DrakeTeleopError(
-                f"'{name}' is a part of drake_teleop", where=self.kind, remedy="use another name"
+                f"'{name}' is the name of a shipped part", where=self.kind, remedy="use another"
             )
         self[name] = part
         return part
@@ -52,14 +52,14 @@ class Registry(dict[str, _Part]):
     def remove(self, name: str) -> None:
         if name in self.shipped:
             raise DrakeTeleopError(
-                f"'{name}' is a part of drake_teleop",
+                f"'{name}' is a shipped part and cannot be removed",
                 where=self.kind,
-                remedy="remove only registered parts",
+                remedy="remove only parts that you registered",
             )
         del self[self.check(name)]
 
     def check(self, name: Any, where: str = "", *others: str) -> str:
-        """Return the name; raise DrakeTeleopError unless it is in the table or in `others`."""
+        """Return the name; raise DrakeTeleopError unless it is registered or in `others`."""
         if isinstance(name, str) and (name in others or name in self):
             return name
         names = (*others, *self)
@@ -67,13 +67,13 @@ class Registry(dict[str, _Part]):
         raise DrakeTeleopError(f"there is no {self.kind} {name!r}", where=where, remedy=remedy)
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or (_run_scripts() and super().__contains__(name))
+        return super().__contains__(name) or (_import_scripts() and super().__contains__(name))
 
     def __missing__(self, name: str) -> _Part:
         return self[self.check(name)]
 
 
-def register_from(script: Path) -> None:
+def register_from_script(script: Path) -> None:
     """Import a Python file that registers parts, here and in the processes of studies."""
     script = script.absolute()
     if script.suffix != ".py" or not script.is_file():
@@ -92,13 +92,13 @@ def register_from(script: Path) -> None:
     if module.__file__ != str(script):
         what = f"has the name of the module {module.__file__ or script.stem}"
         raise DrakeTeleopError(what, where=str(script), remedy="rename the file")
-    paths = os.environ.get(_SCRIPTS, "").split(os.pathsep)
-    os.environ[_SCRIPTS] = os.pathsep.join(dict.fromkeys([*filter(None, paths), str(script)]))
+    paths = os.environ.get(_SCRIPTS_ENV, "").split(os.pathsep)
+    os.environ[_SCRIPTS_ENV] = os.pathsep.join(dict.fromkeys([*filter(None, paths), str(script)]))
 
 
-def _run_scripts() -> bool:
-    paths = [Path(path) for path in os.environ.get(_SCRIPTS, "").split(os.pathsep) if path]
+def _import_scripts() -> bool:
+    paths = [Path(path) for path in os.environ.get(_SCRIPTS_ENV, "").split(os.pathsep) if path]
     new = [path for path in paths if path.stem not in sys.modules]
     for path in new:
-        register_from(path)
+        register_from_script(path)
     return bool(new)

@@ -13,8 +13,8 @@ NUM_COLUMNS_OF_FORM = {
     "quaternion_wxyz": 4,
     "quaternion_xyzw": 4,
     "rotation_vector": 3,
+    "euler": 3,
 }
-NUM_COLUMNS_OF_FORM |= {"euler": 3}
 """Number of columns of each form."""
 
 
@@ -28,9 +28,10 @@ EULER_AXES = tuple(
 
 
 def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
-    """Return rotation matrices (N, 3, 3) from columns of a named form, without normalization.
+    """Return rotation matrices (N, 3, 3) from `columns` of a form in `NUM_COLUMNS_OF_FORM`.
 
-    Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad].
+    Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad]. Nothing is
+    normalized.
     """
     if form == "euler":
         from scipy.spatial.transform import Rotation
@@ -40,8 +41,9 @@ def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Arr
     if form == "matrix":
         return columns.reshape(-1, 3, 3)
     if form == "rotation_vector":
-        return _from_quaternions(_from_rotation_vectors(columns))
-    return _from_quaternions(columns if form == "quaternion_wxyz" else np.roll(columns, 1, axis=1))
+        return _matrices_from_quaternions(_quaternions_from_vectors(columns))
+    q = columns if form == "quaternion_wxyz" else np.roll(columns, 1, axis=1)
+    return _matrices_from_quaternions(q)
 
 
 def rotation_error(R: Array) -> Array:
@@ -65,7 +67,7 @@ def quaternions_of(R: Array) -> Array:
     return np.asarray(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]])
 
 
-def _from_quaternions(q: Array) -> Array:
+def _matrices_from_quaternions(q: Array) -> Array:
     w, x, y, z = q.T
     return np.stack(
         [
@@ -77,7 +79,7 @@ def _from_quaternions(q: Array) -> Array:
     ).reshape(-1, 3, 3)
 
 
-def _from_rotation_vectors(vectors: Array) -> Array:
+def _quaternions_from_vectors(vectors: Array) -> Array:
     half = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
     # np.sinc(x) = sin(pi x) / (pi x) avoids a division by zero at angle 0.
     return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * vectors])

@@ -1,7 +1,7 @@
-"""YAML and JSON files as plain data, without ambiguity.
+"""Conversion of YAML and JSON files to plain data and back.
 
 YAML has the core schema of version 1.2: `1:30` and `yes` are strings, `1e-3` is a number. Repeated
-keys and huge files are rejected. Tags never execute code.
+keys and huge files are errors. Tags never execute code.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import yaml
 from drake_teleop.common.errors import DrakeTeleopError, field_place, to_one_line
 
 _MAX_VALUES = 50_000  # including repetitions by aliases
-_MAX_DEPTH = 50  # nested brackets
+_MAX_NESTING = 50  # nested brackets
 _MAX_INTEGER_DIGITS = 18  # digits, always within 64 bits
 
 _TAG_PREFIX = "tag:yaml.org,2002:"
-_CORE_SCHEMA = (
+_YAML_CORE_SCHEMA = (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     ("int", r"[-+]?[0-9]+", list("-+0123456789")),
@@ -35,11 +35,11 @@ _CORE_SCHEMA = (
 )
 
 
-class _Loader(yaml.SafeLoader):
+class _YamlLoader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level >= _MAX_DEPTH:  # PyYAML scans thousands before it creates nodes
+        if self.flow_level >= _MAX_NESTING:  # PyYAML scans thousands before it creates nodes
             raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_flow_collection_start(TokenClass)
 
@@ -52,7 +52,7 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-class _Dumper(yaml.SafeDumper):
+class _YamlDumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
@@ -64,11 +64,11 @@ class _Dumper(yaml.SafeDumper):
         return self.represent_mapping(tag, [item for item in data.items() if item[0] != "_tag"])
 
 
-_Dumper.add_representer(str, _Dumper.represent_text)
-_Dumper.add_representer(dict, _Dumper.represent_fields)
-_SCALAR_PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _CORE_SCHEMA}
-for _kind, _, _first in _CORE_SCHEMA:
-    for _side in (_Loader, _Dumper):
+_YamlDumper.add_representer(str, _YamlDumper.represent_text)
+_YamlDumper.add_representer(dict, _YamlDumper.represent_fields)
+_SCALAR_PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _YAML_CORE_SCHEMA}
+for _kind, _, _first in _YAML_CORE_SCHEMA:
+    for _side in (_YamlLoader, _YamlDumper):
         _side.add_implicit_resolver(_TAG_PREFIX + _kind, _SCALAR_PATTERNS[_kind], _first)
 
 
@@ -79,7 +79,7 @@ def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
 
 def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
     try:
-        node = yaml.compose(text, _Loader)
+        node = yaml.compose(text, _YamlLoader)
         return None if node is None else _NodeConverter(tagged).convert_node(node, where)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -97,9 +97,12 @@ def parse_yaml(text: str, where: str, *, tagged: bool = False) -> Any:
 def to_yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """Return YAML that `read_yaml` reads as the same data, with comments by field."""
+    """Return YAML that `read_yaml` reads as the same data.
+
+    `head` are comment lines at the top; `comments` are texts after fields, by "field.inner".
+    """
     lines, place, left = [f"# {to_one_line(text)}" for text in head], list[str](), comments or {}
-    for line in yaml_scalar(data, flow=None).splitlines():
+    for line in format_yaml(data, flow=None).splitlines():
         inner = line.lstrip(" ")
         place[(len(line) - len(inner)) // 2 :] = [inner.partition(":")[0]]
         comment = left.get(".".join(place), "")
@@ -114,11 +117,11 @@ def to_yaml_text(
     return text
 
 
-def yaml_scalar(value: Any, flow: bool | None = True) -> str:
+def format_yaml(value: Any, flow: bool | None = True) -> str:
     """Return a value as YAML in one line; with `flow` None, blocks have their own lines."""
     text: str = yaml.dump(
         value,
-        Dumper=_Dumper,
+        Dumper=_YamlDumper,
         default_flow_style=flow,
         width=math.inf,
         allow_unicode=True,
@@ -180,7 +183,7 @@ class _NodeConverter:
             if node.tag != f"{_TAG_PREFIX}seq":
                 raise _error_at_node(f"a list takes no tag {_quote_value(node.tag)}", node, place)
             return [self.convert_node(item, f"{place}[{i}]") for i, item in enumerate(node.value)]
-        return _scalar_data(node, place)
+        return _convert_scalar(node, place)
 
     def _convert_mapping(self, node: Any, place: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -194,7 +197,7 @@ class _NodeConverter:
                 raise _error_at_node("is defined twice", key, field)
             if key.value == "_tag":
                 raise _error_at_node(
-                    "there is no such field", key, field, "a kind is a tag: !Kind {...}"
+                    "there is no such field", key, field, "select a type by a YAML tag: !Type {...}"
                 )
             found[key.value] = self.convert_node(value, field)
         if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
@@ -206,7 +209,7 @@ class _NodeConverter:
         return found
 
 
-def _scalar_data(node: Any, place: str) -> Any:
+def _convert_scalar(node: Any, place: str) -> Any:
     kind, text = node.tag.removeprefix(_TAG_PREFIX), node.value
     if kind == "str":
         return text
@@ -223,9 +226,10 @@ def _scalar_data(node: Any, place: str) -> Any:
     digits = text.lstrip("+-")
     if digits.startswith("0") and digits != "0":
         remedy = f"write {digits.lstrip('0') or 0}, or '{text}' in quotes for a word"
-        raise _error_at_node(f"{_quote_value(text)} may be octal", node, place, remedy)
+        raise _error_at_node(f"{_quote_value(text)} may be octal or decimal", node, place, remedy)
     if len(digits) > _MAX_INTEGER_DIGITS:
-        raise _error_at_node(f"an integer of {len(digits)} digits is too long", node, place)
+        what = f"an integer of {len(digits)} digits is too long (maximum: {_MAX_INTEGER_DIGITS})"
+        raise _error_at_node(what, node, place)
     return int(text)
 
 

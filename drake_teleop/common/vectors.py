@@ -28,7 +28,7 @@ def matrix_at(x, i):
 
 @register_jitable
 def matrix_as_tuple(R):
-    """Return a matrix (3, 3) as a tuple of 9 numbers, by rows."""
+    """Return a matrix (3, 3) as a tuple of 9 numbers, row by row."""
     return R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
 
 
@@ -116,7 +116,7 @@ def cholesky(M, n):
 
 @register_jitable(inline="always")
 def solve_by_cholesky(M, b, n):
-    """Replace b (n,) by M^-1 b, and M (n, n) as in `cholesky`."""
+    """Solve M x = b in place: replace b (n,) by x, and M (n, n) as in `cholesky`."""
     cholesky(M, n)
     for i in range(n):
         for k in range(i):
@@ -129,7 +129,7 @@ def solve_by_cholesky(M, b, n):
 
 
 def cross_matrix(a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrices [a x] (..., 3, 3) of vectors (..., 3)."""
+    """Return the skew-symmetric matrices (..., 3, 3) of the cross product with vectors a."""
     matrix = np.zeros((*a.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrix[..., k, j], matrix[..., j, k] = a[..., i], -a[..., i]
@@ -186,7 +186,7 @@ def normalized_quaternion(a):
 
 
 @njit(cache=True)
-def quaternion_of(R):
+def quaternion_of_matrix(R):
     """Return the unit quaternion of a rotation matrix (3, 3) (Shepperd 1978)."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     largest = max(trace, R[0, 0], R[1, 1], R[2, 2])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, check_identified, one_blas_thread
 from drake_teleop.common.progress import StartStage, UpdateProgress, show_progress
 from drake_teleop.lab.excitation.check import check_trajectory
@@ -147,7 +147,7 @@ def identify_load(
             'LoadScenario("identification")',
         )
     if trajectory is not None:
-        expect(FourierTrajectory, trajectory, "trajectory")
+        expect_type(FourierTrajectory, trajectory, "trajectory")
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:

@@ -40,7 +40,7 @@ def scaled_wrench_as_tuples(
 
 @register_jitable
 def scaled_weight_as_tuples(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
-    """Return force and torque of V(-g) (excess_gripper phi_gripper + excess_object phi_object)."""
+    """Return force and torque of the sum of both weights, each times its excess."""
     a, b = excess_gripper, excess_object
     up = scale_vector(-1.0, vector_at(gravity, 0))
     h = plus(scale_vector(a, vector_at(phi_gripper, 1)), scale_vector(b, vector_at(phi_object, 1)))
@@ -122,7 +122,7 @@ def scaled_wrench(
 ) -> Array:
     """Return F' = gamma F_c + V (sigma_gripper phi_gripper + sigma_object phi_object) (..., 6).
 
-    F_c is the contact wrench, V phi that of weight and inertia, Eq. (T7) [N, N m].
+    F_c is the contact wrench, V phi the wrench of weight and inertia, Eq. (T7) [N, N m].
 
     Args:
         wrench, offsets, s, omega, alpha: as for `contact_wrench`.
@@ -131,9 +131,6 @@ def scaled_wrench(
         sigma_weight, sigma_inertia: scales >= 0 of weight and inertia of both parts; None:
             sigma_gripper and sigma_object.
         gravity: (3,) or (..., 3) g in S [m/s^2]; needed if weight and inertia have other scales.
-
-    Raises:
-        DrakeTeleopError: for a negative scale, or a missing gravity.
     """
     weights, inertias = weight_and_inertia_scales(
         _check_scale("sigma_gripper", sigma_gripper),
@@ -177,7 +174,7 @@ def unknown_gravity_error(where: str, remedy: str) -> DrakeTeleopError:
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return the scales that remove the gripper and keep the share eta of the object, Eq. (14)."""
+    """Return sigma_gripper, sigma_object, gamma for the share eta of the object, Eq. (14)."""
     if not 0.0 <= to_float("eta", eta) <= 1.0:
         raise DrakeTeleopError(
             f"{eta:g} is outside 0 to 1",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import write_json
 from drake_teleop.common.numeric import Array, check_identified, finite_array
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
@@ -30,7 +30,7 @@ MAX_IDENTIFIED_DEVIATION = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
 _MAX_WEAKLY_IDENTIFIED_DEVIATION, _MIN_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
-_MAX_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
+_MAX_FILE_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
 _OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
@@ -135,11 +135,7 @@ class Identification:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write identification.json.
-
-        Raises:
-            DrakeTeleopError: if a number is not finite or the file cannot be written.
-        """
+        """Write identification.json; raise DrakeTeleopError if a number is not finite."""
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             finite_array(f"{path}:{name}", getattr(self, name), *shape)
         covariance = self.covariance.tolist()
@@ -167,18 +163,13 @@ class Identification:
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:
-        """Read identification.json.
-
-        Raises:
-            DrakeTeleopError: naming file and field, if a field is missing, unknown or malformed, or
-                contradicts phi.
-        """
-        expect((str, Path), path, "load")
-        document = _read_json(path)
+        """Read identification.json; raise DrakeTeleopError, with the field, for invalid content."""
+        expect_type((str, Path), path, "load")
+        document = _read_document(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
         for name in sorted((known ^ document.keys()) - (_OPTIONAL_FIELDS - document.keys())):
-            problem = "is missing" if name in known else "is not a field of an identification"
+            problem = "is missing" if name in known else "is not a field of identification.json"
             raise DrakeTeleopError(problem, where=f"{path}:{name}")
 
         def read_number_array(name: str, *shape: int, largest: float = np.inf) -> Array:
@@ -199,23 +190,25 @@ class Identification:
         optional = {
             k: read(f"{path}:{k}", document[k]) for k, read in readers.items() if k in document
         }
-        phi = check_identified(f"{path}:phi", read_number_array("phi", 10, largest=_MAX_VALUE))
+        phi = check_identified(f"{path}:phi", read_number_array("phi", 10, largest=_MAX_FILE_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
-            raise _file_error("has no mass", f"{path}:phi")
+            raise _file_error("has the mass 0", f"{path}:phi")
         result = cls(
             phi=phi,
-            offsets=read_number_array("offsets", 6, largest=_MAX_VALUE),
+            offsets=read_number_array("offsets", 6, largest=_MAX_FILE_VALUE),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
             condition_number=float(read_number_array("condition_number")),
-            delay_s=float(read_number_array("delay_s", largest=_MAX_VALUE)),
-            residual_rms=read_number_array("residual_rms", 6, largest=_MAX_VALUE),
+            delay_s=float(read_number_array("delay_s", largest=_MAX_FILE_VALUE)),
+            residual_rms=read_number_array("residual_rms", 6, largest=_MAX_FILE_VALUE),
             method=document["method"],
             samples=int(read_number_array("samples")),
             **optional,
         )
         if document.get("verdicts", list(result.verdicts)) != list(result.verdicts):
-            raise _file_error("contradicts phi, covariance and flags", f"{path}:verdicts")
+            raise _file_error(
+                "contradicts phi, covariance, identifiable or prior_dominated", f"{path}:verdicts"
+            )
         for name, value in result._derived_quantities().items():
             if isinstance(value, bool):
                 follows = document[name] is value
@@ -266,7 +259,7 @@ def natural_scales(phi: Array) -> Array:
     return scale
 
 
-def _read_json(path: str | Path) -> dict[str, Any]:
+def _read_document(path: str | Path) -> dict[str, Any]:
     from drake_teleop.common.texts import read_json  # the import of PyYAML is slow
 
     if not os.path.exists(path):
@@ -334,7 +327,7 @@ def _read_degrees(where: str, value: Any) -> Array:
 SIGNIFICANT_DEVIATIONS = 3.0
 """Standard deviations below zero at which a mass counts as negative."""
 
-_IS_PHI = np.arange(16) >= 6
+_IS_LOAD_PARAMETER = np.arange(16) >= 6
 
 
 def load_of_object(total: Identification, gripper: Identification) -> Identification:
@@ -348,7 +341,7 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
     deviations = np.sqrt(np.diag(covariance))
     if phi[0] < -SIGNIFICANT_DEVIATIONS * deviations[6] or phi[0] == 0.0:
         raise DrakeTeleopError(
-            f"total minus gripper leaves {phi[0]:.4g} kg for the object",
+            f"load minus gripper leaves {phi[0]:.4g} kg for the object (it must be positive)",
             where="gripper",
             remedy="give the gripper alone as gripper, and the record with the object as the load",
         )
@@ -360,13 +353,13 @@ def load_of_object(total: Identification, gripper: Identification) -> Identifica
         covariance=covariance,
         identifiable=identifiable,
         degrees_of_freedom=_degrees_of_freedom_of_difference(total, gripper),
-        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_PHI,
+        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_LOAD_PARAMETER,
     )
 
 
 def _degrees_of_freedom_of_difference(total: Identification, gripper: Identification) -> Array:
     a, b = (np.diag(load.covariance) for load in (total, gripper))
-    b = np.where(_IS_PHI, b, 0.0)
+    b = np.where(_IS_LOAD_PARAMETER, b, 0.0)
     finite = np.isfinite(a + b) & (a + b > 0.0)
     a, b = np.where(finite, a, 1.0), np.where(finite, b, 0.0)
     with np.errstate(divide="ignore"):
@@ -375,7 +368,7 @@ def _degrees_of_freedom_of_difference(total: Identification, gripper: Identifica
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return the smallest eigenvalue of the normalised pseudo-inertia and its deviation."""
+    """Return smallest eigenvalue of the normalised pseudo-inertia, and its standard deviation."""
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))
     length = np.sqrt(spread / mass) if spread > 0.0 else 1.0

@@ -13,7 +13,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, finite_array
 
 # Tolerance for rounding, so that rods, plates and points are consistent.
-_ROUNDING = 1e-12
+_ROUNDING_TOLERANCE = 1e-12
 # Squared radius of gyration [m^2] below which a body is a point.
 _POINT_MASS_EXTENT_M2 = 1e-290
 
@@ -42,7 +42,7 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
     m = float(phi[0])
     if m == 0.0:
         raise DrakeTeleopError(
-            "a load without mass has no centre of mass",
+            "the mass is 0, so the centre of mass is undefined",
             where="phi",
             remedy="give a mass phi[0] other than 0",
         )
@@ -80,7 +80,7 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     """Return whether a rigid body can have the parameters phi (10,), Eq. (T1).
 
-    `tolerance` is the accepted negative eigenvalue of the normalised pseudo-inertia.
+    Eigenvalues of the normalised pseudo-inertia may be as low as -`tolerance`.
     """
     J = pseudo_inertia(phi)
     if not J.any():
@@ -92,7 +92,7 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     length = np.sqrt(spread / mass) if spread > _POINT_MASS_EXTENT_M2 * mass else 1.0
     unit = np.array([length, length, length, 1.0])
     eigenvalues = np.linalg.eigvalsh(J / np.outer(unit, unit) / mass)
-    return bool(eigenvalues[0] >= -(tolerance + _ROUNDING))
+    return bool(eigenvalues[0] >= -(tolerance + _ROUNDING_TOLERANCE))
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:

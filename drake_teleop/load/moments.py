@@ -1,6 +1,6 @@
 """Second moments of a record, from which all least squares estimates follow, Eq. (T4).
 
-They are the mean of z z^T, where row c of the regressor [E V] is T_c z with constant T_c:
+They are the mean of z z^T, where row c of the regressor [E V] is T_c z, constant T_c, w = omega:
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
 """
@@ -69,7 +69,7 @@ class NoiseStd:
 
 
 class SecondMoments:
-    """Second moments z z^T (19, 19) of a record, summed over its samples."""
+    """Sum of z z^T (19, 19) over the samples of a record, z as in the module docstring."""
 
     def __init__(self) -> None:
         self._sums, self._blocks = np.zeros((19, 19)), np.zeros((_MAX_BLOCKS, 19))
@@ -111,7 +111,7 @@ class SecondMoments:
             self._sums += part + np.triu(part, 1).T
 
     def noise_covariance(self, noise: NoiseStd, wrench: Array) -> Array:
-        """Return the mean noise covariance (19, 19) of z, for wrench noise (6,) [N, N m]."""
+        """Return the mean covariance (19, 19) of z by noise, with wrench noise (6,) [N, N m]."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
@@ -148,7 +148,7 @@ def regressor_coefficients() -> Array:
 
 
 def centripetal_matrix(r: Array) -> Array:
-    """Return C (..., 3, 6) such that C z[13:19] is the acceleration omega x (omega x r)."""
+    """Return C (..., 3, 6) with omega x (omega x r) = C z[13:19], the products w_i w_j of omega."""
     x, y, z = np.moveaxis(r, -1, 0)
     o = np.zeros_like(x)
     rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
@@ -156,7 +156,7 @@ def centripetal_matrix(r: Array) -> Array:
 
 
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
-    """Return Gram matrix (16, 16) and right-hand side (16,) of least squares for [offsets; phi]."""
+    """Return Gram matrix (16, 16) and right-hand side (16,) for [offsets; phi], from moments Z."""
     T = regressor_coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
     WT = (W @ T.reshape(6, -1)).reshape(6, 16, 19)
@@ -166,7 +166,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta."""
+    """Return the mean (6, 6) of r r^T, residual r = F - [E V] theta, from moments Z."""
     L = -np.einsum("cjk,j->ck", regressor_coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T

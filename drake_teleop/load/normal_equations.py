@@ -29,7 +29,7 @@ _MIN_DEGREES_LONGEST, _MIN_ABSORBED_SHARE = 20.0, 0.9
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE_M_S2, _F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
-_ROUNDING_RESIDUAL = 1e-6
+_MAX_ROUNDING_RESIDUAL = 1e-6
 _WRENCH_COLUMNS, _SPECIFIC_FORCE_COLUMNS = slice(1, 7), slice(7, 10)
 """Indices of wrench and specific force in the vector z of `SecondMoments`, Eq. (T4)."""
 
@@ -177,7 +177,7 @@ class NormalEquations(SecondMoments):
         weaker = found & (longest * np.exp(3.0 * np.sqrt(2.0 / longest_degrees)) < variances)
         variances = np.where(weaker, longest, variances)
         degrees = np.where(weaker, longest_degrees, degrees)
-        return variances, degrees, slow & (n * of_samples > _ROUNDING_RESIDUAL**2 * wrench)
+        return variances, degrees, slow & (n * of_samples > _MAX_ROUNDING_RESIDUAL**2 * wrench)
 
     def _pose_variances(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
         assert self._resolution is not None
@@ -237,9 +237,6 @@ def identify(
             [SI]; (3,) zeros for omega, alpha at rest.
         noise: (6,) standard deviations of the wrench channels [N, N m]; None: equal weights.
         delay_s: delay [s] that was removed from the motion, only stored in the result.
-
-    Raises:
-        DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
     """
     equations = NormalEquations(noise)
     equations.add(wrench, s, omega, alpha)

@@ -1,4 +1,4 @@
-"""Wrench of a load by its motion: regressor V of Eq. (5), and Newton-Euler Eqs. (1)-(2).
+"""Wrench of a moving load: regressor V of Eq. (5), and Newton-Euler Eqs. (1)-(2).
 
 A sample is one row of numbers (logs: the first 15):
 
@@ -30,8 +30,8 @@ SAMPLE_ANGULAR_ACCELERATION = slice(12, 15)
 SAMPLE_MOTION = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
 SAMPLE_WRENCH_AND_MOTION = slice(0, 15)
 SATURATION_FLAG_INDEX = 15  #: above 0.5 the wrench is not valid
-#: At this value of SATURATED and above, the reading was lost or impossible: the sample is an old
-#: one. The excess counts the samples with remaining effects.
+#: From this value of the saturation flag on, the reading was lost or impossible: the sample is an
+#: old one. The excess counts the samples with remaining effects.
 LOST_SAMPLE_FLAG = 2.0
 FIRST_JOINT_INDEX = 16
 SAMPLE_JOINT_POSITION = slice(FIRST_JOINT_INDEX, None)

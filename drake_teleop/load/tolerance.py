@@ -46,7 +46,7 @@ class Tolerance(NamedTuple):
 
     @property
     def required_entries(self) -> tuple[str, ...]:
-        """Names (k,) of the single required numbers, such as "com x"."""
+        """Names (k,) of the required numbers, such as "com x"."""
         return tuple(entry for name in self.required_quantities for entry in ENTRY_NAMES[name])
 
     def __str__(self) -> str:
@@ -68,7 +68,7 @@ def read_tolerance(text: str) -> Tolerance:
             value = 0.0
         if name not in QUANTITY_NAMES or (unit == "%") == (name == "com") or name in found:
             raise DrakeTeleopError(
-                f"{part.strip()!r} cannot be read as one tolerance per quantity",
+                f"{part.strip()!r} is no tolerance (quantity, number, unit), or repeats a quantity",
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
@@ -83,7 +83,7 @@ def read_tolerance(text: str) -> Tolerance:
 
 
 def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
-    """Return derivatives (k, 16) of the required numbers by [offsets; phi], over the tolerances."""
+    """Return derivatives (k, 16) of required numbers by [offsets; phi], divided by tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -106,7 +106,7 @@ def derivatives_over_tolerances(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) of the required numbers, over the tolerances."""
+    """Return standard deviations (k,) of the required numbers, divided by their tolerances."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)
@@ -114,7 +114,7 @@ def deviations_over_tolerances(errors: Array, covariance: Array) -> Array:
     return np.where(is_undetermined, np.inf, np.sqrt(np.maximum(variances, 0.0)))
 
 
-def values_of_required(tolerance: Tolerance, phi: Array) -> Array:
+def required_values(tolerance: Tolerance, phi: Array) -> Array:
     """Return the values (k,) of the required numbers of load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}

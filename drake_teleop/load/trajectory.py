@@ -1,4 +1,4 @@
-"""Joint trajectories as Fourier series that excite the load, Eqs. (9)-(10)."""
+"""Joint trajectories as Fourier series, to excite the load's parameters, Eqs. (9)-(10)."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class FourierTrajectory:
     def at_rest(
         cls, q0: ArrayLike, sine: ArrayLike, cosine: ArrayLike, frequency: float
     ) -> FourierTrajectory:
-        """Return a trajectory without velocity and acceleration at both ends, Eq. (T17).
+        """Return a trajectory with velocity and acceleration 0 at both ends, Eq. (T17).
 
-        `sine` and `cosine` (n, N - 1) [rad] are coefficients whose harmonic k is divided by k.
+        `sine` and `cosine` (n, N - 1) [rad] are free coefficients; harmonic k is divided by k.
         """
         sine, cosine = np.asarray(sine, float), np.asarray(cosine, float)
-        rest_rho, rest_delta = _rest_bases(sine.shape[-1] + 1)
+        rest_rho, rest_delta = _make_rest_bases(sine.shape[-1] + 1)
         return cls(np.asarray(q0, float), sine @ rest_rho, cosine @ rest_delta, frequency)
 
     @property
@@ -119,7 +119,7 @@ class FourierTrajectory:
         return cls(q0, rho, delta, frequency)
 
 
-def _rest_bases(harmonics: int) -> tuple[Array, Array]:
+def _make_rest_bases(harmonics: int) -> tuple[Array, Array]:
     k = np.arange(1.0, harmonics + 1)
     bases = [np.linalg.qr(row[:, np.newaxis], mode="complete")[0][:, 1:] for row in (k**0, k)]
     return (bases[0] / k[:, np.newaxis]).T, (bases[1] / k[:, np.newaxis]).T

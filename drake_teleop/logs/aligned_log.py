@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.numeric import Array, narrowest_half, one_blas_thread
+from drake_teleop.common.numeric import Array, narrowest_half_interval, one_blas_thread
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
@@ -206,4 +206,4 @@ def replace_force_by_acceleration(log: Log) -> Log:
 def _residual_spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
     log = aligned.log
     left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
-    return float(np.log(narrowest_half(left[~aligned.edge])[0] + 1e-12).sum())
+    return float(np.log(narrowest_half_interval(left[~aligned.edge])[0] + 1e-12).sum())

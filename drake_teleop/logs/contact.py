@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half
+from drake_teleop.common.numeric import Array, find_runs_of_true, narrowest_half_interval
 from drake_teleop.load.contact.detection import (
     MAX_NOISE_LEVEL,
     ContactDetector,
@@ -246,7 +246,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
     `residual` (N, 6) is the wrench without that of the load [N, N m].
     """
-    offsets = narrowest_half(residual)[1]
+    offsets = narrowest_half_interval(residual)[1]
     agrees: NDArray[np.bool_] = np.zeros(len(residual), bool)
     for _ in range(50):
         distance = np.abs(residual - offsets)
@@ -261,7 +261,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 def noise_floor(contact: Array) -> Array:
     """Return the RMS noise (6,) of a contact wrench (N, 6), half free of contact, Eq. (T12)."""
-    floor = narrowest_half(contact)[0] / 1.349
+    floor = narrowest_half_interval(contact)[0] / 1.349
     quiet: NDArray[np.bool_] = np.zeros(len(contact), bool)
     for _ in range(50):
         before = quiet

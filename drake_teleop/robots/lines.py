@@ -17,8 +17,8 @@ from typing import Any, TextIO
 import numpy as np
 
 from drake_teleop.common.files import (
+    log_part_path,
     make_folder,
-    part_of_log,
     remove_log,
     wrap_write_errors,
     write_table,
@@ -141,7 +141,7 @@ class TableSink:
             remove_log(self._path)
         if self._path.suffix == ".parquet":
             make_folder(self._path)
-            write_table(part_of_log(self._path, self._written), table, aside=self._path)
+            write_table(log_part_path(self._path, self._written), table, aside=self._path)
         else:
             text = table.write_csv(include_header=not self._written).encode()
             mode = "r+b" if self._written else "wb"

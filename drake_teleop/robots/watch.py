@@ -22,9 +22,9 @@ from drake_teleop.load.online.change import change_detector_parameters
 from drake_teleop.load.online.watched import (
     STATE_DISTURBED,
     STATE_OTHER_LOAD,
+    current_monitor_state,
     initial_monitor_memory,
     monitor_load,
-    monitor_state,
 )
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import low_pass_coefficients
@@ -72,7 +72,7 @@ class ContactAndLoadMonitor:
     def reading_flags(self, values: Array) -> int:
         """Return the `ReadingFlag` bits of a valid reading (15,): contact, another load, or 0."""
         monitor_load(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
-        state = monitor_state(self._memory)
+        state = current_monitor_state(self._memory)
         if state == STATE_OTHER_LOAD:
             return int(ReadingFlag.OTHER_LOAD)
         return int(ReadingFlag.IN_CONTACT) if state == STATE_DISTURBED else 0

@@ -15,12 +15,12 @@ import numpy as np
 
 from drake_teleop.common.errors import (
     DrakeTeleopError,
-    expect,
+    expect_type,
     refuse_fork,
     remedy_to_install_extra,
     wrap_read_errors,
 )
-from drake_teleop.common.files import LOG_PARTS_PATTERN, make_folder, part_of_log, write_table
+from drake_teleop.common.files import LOG_PARTS_PATTERN, log_part_path, make_folder, write_table
 from drake_teleop.common.numeric import float_array
 from drake_teleop.common.parquet_sizes import check_parquet
 
@@ -64,7 +64,7 @@ class Signal:
         units = (units,) * len(self.components) if isinstance(units, str) else tuple(units)
         object.__setattr__(self, "units", units)
         for text in (self.name, self.description, *self.components, *units):
-            expect(str, text, "signal")
+            expect_type(str, text, "signal")
         if len(units) != len(self.components):
             raise DrakeTeleopError(
                 f"{len(self.components)} components, but {len(units)} units",
@@ -257,7 +257,7 @@ class SimulationResult:
             folder: folder of the log, prepared by `remove_log`.
             first_row: index of this result's first row in the whole log.
         """
-        part = part_of_log(folder, first_row)
+        part = log_part_path(folder, first_row)
         if len(self.t) or not part.exists():
             make_folder(folder)
             self._write_parquet_file(part, aside=folder)
@@ -284,7 +284,7 @@ class SimulationResult:
         """
         import polars as pl
 
-        expect((str, Path), path, "result")
+        expect_type((str, Path), path, "result")
         path = Path(path)
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
         parts = _log_parts(path)

@@ -11,7 +11,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.common.config import (
     check_field,
-    check_name,
+    check_field_name,
     check_ranges,
     check_structure,
     choice,
@@ -20,7 +20,7 @@ from drake_teleop.common.config import (
     settings,
     unchecked_assignments,
 )
-from drake_teleop.common.errors import DrakeTeleopError, expect, suggest_name
+from drake_teleop.common.errors import DrakeTeleopError, expect_type, suggest_name
 from drake_teleop.common.files import scenarios_dir
 from drake_teleop.common.registry import Registry
 from drake_teleop.common.texts import read_yaml
@@ -181,7 +181,7 @@ def check_scenario(scenario: Any) -> None:
     remedy = "load one: LoadScenario(name)"
     if isinstance(scenario, (str, Path)):
         remedy = f"write LoadScenario({str(scenario)!r})"
-    expect(Scenario, scenario, "scenario", remedy)
+    expect_type(Scenario, scenario, "scenario", remedy)
     scenario.check()
 
 
@@ -221,7 +221,7 @@ def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
 
     `kind` is the file's name in the DrakeTeleopError if neither exists.
     """
-    expect((str, Path), name_or_path, kind)
+    expect_type((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     path = folder / f"{name_or_path}.yaml" if str(name_or_path) in names else Path(name_or_path)
     if not os.path.isfile(path):  # False also for invalid file names
@@ -268,10 +268,10 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
 
     A DrakeTeleopError is raised for an invalid name or value.
     """
-    expect(Scenario, scenario, "scenario")
+    expect_type(Scenario, scenario, "scenario")
     for name, value in changes.items():
         block, _, inner = name.partition("__")
-        check_name(Scenario, block, f"scenario:{block}")
+        check_field_name(Scenario, block, f"scenario:{block}")
         if inner:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):

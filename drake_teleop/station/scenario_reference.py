@@ -12,7 +12,7 @@ from typing import Any
 from drake_teleop.common.config import FieldInfo, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import write_text
-from drake_teleop.common.texts import parse_yaml, yaml_scalar
+from drake_teleop.common.texts import format_yaml, parse_yaml
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of_block
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
@@ -111,7 +111,7 @@ def _comment_of_field(entry: FieldInfo) -> str:
 
 def _block_lines(config: Any) -> list[str]:
     entries = fields_of(config)
-    starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
+    starts = {entry.name: f"{entry.name}: {format_yaml(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
     column = min(_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
     preset = (
@@ -165,7 +165,7 @@ def _sections_of_page(config: Any, path: str) -> Iterator[str]:
     entries = fields_of(config)
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
-        default = yaml_scalar(entry.default) if entry.kind != "block" or not entry.default else ""
+        default = format_yaml(entry.default) if entry.kind != "block" or not entry.default else ""
         takes = _links_to_blocks(entry, path) if entry.kind == "block" else _allowed_values(entry)
         cells = (f"`{entry.name}`", default, takes, entry.meaning)
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"

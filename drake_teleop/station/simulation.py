@@ -13,7 +13,7 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.config import check_ranges
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.files import remove_log
 from drake_teleop.common.progress import UpdateProgress, show_progress
 from drake_teleop.station.operator.decision import OUTCOME_INDEX
@@ -52,12 +52,12 @@ def simulate(
         DrakeTeleopError: if an argument is invalid, a joint of the slave leaves its range, the
             folder contains other files, or at a fault (`Simulation.on_fault`).
     """
-    expect(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
+    expect_type(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
     if simulation is None:
         raise DrakeTeleopError("is missing", where="simulation", remedy="pass scenario.simulation")
-    expect(Simulation, simulation, "simulation", "pass scenario.simulation")
+    expect_type(Simulation, simulation, "simulation", "pass scenario.simulation")
     check_ranges(simulation, "simulation")
-    expect((str, Path, type(None)), log, "log", "give a folder")
+    expect_type((str, Path, type(None)), log, "log", "give a folder")
     if isinstance(progress, bool):
         with show_progress(progress, after=1.0) as stage:
             return simulate(diagram, simulation, progress=stage("Simulate"), log=log)

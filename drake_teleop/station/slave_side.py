@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort, System
 
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import check_identified, finite_array
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -149,7 +149,7 @@ def MakeSlaveSide(
                 where="contact_detection",
                 remedy="pass noise_floor=identify_load(...).noise_floor",
             )
-        expect(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
+        expect_type(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         detection = builder.AddNamedSystem(
             "contact_detection",
             ContactDetection(
@@ -165,7 +165,7 @@ def MakeSlaveSide(
 def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool:
     if controller is None:
         return False
-    expect(System, controller, "controller", "make a Drake system: docs/station.md")
+    expect_type(System, controller, "controller", "make a Drake system: docs/station.md")
     torques = controller.HasOutputPort("joint_torque")
     for has, port in (
         (controller.HasInputPort("pose_command"), "input port 'pose_command'"),

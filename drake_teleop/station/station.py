@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
-from drake_teleop.common.errors import expect
+from drake_teleop.common.errors import expect_type
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.channel_side import MakeChannel
@@ -55,7 +55,7 @@ def MakeTeleopStation(
     check_scenario(scenario)
     for name, side in (("master", master), ("channel", channel), ("slave", slave)):
         if side is not None:
-            expect(System, side, name, "docs/station.md lists the ports that each side has")
+            expect_type(System, side, name, "docs/station.md lists the ports that each side has")
     builder = DiagramBuilder()
     if slave is None:
         slave = MakeSlaveSide(
@@ -103,7 +103,7 @@ def MakeTeleopStation(
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Build a station with only the slave, whose joints follow an excitation trajectory."""
     check_scenario(scenario)
-    expect(FourierTrajectory, trajectory, "trajectory")
+    expect_type(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
     slave = builder.AddNamedSystem("slave_side", MakeSlaveOnTrajectory(scenario, trajectory))
     return record_signals(builder, "identification_station", (slave,), scenario.rates.log_hz)

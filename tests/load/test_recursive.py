@@ -194,7 +194,9 @@ def test_bad_input_is_named_and_leaves_the_estimate():
     with pytest.raises(DrakeTeleopError, match=r"^sample: wrench, s, omega, alpha have shapes"):
         estimator.update(np.zeros(3), np.zeros(6), REST, REST)
     np.testing.assert_array_equal(estimator.phi, before)
-    with pytest.raises(DrakeTeleopError, match=r"^forgetting: 1\.1 is not above 0 and at most 1"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"^forgetting: 1\.1 is outside the range 0 < forgetting <= 1"
+    ):
         RecursiveLeastSquares(NOISE, forgetting=1.1)
     with pytest.raises(DrakeTeleopError, match=r"^bound: -1\.0 is not positive"):
         RecursiveLeastSquares(NOISE, bound=-1.0)

@@ -13,8 +13,8 @@ from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
     deviations_over_tolerances,
     read_tolerance,
+    required_values,
     tolerances_in_units,
-    values_of_required,
 )
 
 ALL = "mass 0.5 %, com 0.5 mm, inertia 5 %"
@@ -41,7 +41,7 @@ def test_what_is_no_tolerance_is_refused(text: str) -> None:
 def test_small_errors_are_those_of_the_numbers_themselves() -> None:
     asked, step = read_tolerance(ALL), 1e-6
     steps = step * np.eye(10)
-    values = partial(values_of_required, asked)
+    values = partial(required_values, asked)
     moved = [values(PHI + row) - values(PHI - row) for row in steps]
     numbers = np.array(moved).T / (2.0 * step) / tolerances_in_units(asked, PHI)[:, None]
     errors = derivatives_over_tolerances(asked, PHI)

@@ -22,8 +22,8 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import (
     derivatives_over_tolerances,
     read_tolerance,
+    required_values,
     tolerances_in_units,
-    values_of_required,
 )
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
@@ -84,7 +84,7 @@ def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_pa
     assert last.found is not None and last.advice == "" and all(at.advice for at in looks[:-2])
     again = identify_log(path).identification
     np.testing.assert_array_equal(last.found.identification.phi, again.phi)
-    error = values_of_required(TOLERANCE, again.phi) - values_of_required(TOLERANCE, PHI)
+    error = required_values(TOLERANCE, again.phi) - required_values(TOLERANCE, PHI)
     assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()
     assert last.t == pytest.approx(identify_log(path).log.t[-1])
 
@@ -291,9 +291,7 @@ def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Pat
     recorder.write(tmp_path / recorder.file)
     found = identify_log(tmp_path / recorder.file)
     assert found.identification.delay_s == pytest.approx(late, abs=1e-3)
-    error = values_of_required(TOLERANCE, found.identification.phi) - values_of_required(
-        TOLERANCE, PHI
-    )
+    error = required_values(TOLERANCE, found.identification.phi) - required_values(TOLERANCE, PHI)
     assert (np.abs(error) < tolerances_in_units(TOLERANCE, PHI)).all()
 
 
@@ -316,5 +314,5 @@ def test_calibration_with_a_ur_and_a_rotated_and_shifted_sensor(tmp_path: Path) 
     assert summary["all_known"] and summary["seconds"] < 8.0
     asked = read_tolerance("mass 1 %, com 1 mm")
     phi = json.loads((tmp_path / "out" / "identification.json").read_text())["phi"]
-    error = values_of_required(asked, np.array(phi)) - values_of_required(asked, PHI)
+    error = required_values(asked, np.array(phi)) - required_values(asked, PHI)
     assert (np.abs(error) < tolerances_in_units(asked, PHI)).all()

@@ -20,7 +20,7 @@ from test_reading_assembly import StreamStub
 from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.load.tolerance import read_tolerance, tolerances_in_units, values_of_required
+from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
 from drake_teleop.robots.assembly import Assembly, Parts, PosedByJoints
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
@@ -170,5 +170,5 @@ def test_calibration_with_a_wrench_source_and_joints(box: str, model: Path, tmp_
     assert known.return_value == 0, known.output
     asked = read_tolerance("mass 2 %, com 2 mm")
     phi = json.loads((tmp_path / "identification.json").read_text())["phi"]
-    error = values_of_required(asked, np.array(phi)) - values_of_required(asked, PHI)
+    error = required_values(asked, np.array(phi)) - required_values(asked, PHI)
     assert (np.abs(error) < tolerances_in_units(asked, PHI)).all()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.vectors import copy_into, quaternion_of
+from drake_teleop.common.vectors import copy_into, quaternion_of_matrix
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, RunMeasures, Task, figures_of_traces
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm
@@ -151,7 +151,7 @@ def _sensor_poses(arm, q):
     R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
     for k in range(q.shape[0]):
         forward_kinematics(arm, q[k], R, p)
-        orientation = quaternion_of(R)
+        orientation = quaternion_of_matrix(R)
         for i in range(4):
             poses[k, i] = orientation[i]
         copy_into(poses[k], 4, p, 0, 3)

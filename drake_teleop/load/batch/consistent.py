@@ -16,8 +16,8 @@ from drake_teleop.load.inertia import is_physically_consistent, pseudo_inertia
 
 _PSEUDO_INERTIA_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
 _CONSTRAINT_MATRICES = [np.zeros((4, 4)), *_PSEUDO_INERTIA_BASIS]
-_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_PSEUDO_INERTIA_BASIS, (10, 16)).T)  # (10, 16)
-_MIN_LENGTH_M = 1e-3  # lower bound of the length unit L [m]
+_PHI_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_PSEUDO_INERTIA_BASIS, (10, 16)).T)  # (10, 16)
+_MIN_LENGTH_UNIT_M = 1e-3  # lower bound of the length unit L [m]
 # Eigenvalues relative to the largest: limit of information, and replacement of smaller ones.
 _MIN_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 _PRIOR_KINDS = ("entropic", "geodesic")
@@ -29,7 +29,7 @@ class Prior:
 
     Attributes:
         phi: (10,) prior load about So in S, of a body with extent in all directions.
-        weight: factor of the cost, a residual variance per sample.
+        weight: factor of the cost per sample, relative to squared normalised residuals.
         kind: cost of the pseudo-inertia J: "entropic" (Lee, Wensing, Park, T-RO 2020) or "geodesic"
             (Lee, Park, RA-L 2018).
     """
@@ -79,7 +79,7 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def constraint_row(self) -> Array:
-        """Return a (10,) such that a^T phi >= 0 for each phi whose mass is inside the ellipsoid."""
+        """Return the row a (10,) with a^T phi >= 0 if the mass of phi is inside the ellipsoid."""
         A, c = (
             finite_array("ellipsoid.matrix", self.matrix, 3, 3),
             finite_array("center", self.center, 3),
@@ -101,7 +101,7 @@ def consistent_least_squares(
     prior: Prior | None = None,
     ellipsoid: Ellipsoid | None = None,
 ) -> Array:
-    """Return the parameters [offsets; phi] (16,) with the best fit that a rigid body can have.
+    """Return [offsets; phi] (16,) of the rigid body that fits best.
 
     `theta` (16,) is the unconstrained solution of the weighted normal equations `gram` and
     `right`.
@@ -133,14 +133,13 @@ def _parameter_units(phi: Array) -> Array:
             remedy="check that the sensor is connected and its orientation changes",
         )
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
-    L = max(_MIN_LENGTH_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
+    L = max(_MIN_LENGTH_UNIT_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])
 
 
 def _solve_consistent_fit(
     H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None
 ) -> Array:
-    """Return phi / unit of the consistent load with the least phi^T H phi / 2 - b^T phi + prior."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(finite_array("prior.phi", prior.phi, 10) / unit))
@@ -150,7 +149,7 @@ def _solve_consistent_fit(
             H = H + prior.weight * np.einsum("aij,bji->ab", scaled, scaled)
         b = b + (-pull if entropic else pull)
     if not entropic and row is None:
-        problem = _distance_program(get_ident())
+        problem = _cached_distance_program(get_ident())
     else:
         problem = _make_cone_program(distance=not entropic)
     program, x, cone, solver = problem
@@ -161,9 +160,9 @@ def _solve_consistent_fit(
         assert prior is not None
         scale = 10.0 / np.trace(H)
         program.AddQuadraticCost(scale * H, -scale * b, x, is_convex=True)
-        _add_log_det(program, x, prior.weight * scale)
+        _add_log_det_cost(program, x, prior.weight * scale)
     else:
-        cone.UpdateCoefficients(*_distance_cone(H, b))
+        cone.UpdateCoefficients(*_distance_cone_coefficients(H, b))
     result = solver.Solve(program)
     if not result.is_success():
         raise DrakeTeleopError(
@@ -174,7 +173,7 @@ def _solve_consistent_fit(
     # The solver's tolerance leaves eigenvalues of about -1e-9.
     values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _PSEUDO_INERTIA_BASIS, 1))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
+    return np.asarray(_PHI_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
 
 
 def _make_cone_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
@@ -193,12 +192,12 @@ def _make_cone_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
 
 
 @cache
-def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
+def _cached_distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
     return _make_cone_program(distance=True)
 
 
-def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return matrix and vector of the cone t >= |R x - d|, with R^T R = H and R^T d = b."""
+def _distance_cone_coefficients(H: Array, b: Array) -> tuple[Array, Array]:
+    """Return matrix and vector of the cone t >= |R x - d| with R^T R = H and R^T d = b."""
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale
@@ -209,7 +208,7 @@ def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
     return cone, constants
 
 
-def _add_log_det(program: Any, x: Any, weight: float) -> None:
+def _add_log_det_cost(program: Any, x: Any, weight: float) -> None:
     m, hx, hy, hz, xx, xy, xz, yy, yz, zz = x
     half = 0.5 * (xx + yy + zz)
     J = np.array(

@@ -1,4 +1,4 @@
-"""Batch estimators by name for the load and the sensor's offsets."""
+"""Batch estimators of the load and the sensor's offsets, by name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, broadcast_to_rows, to_float
 from drake_teleop.common.registry import Registry
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
@@ -46,7 +46,7 @@ _MIN_NOISE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
 _HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
-_NORMAL_MAD = 1.4826
+_STD_PER_NORMAL_MAD = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
 _MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
@@ -186,6 +186,7 @@ def identify_batch(
     """Return load and sensor offsets of a free motion, by a batch estimator.
 
     Args:
+        wrench, s, omega, alpha, delay_s: as for `identify`.
         noise: noise of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
         shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
@@ -193,7 +194,7 @@ def identify_batch(
         gain_std: relative standard deviation of the sensor's 36 gains.
     """
     METHODS.check(method, "method")
-    expect((NoiseStd, type(None)), noise, "noise")
+    expect_type((NoiseStd, type(None)), noise, "noise")
     if not to_float("gain_std", gain_std) >= 0.0:
         raise DrakeTeleopError(f"{gain_std} is negative", where="gain_std", remedy="give 0 or more")
     if method != "consistent" and (prior, ellipsoid) != (None, None):
@@ -274,7 +275,7 @@ def _relative_residuals(record: SampleRecord, theta: Array, shared: bool) -> Arr
     if shared:
         median = np.median(magnitudes.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
     rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    scale = np.maximum(_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
+    scale = np.maximum(_STD_PER_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
     for start in range(0, n, CHUNK_ROWS):

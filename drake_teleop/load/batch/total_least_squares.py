@@ -28,7 +28,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 # Largest number of weight updates, relative change of theta at convergence, smallest relative
 # distance of a root from a pole, and standard deviations of noise that a signal must exceed.
 _MAX_ITERATIONS, _THETA_TOLERANCE, _POLE_DISTANCE, _NOISE_DEVIATIONS = 10, 1e-8, 1e-12, 5.0
-_MIN_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
+_MIN_WRENCH_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
 class NormalForm(NamedTuple):
@@ -53,12 +53,12 @@ class NormalForm(NamedTuple):
 def total_least_squares(
     moments: SecondMoments, noise: NoiseStd, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
-    """Return the load and offsets that allow for noise of the motion.
+    """Return the total least squares fit of load and offsets to the moments of a record.
 
     `wrench_noise` (6,) [N, N m] are standard deviations; `offsets` False fixes the offsets at 0.
     """
     Z, Q = moments.mean_products, moments.noise_covariance(noise, wrench_noise)
-    if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:
+    if np.diag(Z)[1:7].max() <= _MIN_WRENCH_MEAN_SQUARE:
         raise DrakeTeleopError(
             "the wrench is 0 throughout: the mass cannot be identified",
             where="wrench",
@@ -143,7 +143,7 @@ class EstimatorOptions:
 
 @dataclass(frozen=True, eq=False)
 class SampleRecord:
-    """Checked samples: wrench (N, 6), motion s, omega and alpha (N, 3)."""
+    """Validated samples of a record: wrench (N, 6), motion s, omega and alpha (N, 3)."""
 
     wrench: Array
     s: Array
@@ -170,7 +170,7 @@ class SampleRecord:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorFit:
-    """Result of an estimator: solution, noise (6,) [N, N m], rejected samples (N,), note."""
+    """Fit of an estimator: solution, wrench noise (6,) [N, N m], rejected samples (N,), note."""
 
     form: NormalForm
     wrench_noise: Array

@@ -32,7 +32,7 @@ _MAX_DEGREES_OF_FREEDOM = 1e6  # Student's t is then normal to six digits
 CHANNEL_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
-_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
+_PARAMETER_UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 # Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
 # coefficient that is rounding.
 _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
@@ -84,8 +84,8 @@ class Combination:
     words: str
 
     def __str__(self) -> str:
-        numbers = f"{self.value:.4g} +- {self.standard_deviation:.2g} {_UNITS[self.leading]}"
-        return f"{self.words} = {numbers}"
+        unit = _PARAMETER_UNITS[self.leading]
+        return f"{self.words} = {self.value:.4g} +- {self.standard_deviation:.2g} {unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class BaseParameters:
 
     Attributes:
         without_influence: names of parameters without influence on the wrench.
-        directions: combinations of those parameters that are not identified one by one.
+        directions: combinations of the parameters that are not identified individually.
         slow_noise: names of wrench channels with drift.
     """
 
@@ -214,7 +214,7 @@ def covariance_with_prior(covariance: Array, information: Array) -> tuple[Array,
 def covariance_for_white_noise(
     plain: Array, equations: NormalEquations, fit: EstimatorFit
 ) -> Array:
-    """Return the covariance (16, 16) of a fit with noise that is correlated between channels."""
+    """Return the covariance (16, 16) of a fit, for noise correlated between channels only."""
     W, Z = fit.form.weights, fit.moments.mean_products
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -262,7 +262,11 @@ def covariance_for_random_walks(
 
 
 def parameter_errors_by_gains(products: Array, W: Array, inverse: Array) -> Array:
-    """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains."""
+    """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains.
+
+    `products` (B, 6, n, 6): regressor times wrench; `W` (B, 6, 6): weights; `inverse` (n, n): of
+    the Gram matrix.
+    """
     right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
     length = np.repeat([1.0, TORQUE_ARM_M], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
@@ -280,7 +284,7 @@ def covariance_for_gain_errors(fit: EstimatorFit, offsets: bool) -> Array:
 
 
 def covariance_of_solution(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """Return the covariance (16, 16) of the solution `form`, from that of least squares."""
+    """Return the covariance (16, 16) of the solution `form`, from `plain` of least squares."""
     unknown = np.isinf(np.diag(plain))
     covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
     if not offsets:  # covariance for known offsets

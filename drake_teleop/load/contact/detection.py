@@ -60,7 +60,7 @@ def update_statistics(
 ):
     """Process one sample and write level, cusum and glr to memory[5:8].
 
-    `memory` (SIZE,) is zero before the first sample; `quiet` is `leave` of `ContactDetector`.
+    `memory` (MEMORY_SIZE,) is zero at the start; `quiet` is `leave` of `ContactDetector`.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -131,7 +131,7 @@ def _statistics_of_rows(rows, parameters, slack, following, quiet, out):
 def statistics_of_log(
     floor: NoiseFloor, *samples: ArrayLike, slack: float = DEFAULT_SLACK, following: float = 0.0
 ) -> Array:
-    """Return level, cusum and glr (N, 3) of the `Samples` of a log, in standard deviations."""
+    """Return level, cusum and glr (N, 3) for the `DetectorSamples` of a log."""
     rows = check_samples(*samples)
     out = np.empty((len(rows[0]), 3))
     sums = float(positive_array("slack", slack)), float(following), CONTACT_END_LEVEL
@@ -157,7 +157,7 @@ def _sum_of_last_innovations(memory, hold, widths):
 
 @njit(cache=True)
 def update_hysteresis(memory, statistic, enter, leave, hold, widths):
-    """Return whether there is contact, after `update_statistics` of the same memory."""
+    """Update the contact flag in the memory after `update_statistics`, and return it."""
     if memory[FLAG_INDEX] == 0.0:
         if memory[STATISTICS_START + statistic] >= enter:
             memory[FLAG_INDEX], memory[QUIET_SAMPLES_INDEX] = 1.0, 0.0
@@ -178,7 +178,7 @@ def update_hysteresis(memory, statistic, enter, leave, hold, widths):
 
 @njit(cache=True)
 def update_contact_flag(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Process one sample and return whether there is contact."""
+    """Process one sample with `ContactDetector.settings`; return whether there is contact."""
     slack, following, statistic, enter, leave, hold = decision
     update_statistics(
         memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
@@ -224,9 +224,9 @@ class ContactDetector:
         )
         if not 0.0 <= following < 1.0:
             raise DrakeTeleopError(
-                f"{following} is not at least 0 and below 1",
+                f"{following} is outside the range 0 <= following < 1",
                 where="following",
-                remedy="give 0 for no following",
+                remedy="give 0 to subtract no mean",
             )
         sums = float(positive_array("slack", slack)), float(following)
         decision = column, enter, exit_level, int(hold)
@@ -244,7 +244,7 @@ class ContactDetector:
         return bool(update_contact_flag(self._memory, *arrays, *self.settings))
 
     def detect(self, *samples: ArrayLike) -> NDArray[np.bool_]:
-        """Process N samples of a log; return (N,) True for contact."""
+        """Process N `DetectorSamples` of a log; return (N,) True for contact."""
         rows = check_samples(*samples)
         out = np.empty(len(rows[0]), np.bool_)
         _contact_flags_of_rows(self._memory, tuple(rows), self.settings, out)
@@ -262,7 +262,7 @@ def central_axis_of_wrenches(wrench: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 # Lower limit of a noise floor [N, N m], as in `logs.contact`.
-_RESOLUTION = np.repeat([1e-3, 1e-4], 3)
+_MIN_NOISE_STD = np.repeat([1e-3, 1e-4], 3)
 _MAX_FITS, _FIT_TOLERANCE = 20, 1e-4
 _MAX_LAG_ONE_CORRELATION, _MIN_WIDTH, _RARE_SHARE = 0.999, 0.1, 1e-3
 
@@ -297,13 +297,13 @@ def fit_noise_floor(
     for c in range(6):
         square, explained = rows[0][:, c] ** 2, parameter_std[:, c] ** 2
         terms = np.stack([np.ones(len(square)), *held[:, :, c] ** 2], axis=1)
-        variance = np.full(len(square), max(float(square.mean()), _RESOLUTION[c] ** 2))
+        variance = np.full(len(square), max(float(square.mean()), _MIN_NOISE_STD[c] ** 2))
         for _ in range(_MAX_FITS):
             previous = fitted[c].copy()
             weighted = np.column_stack([terms, square - explained]) / variance[:, None]
             R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem with four rows
             fitted[c] = nnls(R[:, :3], R[:, 3])[0]
-            fitted[c, 0] = max(fitted[c, 0], _RESOLUTION[c] ** 2)
+            fitted[c, 0] = max(fitted[c, 0], _MIN_NOISE_STD[c] ** 2)
             variance = terms @ fitted[c] + explained
             if np.allclose(fitted[c], previous, rtol=_FIT_TOLERANCE, atol=0.0):
                 break

@@ -23,7 +23,7 @@ from drake_teleop.load.regressor import regressor_into
 MAX_SUMMED_SAMPLES = 128
 """Longest window of the likelihood ratio [samples], a power of two."""
 NUM_SUM_LENGTHS = MAX_SUMMED_SAMPLES.bit_length()
-"""Number of windows: 1, 2, 4 ... WINDOW samples."""
+"""Number of windows: 1, 2, 4 ... MAX_SUMMED_SAMPLES samples."""
 
 HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = (
     1,
@@ -31,7 +31,7 @@ HELD_ACCELERATION_INDEX, HELD_ALPHA_INDEX = (
 )  # indices of held squares in the memory of a detector
 
 STATISTIC_NAMES = ("level", "cusum", "glr")
-"""Names of the statistics: columns of `statistics`, and choices of `ContactDetector`."""
+"""Names of the statistics: columns of `statistics_of_log`, and choices of `ContactDetector`."""
 THRESHOLD_MARGIN = 1.25
 """Ratio of threshold to the largest value in free motion. Normal noise exceeds it hundreds of times
 less often than that value, which is reached about once in a record of the same length."""
@@ -77,7 +77,7 @@ class NoiseFloor:
         correlation: (6, 6) correlation between channels.
         rho: (6,) lag-one correlation of the normalised wrench.
         widths: (8,) standard deviations of sums of 1, 2, 4 ... innovations over sqrt(number).
-        fade: factor per sample on the held peaks of the acceleration, 0 for no hold.
+        fade: factor per sample of the held acceleration peaks; 0: peaks are not held.
         reached: (3,) largest value of each statistic in the fitted motion.
     """
 
@@ -108,7 +108,7 @@ class NoiseFloor:
         finite_array("reached", self.reached, 3)
         if not 0.0 <= self.fade < 1.0:
             raise DrakeTeleopError(
-                f"{self.fade} is not at least 0 and below 1",
+                f"{self.fade} is outside the range 0 <= fade < 1",
                 where="fade",
                 remedy="call fit_noise_floor",
             )
@@ -125,7 +125,7 @@ class NoiseFloor:
 
     @property
     def compiled_parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
-        """Arguments of compiled functions: n^2, P, k^2, l^2, decorrelation, rho, widths, fade."""
+        """Arguments of compiled functions: n^2, P, [k^2 l^2], whitening, rho, widths, fade."""
         root = np.linalg.inv(np.linalg.cholesky(self.correlation))
         variances, growth = self.noise**2, self.per_acceleration**2
         return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
@@ -188,9 +188,9 @@ def check_samples(*arrays: ArrayLike) -> list[Array]:
 
 
 def limit_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi], limited to natural scales.
+    """Return the covariance (16, 16) of [offsets; phi], with deviations up to `natural_scales`.
 
-    `tared` means that offsets are from the same record: their variance is 0.
+    `tared`: the offsets are from the same record; their variance is 0.
     """
     P, natural = covariance.copy(), natural_scales(phi)
     # Undetermined offsets must have been tared; otherwise the elimination is useless.

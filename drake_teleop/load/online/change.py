@@ -34,7 +34,7 @@ from drake_teleop.load.regressor import (
 )
 
 STATE_NAMES = ("known", "disturbed", "changed", "identified")
-"""States of the monitor, by index."""
+"""States of the change detector, by index."""
 STATE_KNOWN, STATE_DISTURBED, STATE_CHANGED, STATE_IDENTIFIED = range(4)
 
 BLOCK_DURATION_S, ESTIMATE_WINDOW_S, HOLD_S, MODEL_ERROR_S = 0.016, 2.0, 0.2, 0.3
@@ -54,7 +54,7 @@ _CHI_SQUARED_SLACK, _ALARM_SUM, _RETURN_TO_KNOWN_SUM = 12.0, 60.0, -30.0
 # Factor of the bound for first moments relative to that of the mass, and smallest size [m].
 _MOMENT_FACTOR, _MIN_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
-_IMPOSSIBLE_DEVIATIONS = 4.0
+_MAX_NEGATIVE_DEVIATIONS = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
@@ -84,12 +84,12 @@ MEMORY_SIZE = _KNOWN_FILTER_START + 816
 """Length of the memory of `update_change_detector`."""
 
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
-_RESOLUTION = 1e-10
+_MIN_RELATIVE_VARIANCE = 1e-10
 
 
 @njit(cache=True)
 def whitening_matrix(motion, phi, noise, model_var, n):
-    """Return a matrix (6, 6) that maps the wrench noise of a block mean to unit covariance."""
+    """Return the matrix (6, 6) that maps noise of an n-sample mean wrench to unit covariance."""
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     above, below, shifted = np.empty(6), np.empty(6), motion.copy()
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
@@ -123,10 +123,7 @@ def whitening_matrix(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def update_estimate(estimate, V, wrench, root):
-    """Update an estimate [theta (16); covariance (256)] by the mean of a block, Eq. (T6).
-
-    Return chi-squared of its innovation.
-    """
+    """Update [theta (16); covariance (256)] by a block mean, Eq. (T6); return its chi-squared."""
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
     for c in range(6):
@@ -146,7 +143,7 @@ def update_estimate(estimate, V, wrench, root):
             gain[i] = value
             predicted += row[i] * value
             uncorrelated += row[i] * row[i] * P[i, i]
-        total = max(1.0, _RESOLUTION * uncorrelated) + predicted
+        total = max(1.0, _MIN_RELATIVE_VARIANCE * uncorrelated) + predicted
         chi += innovation * innovation / total
         for i in range(16):
             theta[i] += gain[i] * innovation / total
@@ -210,7 +207,7 @@ def _inflate_inertia_variances(memory, noise, block):
 
 @njit(cache=True)
 def update_change_detector(memory, sample, block, noise, window, hold, bound):
-    """Process one sample in the change detector, without checks; `memory` is updated."""
+    """Update `memory` by one sample; last arguments: `change_detector_parameters`."""
     V = np.empty((6, 10))
     s, omega, alpha = (
         sample[SAMPLE_SPECIFIC_FORCE],
@@ -271,7 +268,7 @@ def _test_block(memory, block, noise, window, hold, bound):
         memory[_NEW_FILTER_START + 6],
         math.sqrt(memory[_NEW_FILTER_START + 16 + 17 * 6]),
     )
-    if memory[_SUM] > _ALARM_SUM or mass < -_IMPOSSIBLE_DEVIATIONS * deviation:
+    if memory[_SUM] > _ALARM_SUM or mass < -_MAX_NEGATIVE_DEVIATIONS * deviation:
         memory[_STATE_INDEX] = STATE_DISTURBED
         _restart_new_estimate(memory, _NEW_FILTER_START)
     elif memory[_STATE_INDEX] == STATE_DISTURBED and memory[_ESTIMATE_AGE_INDEX] >= hold:
@@ -315,7 +312,7 @@ def change_detector_parameters(
     positive_array("period", period)
     if not 0.0 <= model_error < 1.0:
         raise DrakeTeleopError(
-            f"{model_error} is not at least 0 and below 1",
+            f"{model_error} is outside the range 0 <= model_error < 1",
             where="model_error",
             remedy="give the relative error of the model",
         )
@@ -363,8 +360,8 @@ def known_load_in_memory(memory):
 
 
 @njit(cache=True)
-def change_state(memory):
-    """Return the index into `STATE_NAMES`; `STATE_KNOWN` again after a new load was identified."""
+def current_change_state(memory):
+    """Return the state as index into `STATE_NAMES`; a new load becomes known once identified."""
     return (
         STATE_KNOWN
         if memory[_STATE_INDEX] == memory[_BASE_STATE_INDEX]

@@ -33,7 +33,7 @@ MAX_SETTLED_STD = 0.05
 """Default of `bound`, relative to the natural scale."""
 
 # Smallest relative eigenvalue that is not rounding.
-_ROUNDING = 1e-16
+_MIN_RELATIVE_EIGENVALUE = 1e-16
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
 _MIN_RELATIVE_VARIANCE = 1e-10
@@ -94,7 +94,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
 class RecursiveEstimator(ABC):
     """Recursive estimator of load and sensor offsets, theta = [offsets; phi] (16,).
 
-    Its state, theta and a `memory` array, can be external.
+    The caller may keep its state, theta and a `memory` array.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
@@ -117,7 +117,7 @@ class RecursiveEstimator(ABC):
     ) -> None:
         if not 0.0 < forgetting <= 1.0:
             raise DrakeTeleopError(
-                f"{forgetting} is not above 0 and at most 1",
+                f"{forgetting} is outside the range 0 < forgetting <= 1",
                 where="forgetting",
                 remedy="give 1 for no forgetting",
             )
@@ -135,7 +135,7 @@ class RecursiveEstimator(ABC):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveEstimator:
-        """Return an estimator for standard deviations of wrench (6,) and motion (9,)."""
+        """Return an estimator for standard deviations of wrench (6,) and [s, omega, alpha] (9,)."""
         return cls(noise_std, forgetting=forgetting, bound=bound)
 
     @property
@@ -168,7 +168,7 @@ class RecursiveEstimator(ABC):
     def covariance_of(self, theta: Array, memory: Array) -> Array: ...
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
-        """Process one sample with an external theta and memory, without checks."""
+        """Update the given theta and memory by one sample, without checks."""
         self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
     @abstractmethod
@@ -178,7 +178,7 @@ class RecursiveEstimator(ABC):
     def _residual_rms(self) -> Array: ...
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Process one sample of a free motion: wrench (6,), others (3,)."""
+        """Process one sample of a free motion: wrench (6,); s, omega, alpha (3,)."""
         parts = (wrench, s, omega, alpha)
         shapes = [np.shape(part) for part in parts]
         if shapes != [(6,), (3,), (3,), (3,)]:
@@ -194,7 +194,7 @@ class RecursiveEstimator(ABC):
         self._samples += 1
 
     def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Process N samples of a free motion, (N, 6) and (N, 3); faster than `update`."""
+        """Process N samples of a free motion: wrench (N, 6), others (N, 3)."""
         _, rows = broadcast_to_rows(
             wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
         )
@@ -231,11 +231,12 @@ class RecursiveEstimator(ABC):
         information = np.linalg.inv(self.covariance)
         scale = 1.0 / np.sqrt(np.diag(information))
         eigenvalues = np.linalg.eigvalsh(information * np.outer(scale, scale))
-        return float(np.sqrt(eigenvalues[-1] / max(eigenvalues[0], _ROUNDING * eigenvalues[-1])))
+        smallest = max(eigenvalues[0], _MIN_RELATIVE_EIGENVALUE * eigenvalues[-1])
+        return float(np.sqrt(eigenvalues[-1] / smallest))
 
 
 class RecursiveLeastSquares(RecursiveEstimator):
-    """Recursive least squares; noise of the measured motion biases it."""
+    """Recursive least squares, whose estimate is biased by noise of the measured motion."""
 
     method = "recursive least squares"
 

@@ -2,7 +2,7 @@
 
 The estimate minimises the squared residuals over their expected value (Kubus, Kroeger, Wahl, IROS
 2008). Row c of the regressor [E V] is T_c z with constant T_c; [G g] are the normal equations, and
-Z (19, 19) is the sum of z z^T:
+Z (19, 19) is the sum of z z^T, with w = omega:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
 """
@@ -34,16 +34,16 @@ RELATIVE_RIDGE = 1e-13
 _WRENCH, _OMEGA_PRODUCT_INDICES = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER_OF_BATCH_MOMENTS = [0, *range(7, 19), *range(1, 7)]
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
-_MIN_EXCESS = 4.0
+_MIN_INFORMATION_EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
-_MIN_PIVOT = 1e-13
+_MIN_RELATIVE_PIVOT = 1e-13
 # Fewest samples for the noise scale from residuals.
 _MIN_SCALE_SAMPLES = 20
 
 
 @cache
 def nonzero_regressor_terms() -> tuple[NDArray[np.uintp], Array]:
-    """Return nonzero terms of T: [channel, element of z, parameter] (n, 3), factors (n,)."""
+    """Return nonzero terms of T, [E V] = T z: indices (n, 3) of channel, z, parameter; factors."""
     T = regressor_coefficients()[:, :, _ORDER_OF_BATCH_MOMENTS].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
@@ -78,7 +78,6 @@ def write_products_vector(wrench, motion, z):
 
 @njit(cache=True)
 def add_outer_product(y, z, total):
-    """Add y z^T to `total` (19, 19)."""
     for i in range(19):
         for j in range(19):
             total[i, j] += y[i] * z[j]
@@ -97,7 +96,7 @@ def forget_samples(memory, theta, information, forgetting):
 
 @njit(cache=True)
 def residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L, L Z and S = L Z L^T (6, 6) for the residual r = F - [E V] theta = L z."""
+    """Write L, LZ = L Z and S = L Z L^T (6, 6), where r = F - [E V] theta = L z is the residual."""
     L[:] = 0.0
     LZ[:] = 0.0
     for c in range(6):
@@ -120,7 +119,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the expected noise of Z into Q."""
+    """Write the part of Z, the sum of z z^T, that noise is expected to cause into Q (19, 19)."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
@@ -138,7 +137,7 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 @njit(cache=True)
 def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z."""
+    """Write the sum of X^T W Y into G[:, first:]; Z sums y z^T, X and Y are [E V] of y and z."""
     E[:] = 0.0
     for t in range(len(factors)):
         c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
@@ -159,7 +158,7 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def weighted_right(LZ, W, index, factors, g):
-    """Write the right-hand side g (16,), the sum of X^T W r with X = [E V] of z."""
+    """Write the sum of X^T W r into g (16,); LZ sums r z^T, X is [E V] of z."""
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -199,7 +198,7 @@ def solve_linear_system(A):
 
 @njit(cache=True)
 def invert_matrix(S, A, W):
-    """Write S^-1 into W, both (6, 6); A (6, 12) is scratch."""
+    """Write S^-1 into W, both (6, 6); A (6, 12) is scratch memory."""
     for c in range(6):
         for d in range(6):
             A[c, d] = S[c, d]
@@ -212,7 +211,7 @@ def invert_matrix(S, A, W):
 
 
 class MomentEstimator(RecursiveEstimator):
-    """Recursive estimator whose memory is the sum of z z^T, and a row for the prior."""
+    """Recursive estimator whose memory is the sum of z z^T of Eq. (T18), and a row of the prior."""
 
     def initial_memory(self, theta: Array) -> Array:
         memory = np.zeros((20, 19))
@@ -230,8 +229,8 @@ class MomentEstimator(RecursiveEstimator):
 
 
 @njit(cache=True)
-def select_compensated(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise can be compensated, otherwise to 0."""
+def select_compensated_parameters(G, N, strength, K, taper):
+    """Set `taper` (16,) to 1 for parameters whose noise N can be removed from G, otherwise to 0."""
     taper[:] = 1.0
     for i in range(16):
         for j in range(16):
@@ -239,7 +238,7 @@ def select_compensated(G, N, strength, K, taper):
     eliminate_rows(K)
     definite = True
     for i in range(16):
-        definite &= K[i, i] > _MIN_PIVOT * G[i, i]
+        definite &= K[i, i] > _MIN_RELATIVE_PIVOT * G[i, i]
     if definite:
         return
     for i in range(16):
@@ -253,9 +252,9 @@ def select_compensated(G, N, strength, K, taper):
             total = G[i, i] - strength * taper[i] * N[i, i]
             for k in range(i):
                 total -= K[i, k] * K[i, k]
-            if total > _MIN_PIVOT * G[i, i]:
+            if total > _MIN_RELATIVE_PIVOT * G[i, i]:
                 break
-        if not total > _MIN_PIVOT * G[i, i]:
+        if not total > _MIN_RELATIVE_PIVOT * G[i, i]:
             taper[:] = 0.0
             return
         K[i, i] = math.sqrt(total)
@@ -263,7 +262,7 @@ def select_compensated(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write [G g] into G and the noise of G into N; return the noise scale."""
+    """Write [G g] into G, its part from noise into N; return the ratio of actual to given noise."""
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
     residual_products(Q, theta, index, factors, L, LZ, S)
@@ -305,9 +304,9 @@ def rtls_update(
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        gain = 1.0 - _MIN_EXCESS * math.sqrt(2.0 / Z[0, 0])
+        gain = 1.0 - _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / Z[0, 0])
         if gain > 0.0:
-            select_compensated(G, N, scale / gain, K, taper)
+            select_compensated_parameters(G, N, scale / gain, K, taper)
             for i in range(6, 16):
                 for j in range(6, 16):
                     G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
@@ -354,18 +353,18 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance (16, 16); poorly excited directions have the prior's variance."""
+        """Return the covariance (16, 16); poorly excited directions keep the prior's variance."""
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
-        root = np.linalg.inv(_cholesky_or_none(G + information))
+        root = np.linalg.inv(_regularized_cholesky(G + information))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        excited = (shares < _MIN_PIVOT) | (
-            excess > _MIN_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
+        excited = (shares < _MIN_RELATIVE_PIVOT) | (
+            excess > _MIN_INFORMATION_EXCESS * math.sqrt(2.0 / max(samples, 1.0))
         )
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
-        factor = inverse @ _cholesky_or_none(scale * G + information)
+        factor = inverse @ _regularized_cholesky(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
         return self._limit_to_prior(factor @ factor.T + unknown @ unknown.T)
@@ -389,8 +388,8 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         rtls_update(theta, memory, samples, *options, *nonzero_regressor_terms())
 
 
-def _cholesky_or_none(A: Array) -> Array:
-    return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))
+def _regularized_cholesky(A: Array) -> Array:
+    return np.asarray(np.linalg.cholesky(A + _MIN_RELATIVE_PIVOT * np.diag(np.diag(A))))
 
 
 METHODS: Registry[type[RecursiveEstimator]] = Registry(

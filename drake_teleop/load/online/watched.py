@@ -18,7 +18,7 @@ from drake_teleop.load.online import change
 from drake_teleop.load.online.change import (
     STATE_CHANGED,
     STATE_KNOWN,
-    change_state,
+    current_change_state,
     known_load_in_memory,
     new_load_age,
     new_load_in_memory,
@@ -67,7 +67,7 @@ def initial_monitor_memory(theta: Array, covariance: Array) -> Array:
 
 
 @njit(cache=True)
-def monitor_state(memory):
+def current_monitor_state(memory):
     """Return the index into `LOAD_STATE_NAMES`; `STATE_LEARNING` for a memory of zeros."""
     return int(memory[_STATE])
 
@@ -131,7 +131,7 @@ def monitor_load(out, memory, sample, fallback, period, block, noise, window, ho
     wrench = sample[SAMPLE_WRENCH]
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
-    at_rest, verdict = _is_at_rest(memory, sample, period), change_state(watch)
+    at_rest, verdict = _is_at_rest(memory, sample, period), current_change_state(watch)
     force_changed = _force_has_changed(memory, residual, new_load_age(watch), period)
     if verdict == STATE_KNOWN:
         memory[_STATE] = STATE_SETTLED

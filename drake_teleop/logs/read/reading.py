@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.numeric import Array, to_float
 from drake_teleop.common.rotations import nearest_rotation, quaternions_of, rotation_matrices
 from drake_teleop.logs.pose_motion.poses import ImuData, Poses
@@ -80,7 +80,7 @@ def read_log(
     Raises:
         DrakeTeleopError: naming file, field and remedy.
     """
-    expect((str, Path), path, "log", "give the file's name")
+    expect_type((str, Path), path, "log", "give the file's name")
     if bandwidth_hz is not None and not to_float("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
             f"{bandwidth_hz:g} Hz is too low", where="bandwidth_hz", remedy="give more, or None"

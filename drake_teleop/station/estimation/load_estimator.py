@@ -17,9 +17,9 @@ from drake_teleop.load.online.watched import (
     MEMORY_SIZE,
     STATE_LEARNING,
     STATE_SETTLED,
+    current_monitor_state,
     initial_monitor_memory,
     monitor_load,
-    monitor_state,
 )
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
@@ -168,7 +168,7 @@ class LoadEstimator(LeafSystem):
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
 
     def _load_state_index(self, discrete_state: DiscreteValues) -> int:
-        return monitor_state(discrete_state.value(2)) if self._watches else STATE_LEARNING
+        return current_monitor_state(discrete_state.value(2)) if self._watches else STATE_LEARNING
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()

@@ -15,7 +15,7 @@ from pydrake.systems.framework import BasicVector, Context
 from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.vectors import copy_into, cross, quaternion_of, vector_at
+from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
 from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, display_into
 from drake_teleop.station.master.numbers import HAND_MASS
@@ -82,7 +82,7 @@ def _pose_and_twist(arm, q, v, pose, twist):
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
     jacobian_and_pose(arm, q, J, x)
-    turn = quaternion_of(x[12:].reshape((3, 3)))
+    turn = quaternion_of_matrix(x[12:].reshape((3, 3)))
     same = 0.0
     for i in range(4):
         same += turn[i] * pose[i]

@@ -14,9 +14,9 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from drake_teleop.common.compiled import address_of, make_call_at_address, njit
+from drake_teleop.common.compiled import address_of_function, make_call_at_address, njit
 from drake_teleop.common.config import (
-    check_name,
+    check_field_name,
     check_ranges,
     choice,
     plain,
@@ -228,7 +228,7 @@ class PassivityConfig(MethodConfigs, _CommonConfig):
                 else None
             )
         for name in self.registered:
-            check_name(schema, name, f"{where}.registered.{name}")
+            check_field_name(schema, name, f"{where}.registered.{name}")
         with unchecked_assignments():
             config = schema(**self.registered)
         check_ranges(config, f"{where}.registered")
@@ -308,7 +308,7 @@ def _addresses_of_functions(*steps: Any) -> tuple[int, int, int]:
     master, slave, sent = zip(
         steps, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _RECORD_ARGUMENTS), strict=True
     )
-    return address_of(*master), address_of(*slave), address_of(*sent)
+    return address_of_function(*master), address_of_function(*slave), address_of_function(*sent)
 
 
 @njit(cache=True)

@@ -27,7 +27,7 @@ from pydrake.systems.primitives import RandomSource
 
 from drake_teleop.common.blocks import ONE_DICT, DoubleOnly
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.errors import DrakeTeleopError, expect_type
 from drake_teleop.common.vectors import (
     add_cross_product,
     apply_matrix,
@@ -319,7 +319,7 @@ def _sample_into(sensor, truth, noise, memory, sample):
 
 
 def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
-    expect(MultibodyPlant, plant, f"{_NAME_IN_ERRORS}: plant")
+    expect_type(MultibodyPlant, plant, f"{_NAME_IN_ERRORS}: plant")
     if not plant.is_finalized():
         raise DrakeTeleopError(
             f"plant '{plant.get_name()}' is not finalized",
@@ -354,7 +354,7 @@ def _event_period_and_count(step: float | None, period: float | None) -> tuple[f
 
 
 def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple[Frame, WeldJoint]:
-    expect((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
+    expect_type((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         raise DrakeTeleopError(
             f"'{joint_or_frame.name()}' belongs to another plant",

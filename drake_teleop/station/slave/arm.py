@@ -23,7 +23,7 @@ from drake_teleop.common.vectors import (
     matrix_at,
     minus,
     plus,
-    quaternion_of,
+    quaternion_of_matrix,
     scale_vector,
     symmetric_at,
     transposed,
@@ -412,7 +412,7 @@ def pose_into(arm, q, pose):
     """Write the pose X_WS (7,) [qw qx qy qz px py pz] of an arm table at q (n,) [rad]."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm, q, R, p)
-    orientation = quaternion_of(R)
+    orientation = quaternion_of_matrix(R)
     for i in range(4):
         pose[i] = orientation[i]
     for i in range(3):

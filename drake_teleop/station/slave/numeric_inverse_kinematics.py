@@ -20,7 +20,7 @@ from drake_teleop.common.vectors import (
     dot,
     normalized_quaternion,
     quaternion_logarithm,
-    quaternion_of,
+    quaternion_of_matrix,
     quaternion_product,
     vector_at,
 )
@@ -80,7 +80,8 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
     for i in range(3):
         for k in range(3):
             R[i, k] = x[12 + 3 * i + k]
-    turn = quaternion_logarithm(quaternion_product(a, conjugate_quaternion(quaternion_of(R))))
+    q = conjugate_quaternion(quaternion_of_matrix(R))
+    turn = quaternion_logarithm(quaternion_product(a, q))
     squared = 0.0
     for i in range(3):
         e[i] = pose[4 + i] - x[9 + i]

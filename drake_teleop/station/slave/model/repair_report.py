@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError
 
 _MAX_NAMES = 12  # names in one statement
 
@@ -66,7 +66,7 @@ class RepairReport:
         causes = list(self._causes)
         if len(causes) == 1:
             raise DrakeTeleopError(causes[0], where=str(file))
-        room, texts = LONGEST_LINE - len(f"{file}: 1000 faults: ; and 1000 more"), list[str]()
+        room, texts = MAX_LINE_LENGTH - len(f"{file}: 1000 faults: ; and 1000 more"), list[str]()
         for k, cause in enumerate(causes, start=1):
             texts.append(f"({k}) {cause}")
             room -= len(f"{texts[-1]}; ")
