@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import socket
 import sys
 import time
@@ -157,21 +158,22 @@ def open_device(address: str, grip: str, depth: float) -> Device:
     if address.startswith("haply://"):
         return HaplyDevice(address)
     raise DrakeTeleopError(
-        "is not a device", where=address, remedy="use virtual or haply://HOST:PORT"
+        "is not the address of a haptic device",
+        where=address,
+        remedy="use virtual or haply://HOST:PORT",
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("device", help="virtual, or haply://HOST:PORT")
-    parser.add_argument("station", help="udp://127.0.0.1:PORT")
-    parser.add_argument(
-        "--grip", choices=tuple(GRIP_IMPEDANCES), default="medium", help="of the virtual hand"
-    )
-    parser.add_argument("--depth", type=float, default=0.08, help="stroke of that hand [m]")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="duration")
-    parser.add_argument("--no-observer", action="store_true", help="no passivity observer")
-    parser.add_argument("--json", type=Path, help="output file of the figures")
+    add = parser.add_argument
+    add("device", help="haptic device: virtual, or haply://HOST:PORT")
+    add("station", help="station: udp://127.0.0.1:PORT of `drake-teleop drive`")
+    add("--grip", choices=[*GRIP_IMPEDANCES], default="medium", help="grip on the virtual device")
+    add("--depth", type=float, default=0.08, help="tapping depth of the virtual device [m]")
+    add("--seconds", type=float, default=math.inf, help="duration [s] (default: no limit)")
+    add("--no-observer", action="store_true", help="disable the passivity observer")
+    add("--json", type=Path, help="JSON file for the force delays, largest force and energy")
     options = parser.parse_args(arguments)
     device = open_device(options.device, options.grip, options.depth)
     client = DeviceClient(device, options.station, observe=not options.no_observer)

@@ -191,7 +191,7 @@ class DeviceConnection:
         kind = address.partition("://")[0]
         if kind not in ("udp", "haply"):
             raise DrakeTeleopError(
-                "is not a haptic device address",
+                "is not the address of a haptic device",
                 where=address,
                 remedy="use udp://127.0.0.1:PORT or haply://localhost:10001",
             )

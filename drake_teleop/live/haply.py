@@ -90,7 +90,9 @@ class HaplyDevice:
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
             raise DrakeTeleopError(
-                f"does not answer ({error})", where=address, remedy="start Haply's service"
+                f"Haply's service does not answer ({error})",
+                where=address,
+                remedy="start the service",
             ) from error
         self._device = ""
 
@@ -103,9 +105,9 @@ class HaplyDevice:
             return None
         except ConnectionClosed as error:
             raise DrakeTeleopError(
-                "the service has closed the connection",
+                "Haply's service has closed the connection",
                 where="haply",
-                remedy="restart the Haply service",
+                remedy="restart the service",
             ) from error
         if message is None:
             return None

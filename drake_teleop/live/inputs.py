@@ -217,10 +217,10 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _COLUMNS:
-        raise _repeat_error("has choices as numbers and no version of this package", path)
+        raise _repeat_error("does not contain the version of drake_teleop that recorded it", path)
     if tuple(lines[1:2]) != (list(_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
-            "is not a record of a drive",
+            "does not contain the inputs of a recorded live session",
             where=str(path),
             remedy=f"use the columns {', '.join(_COLUMNS)}",
         )
@@ -234,7 +234,7 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
     changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         raise DrakeTeleopError(
-            "has a duration of 0 s", where=str(path), remedy="record the drive again"
+            "has a duration of 0 s", where=str(path), remedy="record the session again"
         )
     return changes
 
@@ -250,7 +250,7 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
         where = f"{path}:{number}"
         if len(line) != len(_COLUMNS):
             raise DrakeTeleopError(
-                f"has {len(line)} values, must have {len(_COLUMNS)}",
+                f"has {len(line)} values, must have {len(_COLUMNS)}, one for each column",
                 where=where,
                 remedy="use the file as recorded",
             )
@@ -258,20 +258,22 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _repeat_error(f"has an unknown {name}, {line[column]!r}", path)
+                raise _repeat_error(
+                    f"has the {name} {line[column]!r}, which is unknown in this version", path
+                )
         try:
             ms, *values = map(int, line)
         except ValueError:
             raise DrakeTeleopError(
-                "has a value that is not a whole number",
+                "has a value that is not a whole number (all inputs are integers)",
                 where=where,
                 remedy="use the file as recorded",
             ) from None
         if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
             raise DrakeTeleopError(
-                f"{ms} ms is not a valid time",
+                f"{ms} ms is not a valid time (first 0, never decreasing, at most 10 hours)",
                 where=where,
-                remedy="use increasing times in whole milliseconds from 0",
+                remedy="use the file as recorded",
             )
         earlier, inputs = ms, dict(zip(RANGES, values, strict=True))
         for name in RANGES:

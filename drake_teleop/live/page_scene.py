@@ -90,5 +90,5 @@ class _SceneRecorder:
 def _extract_objects(html: str) -> bytes:
     commands = _COMMAND.findall(html)
     if not commands:
-        raise ValueError("Drake's Meshcat writes its static page in an unknown form")
+        raise ValueError("the static page of Drake's Meshcat has an unknown format")
     return json.dumps({"commands": commands, "files": dict(_FILE.findall(html))}).encode()

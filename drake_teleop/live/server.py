@@ -274,7 +274,9 @@ class LiveDrive:
     def _raise_when_stopped(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
-                raise DrakeTeleopError("the drive has ended")
+                raise DrakeTeleopError(
+                    "the live session ended during the identification of the load"
+                )
 
         return progress
 
@@ -414,7 +416,7 @@ def drive_command(
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
     if live.ended:
-        raise DrakeTeleopError(f"the session has ended: {live.ended}", where="drive")
+        raise DrakeTeleopError(f"the simulation has stopped: {live.ended}", where="drive")
 
 
 def start_condition(device: str | None) -> str:

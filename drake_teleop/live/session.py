@@ -367,9 +367,9 @@ def read_drive(folder: str | Path) -> Drive:
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD_FILE).exists()):
         raise DrakeTeleopError(
-            "is damaged, or not a load of a drive",
+            "is not an identified load (16 finite parameters)",
             where=str(folder / LOAD_FILE),
-            remedy="record the drive again",
+            remedy="record the session again",
         )
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
     return Drive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)

@@ -22,7 +22,7 @@ class Address:
         except ValueError as error:
             raise DrakeTeleopError(str(error), where=text) from error
         if not self.host:
-            raise DrakeTeleopError("has no host", where=text, remedy=f"{parts.scheme}://HOST")
+            raise DrakeTeleopError("has no host", where=text, remedy=f"use {parts.scheme}://HOST")
         self.path = parts.path.strip("/")
         self._parameters = parameters
         for name in parameters:

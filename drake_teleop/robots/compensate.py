@@ -160,7 +160,7 @@ def compensate_command(
     control_port = None if control is None else TareRequestPort(control)
     changes = ChangeMonitor(readings.dt, live=readings.live, report=report) if watch else None
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
-    report(f"late by {1e3 * late:.1f} ms")
+    report(f"outputs are {1e3 * late:.1f} ms late")
     report(f"readings are stale after {1e3 * STALE_S:.0f} ms; invalid wrenches are zero")
     if largest is None:
         report("no --range: saturation of the sensor is not detected")

@@ -78,7 +78,7 @@ def open_source(
         return ReplayLogSource(path, load, **options)  # type: ignore[arg-type]
     if kind not in SOURCES:
         remedy = f"give {_address_forms(SOURCES, PART_SOURCES)}, or replay:LOG"
-        raise DrakeTeleopError("is not a source", where=address, remedy=remedy)
+        raise DrakeTeleopError("is not the address of a source", where=address, remedy=remedy)
     if load is not None and load.weight_removed:
         raise missing_orientation_error(address)
     return SOURCES[kind](address, _period(rate_hz, address))
@@ -112,7 +112,7 @@ def open_sink(address: str) -> Sink:
     kind = _address_kind(address) or Path(address).suffix
     if kind not in SINKS:
         remedy = f"give {_address_forms(SINKS)}"
-        raise DrakeTeleopError("is not a sink", where=address, remedy=remedy)
+        raise DrakeTeleopError("is not the address of a sink", where=address, remedy=remedy)
     return SINKS[kind](address)
 
 

@@ -41,9 +41,9 @@ def topic_of_address(address: Address, text: str) -> str:
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
-            f"{text!r} is not a topic",
+            f"{text!r} is not the name of a ROS topic",
             where=address.text,
-            remedy="give one, such as zenoh://HOST/ft_sensor/wrench",
+            remedy="give one such as /ft_sensor/wrench",
         )
     return topic
 

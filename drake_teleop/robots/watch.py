@@ -97,11 +97,13 @@ class StreamContactDetector:
         delay: str | float = "auto",
     ) -> None:
         if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
-            raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
+            raise DrakeTeleopError(
+                "needs a low-pass of the stream", where="--free", remedy="give --cutoff HZ"
+            )
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
         if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
             raise DrakeTeleopError(
-                f"has {1.0 / source.dt:.4g} Hz, and the stream {1.0 / dt:.4g} Hz",
+                f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz",
                 where=str(free),
                 remedy="use the log that `calibrate` wrote from this stream",
             )

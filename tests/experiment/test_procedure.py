@@ -178,9 +178,12 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
         ("tasks: [!Juggling {}]\nconditions: [{name: a}]", "Juggling"),
         (
             "tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]",
-            "too small a range",
+            "0.1 is less than twice low, 0.1: the range is too small",
         ),
-        ("tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]", "not unique"),
+        (
+            "tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]",
+            "'a' is empty, or the name of an earlier",
+        ),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, sigma: 1, eta: 0.5}]", "eta"),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, network: moon}]", "moon"),
     ],

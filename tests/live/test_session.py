@@ -306,7 +306,7 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not a record of a drive"),
+        ("", "does not contain the inputs of a recorded live session"),
         (HEADER, "has a duration of 0 s"),
         (HEADER + csv_row(0, Inputs()), "has a duration of 0 s"),
         (HEADER + csv_row(5, Inputs()), "5 ms is not a valid time"),
@@ -322,19 +322,22 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
         ),
         (
             HEADER + csv_row(0, Inputs()).replace("none", "share"),
-            "has an unknown method, 'share'; it ca",
+            "the method 'share', which is unknown in this version; it ca",
         ),
         (
             HEADER + csv_row(0, Inputs()).replace("none", "0"),
-            "has an unknown method, '0'; it cannot be",
+            "the method '0', which is unknown in this version; it cannot be",
         ),
-        (HEADER + csv_row(0, Inputs()).replace("medium", "iron"), "has an unknown grip, 'iron'"),
+        (
+            HEADER + csv_row(0, Inputs()).replace("medium", "iron"),
+            "the grip 'iron', which is unknown",
+        ),
         (
             HEADER.replace("1.2", "1.1"),
             "recorded with drake_teleop 1.1, and this is 1.2; it cannot",
         ),
         (HEADER.replace(", drake 3.4", ""), "recorded with drake unknown, and this is 3.4"),
-        (HEADER.partition("\n")[2] + "0,0\n", "has choices as numbers and no version"),
+        (HEADER.partition("\n")[2] + "0,0\n", "does not contain the version of drake_teleop"),
         ("# \n" + HEADER.partition("\n")[2], "recorded with drake_teleop unknown"),
     ],
 )

@@ -133,35 +133,38 @@ class Experiment:
                     "is empty", where=f"{where}:{name}", remedy="add at least one"
                 )
         kinds = [type(task).__name__ for task in self.tasks]
-        if len(set(kinds)) < len(kinds):
-            raise DrakeTeleopError(
-                "a task is listed twice", where=f"{where}:tasks", remedy="remove one"
-            )
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                raise DrakeTeleopError(
+                    f"the task !{kind} is listed twice", where=f"{where}:tasks", remedy="remove one"
+                )
         for index, task in enumerate(self.tasks):
             if not isinstance(task, PegInSlot) and not 2.0 * task.low <= task.high:
                 raise DrakeTeleopError(
-                    f"{task.low:g} to {task.high:g} is too small a range for a threshold",
+                    f"{task.high:g} is less than twice low, {task.low:g}: the range is too small",
                     where=f"{where}:tasks[{index}].high",
-                    remedy="set it to at least twice low",
+                    remedy="increase high, so that the range contains the threshold",
                 )
         names = [condition.name for condition in self.conditions]
         for index, condition in enumerate(self.conditions):
             place = f"{where}:conditions[{index}]"
             if not condition.name or condition.name in names[:index]:
                 raise DrakeTeleopError(
-                    "is empty or not unique",
+                    f"{condition.name!r} is empty, or the name of an earlier condition",
                     where=f"{place}.name",
-                    remedy="give each condition a name",
+                    remedy="give each condition its own name",
                 )
             if condition.eta is not None and condition.sigma != 0.0:
                 raise DrakeTeleopError(
-                    "cannot be combined with sigma", where=f"{place}.eta", remedy="set sigma: 0"
+                    f"cannot be combined with sigma = {condition.sigma:g}",
+                    where=f"{place}.eta",
+                    remedy="set sigma: 0",
                 )
             if condition.delay is not None and condition.network != AS_IN_SCENARIO:
                 raise DrakeTeleopError(
-                    "cannot be combined with network",
+                    f"cannot be combined with network {condition.network!r}",
                     where=f"{place}.delay",
-                    remedy="remove one of them",
+                    remedy="remove delay or network",
                 )
 
 
@@ -181,10 +184,10 @@ def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
     place = f"{path}:tasks[{index}].scenario"
     if isinstance(task, PegInSlot) and not isinstance(scenario.operator.task, Insert):
         raise DrakeTeleopError(
-            "has no slot", where=place, remedy="give its operator a task !Insert"
+            f"{task.scenario} has no slot", where=place, remedy="give its operator a task !Insert"
         )
     if isinstance(task, ContactDetection) and scenario.surroundings is None:
         raise DrakeTeleopError(
-            "has no object to touch", where=place, remedy="use a scenario such as touch"
+            f"{task.scenario} has no object to touch", where=place, remedy="use one such as touch"
         )
     return scenario

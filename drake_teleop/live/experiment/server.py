@@ -85,10 +85,12 @@ def serve_experiment(
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
         raise DrakeTeleopError(
-            f"the session has ended: {live.ended}; {what}",
+            f"the simulation has stopped: {live.ended}; {what}",
             where="drive",
             remedy="run the same command again to continue",
         )
     if done < trials:
-        raise KeyboardInterrupt(f"{reason}: {what}; run the same command again to continue")
+        raise KeyboardInterrupt(
+            f"ended by {reason}: {what}; run the same command again to continue"
+        )
     print(f"\nended by {reason}: {what}")

@@ -78,7 +78,7 @@ class Store:
             any(row.trial != index for index, row in enumerate(rows))
             or table.null_count().sum_horizontal()[0]
         ):
-            raise DrakeTeleopError("lacks trials", where=str(path), remedy=remedy)
+            raise DrakeTeleopError("lacks trials or values", where=str(path), remedy=remedy)
         return rows
 
     def write_rows(self, participant: int, rows: list[TrialRow]) -> None:

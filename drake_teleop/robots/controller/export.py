@@ -41,7 +41,9 @@ def export_controller(
     """
     if rate_hz is None:
         raise DrakeTeleopError(
-            f"is required by {to}", where="rate", remedy="give the rate of the readings in Hz"
+            f"not given, but required by {to}",
+            where="rate",
+            remedy="give that of the readings in Hz",
         )
     if sensor_pose is not None:
         raise sensor_frame_error(to)

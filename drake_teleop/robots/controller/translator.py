@@ -98,7 +98,9 @@ class _Function:
         tree, self._globals = _parse_source(function)
         names = [argument.arg for argument in tree.args.args]
         if names != list(parameters):
-            raise TypeError(f"{name}: give the types of {names}, not of {list(parameters)}")
+            raise TypeError(
+                f"{name}: types are given for {list(parameters)}; give them for {names}"
+            )
         self._values: dict[str, Any] = {
             each: _Scalar(each, kind, constant=True)
             if isinstance(kind, str)
@@ -159,7 +161,7 @@ class _Function:
                 node.target, self._translate_operation(node, node.op, node.target, node.value)
             )
         elif self._expanding:
-            raise self._unsupported_error(node, "in a function that is expanded at its call")
+            raise self._unsupported_error(node, "only assignments are expanded at a call")
         elif isinstance(node, ast.Return) and node.value is not None:
             value = self._translate_expression(node.value)
             self.kind = _c_type(value)
@@ -183,7 +185,7 @@ class _Function:
             not (isinstance(call, ast.Call) and self._translate_expression(call.func) is range)
             or call.args[2:]
         ):
-            raise self._unsupported_error(call, "as the range of a loop")
+            raise self._unsupported_error(call, "a loop needs range(stop) or range(start, stop)")
         *start, stop = [
             _c_expression(self._translate_expression(argument)) for argument in call.args
         ]
@@ -207,13 +209,15 @@ class _Function:
             self._values[target.id] = self._store_in_variables(value)
         elif isinstance(value, (tuple, _Array)):
             if self._indent > 1:
-                raise self._unsupported_error(target, "in a branch or loop as a tuple or array")
+                raise self._unsupported_error(
+                    target, "no tuple or array is assigned in a branch or loop"
+                )
             self._values[target.id] = self._store_in_variables(value)
         else:
             if isinstance(self._values.get(target.id), _Scalar) and target.id not in self._locals:
-                raise self._unsupported_error(target, "as a parameter with a new value")
+                raise self._unsupported_error(target, "a parameter keeps its value")
             if self._locals.setdefault(target.id, _c_type(value)) != _c_type(value):
-                raise self._unsupported_error(target, "with two types")
+                raise self._unsupported_error(target, "a variable keeps its type")
             self._values[target.id] = _Scalar(target.id, _c_type(value))
             self._write_line(f"{target.id} = {_remove_outer_parentheses(_c_expression(value))};")
 
@@ -291,7 +295,9 @@ class _Function:
         kinds = {_c_type(a), _c_type(b)}
         needed = {"%": {"int"}, "/": {"double"}}.get(sign, kinds)
         if kinds != needed:
-            raise self._unsupported_error(node, f"with {' and '.join(sorted(kinds))}")
+            raise self._unsupported_error(
+                node, f"{sign} of {' and '.join(sorted(kinds))}, not {' and '.join(needed)}"
+            )
         kind = "int" if isinstance(op, ast.cmpop) or kinds == {"int"} else "double"
         return _Scalar(f"({_c_expression(a)} {sign} {_c_expression(b)})", kind)
 
@@ -326,7 +332,9 @@ class _Function:
             return self._translate_c_call(function, values)
         if inspect.isfunction(function):
             return self._expand_call(function, values)
-        raise ValueError(f"{self.name}: a call of {function!r} cannot be translated to C")
+        raise ValueError(
+            f"{self.name}: a call of {function!r} cannot be translated to C (unknown function)"
+        )
 
     def _translate_c_call(self, function: Any, values: list[Any]) -> _Scalar:
         given = dict(zip(inspect.signature(function.py_func).parameters, values, strict=True))
@@ -365,8 +373,8 @@ class _Function:
         return result
 
     def _unsupported_error(self, node: ast.AST, why: str = "") -> ValueError:
-        what = f"{self.name}: {ast.unparse(node)!r} {why}".rstrip()
-        return ValueError(f"{what} cannot be translated to C")
+        what = f"{self.name}: {ast.unparse(node)!r} cannot be translated to C"
+        return ValueError(f"{what} ({why})" if why else what)
 
 
 def _parse_source(function: Any) -> tuple[ast.FunctionDef, dict[str, Any]]:
