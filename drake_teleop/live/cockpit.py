@@ -1,4 +1,4 @@
-"""Forces, energy, contact and warnings for the browser page."""
+"""Forces, energy, contact and warnings that the browser page displays."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Calculator of the page's values from the log's rows."""
+    """Calculator of the page's values from rows of the log."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
@@ -80,7 +80,7 @@ class Cockpit:
         self._forces = np.zeros((3, 2))
 
     def page_values(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
-        """Return the page's values for at least one new row, finite and ready for JSON."""
+        """Return the page's values for the new rows (at least one), as finite numbers for JSON."""
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces

@@ -51,13 +51,13 @@ class Device(Protocol):
         """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
 
     def close(self) -> None:
-        """Disconnect the device with zero force."""
+        """Set zero force and disconnect the device."""
 
 
 class DeviceClient:
-    """Connection of a haptic device and a station.
+    """Connection of a haptic device to a station.
 
-    `behind` is the delay [s] between each device position and the force that answers it.
+    `behind` contains the delays [s] from each device position to the force that answers it.
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
@@ -73,7 +73,7 @@ class DeviceClient:
     def exchange_once(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
-        """Exchange pose and force once; return the displayed wrench, or None without a pose."""
+        """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
         pose = self._device.read()
         now = clock()
         self._receive()
@@ -152,7 +152,7 @@ class RealTimeVirtualDevice:
 
 
 def open_device(address: str, grip: str, depth: float) -> Device:
-    """Return the device at an address: `virtual` or haply://HOST:PORT."""
+    """Return the device at `virtual` (tapping `depth` [m] deep) or haply://HOST:PORT."""
     if address == "virtual":
         return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))
     if address.startswith("haply://"):

@@ -132,7 +132,7 @@ class DeviceLink:
         return values
 
     def link_statistics(self, now: float) -> dict[str, float]:
-        """Return packet rate [Hz], lost packets and lateness [ms]."""
+        """Return packet rate [Hz], lost packets, lateness and delays [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (

@@ -1,4 +1,4 @@
-"""Master side of a real haptic device."""
+"""Master side of a station with a real haptic device."""
 
 from __future__ import annotations
 
@@ -100,8 +100,8 @@ class ExternalMaster(LeafSystem):
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - master_state: (12,) position [m], yaw, pitch, roll [rad]; zero speeds
         - force_to_master: (6,) wrench for the device [N, N m]
-        - fault_at_hand: a `Fault`
-        - displayed_and_fault: the last two side by side
+        - fault_at_hand: number of a `Fault`; 0: none
+        - displayed_and_fault: (7,) force_to_master and fault_at_hand
         - hand_wrench_E: (6,) minus the displayed wrench
     """
 
@@ -140,7 +140,7 @@ class ExternalMaster(LeafSystem):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Do nothing: a real hand has no setting."""
+        """Do nothing: a real hand keeps its impedance."""
 
     def _current_pose_and_twist(self, context: Context) -> Array:
         _pose_on_path(

@@ -58,13 +58,13 @@ _INTENTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3
 
 @njit(cache=True)
 def _intention_into(path, time, pose, out):
-    """Write X_BE (7,), twist (6,), acceleration (3,): (d/dt + w)^3 x = 0, (d/dt + w)^2 r = 0."""
+    """Write intended X_BE (7,), twist (6,), acceleration (3,) of a smooth path to the target."""
     if path[_HELD] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
         return
     t = time - path[_START_TIME]
-    w = path[_POLES]
+    w = path[_POLES]  # (d/dt + w)^3 x = 0, and (d/dt + _ROTATION_POLE)^2 r = 0
     decay, turning_decay = math.exp(-w * t), math.exp(-_ROTATION_POLE * t)
     r, rate = np.empty(3), np.empty(3)
     for k in range(3):
@@ -136,7 +136,7 @@ class LiveHand(Operator):
 
         name: LiveHand
         input_ports:
-        - pose_master: (7,) X_BE
+        - pose_master: (7,) X_BE of the stylus
         - twist_master: (6,) [v; omega] of E in B
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
@@ -217,7 +217,7 @@ class LiveHand(Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the Diagram of the master side with a `LiveHand`, which follows external targets."""
+    """Return the master side with a `LiveHand`; `cross_fade`: with a block `CrossFade`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)

@@ -25,14 +25,14 @@ _GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse
 
 
 class Message(NamedTuple):
-    """Content of a message: name of the device, and its state in the base frame B."""
+    """Content of a message: name of the device, and its state in its base frame B."""
 
     device: str
     state: DeviceState
 
 
 def read_message(text: Any) -> Message | None:
-    """Return the content of a message, or None without a plausible pose."""
+    """Return the content of a message, or None without a plausible device pose."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
@@ -90,9 +90,7 @@ class HaplyDevice:
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
             raise DrakeTeleopError(
-                f"Haply's service does not answer ({error})",
-                where=address,
-                remedy="start the service",
+                f"Haply's service does not answer ({error})", where=address, remedy="start it"
             ) from error
         self._device = ""
 

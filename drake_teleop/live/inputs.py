@@ -38,7 +38,7 @@ MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
 def choice_names() -> dict[str, tuple[str, ...]]:
-    """Return the names of each choice; a choice is the index of its name."""
+    """Return the names that the inputs network, grip, sensor and method index."""
     shipped = {"network": NETWORKS, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSORS}
     return shipped | {"method": tuple(METHODS)}
 
@@ -69,7 +69,7 @@ class Inputs:
         sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
-        network, method, grip, sensor: index into `names()`.
+        network, method, grip, sensor: index into `choice_names()`.
         delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
         object: 1 with a gripped object.
         detection: 1 with contact detection.
@@ -142,7 +142,7 @@ class Inputs:
         return self.station_choices[:2] + self.station_choices[6:]
 
     def intended_pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,) of the stylus; None if released."""
+        """Return the intended pose X_BE (7,) from the `start` (3,); None if released."""
         if not self.held:
             return None
         turn = quaternion_exponential(
@@ -213,7 +213,7 @@ def csv_row(ms: int, inputs: Inputs) -> str:
 
 
 def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """Return the recorded changes with their times [ms]; the last one is the end."""
+    """Return the recorded times [ms] and inputs of each change; the last is the end."""
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _COLUMNS:
@@ -258,9 +258,7 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _repeat_error(
-                    f"has the {name} {line[column]!r}, which is unknown in this version", path
-                )
+                raise _repeat_error(f"has the unknown {name} {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:

@@ -139,7 +139,7 @@ class Live:
         self.pace.restart(now)
 
     def hello(self) -> dict[str, Any]:
-        """Return the scenario's constants, which a new page receives first."""
+        """Return the scenario's constants for a new page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",

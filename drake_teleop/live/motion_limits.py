@@ -1,4 +1,4 @@
-"""Rate inputs of keys and sticks, and motion limits, in simulated time."""
+"""Motion of the hand by keys and sticks, and its limits, in simulated time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
-    """Integrator of input rates (keys, sticks) per simulated second."""
+    """Integrator of rates (of keys, sticks) in simulated time."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
@@ -46,7 +46,7 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Limiter of the target's speed, and for a device also of its acceleration."""
+    """Limiter of the hand's target: its speed, and for a device also its acceleration."""
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _Axis] = {}

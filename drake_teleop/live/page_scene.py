@@ -48,7 +48,7 @@ class PageScene:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
-        """Return poses (4x4 matrices by columns) and sizes of the objects by path."""
+        """Return poses (4x4 matrices by columns) and sizes of the objects by Meshcat path."""
         moves = {} if self.failure else self._scene_changes(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 

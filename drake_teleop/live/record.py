@@ -29,7 +29,7 @@ DEVICE_MARKER_FILE = "device.txt"
 
 
 def versions_and_digest(scenario: Scenario) -> dict[str, str]:
-    """Return the versions, and a digest of the files that the scenario names."""
+    """Return versions of drake_teleop and Drake, and a digest of the scenario's files."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
         value = left.pop()
@@ -73,7 +73,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Write the inputs at a time [ms], if they have changed."""
+        """Write time [ms] and inputs, if these have changed."""
         line = csv_row(ms, inputs)
         if line != self._last:
             self._append(line)
@@ -85,7 +85,7 @@ class Record:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end at a time [ms]; remove the record if no time was simulated."""
+        """Write the end time [ms] and close the files; remove an empty record."""
         if not ms:
             return self._remove()
         self.write(ms, inputs)

@@ -1,4 +1,4 @@
-"""Scenarios of a live session: scenes of the page, and results of the driver's choices."""
+"""Scenarios of a live session: scenes of the page, and changes by the driver's choices."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _object_phi(scenario: Scenario) -> Array:
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the load estimate (16,) of `before`, adapted to load and sensor offsets of `now`."""
+    """Return the load estimate (16,) of `before`, adapted to payload and sensor of `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()

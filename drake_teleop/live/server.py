@@ -274,9 +274,7 @@ class LiveDrive:
     def _raise_when_stopped(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
-                raise DrakeTeleopError(
-                    "the live session ended during the identification of the load"
-                )
+                raise DrakeTeleopError("the live session was stopped")
 
         return progress
 
@@ -388,7 +386,7 @@ def drive(
     the page; elsewhere open its `url`.
 
     Args:
-        scenario: scenario, shipped name, or YAML file; its operator specifies only the grip.
+        scenario: scenario, shipped name, or YAML file; of its operator only the grip is used.
         record: folder for `run --inputs`; None: no record.
         port: TCP port of the page on 127.0.0.1; 0: any free port.
         browser: whether to open the page.
@@ -420,7 +418,7 @@ def drive_command(
 
 
 def start_condition(device: str | None) -> str:
-    """Return as text the event for which the simulation waits."""
+    """Return as text what starts the waiting simulation."""
     return "the simulation waits until this page is open" + _DEVICE_CONDITIONS[device is not None]
 
 

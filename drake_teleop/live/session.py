@@ -64,7 +64,7 @@ _NO_EVENT = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Limit the integrator's steps of error control to at least `shortest` [s]."""
+    """Integrate in steps of `shortest` [s] for 4 ms after a step is rejected."""
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
     shortest = min(shortest, longest)
@@ -92,7 +92,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log with missing signals added."""
+    """Return the log with signals that some stations lack."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -143,7 +143,7 @@ class _Station:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
     def continue_from(self, other: _Station, channel_anew: bool) -> float:
-        """Continue another station's state; return how long the clutch stays open [s]."""
+        """Copy another station's state; return how long the clutch must stay open [s]."""
         excluded = {"channel"} if channel_anew else set()
         if not self.scenario.load_estimator.enabled:
             excluded.add("load_estimator")  # its configured load differs
@@ -297,7 +297,7 @@ class Session:
         return self._station.signal_value("force_to_master")
 
     def removed_force(self) -> float:
-        """Return the force [N] that the limit after a channel change removes."""
+        """Return the force [N] that the force limit after a channel change removes."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block("cross_fade")
@@ -334,8 +334,8 @@ class Drive:
     """Recorded live session.
 
     Attributes:
-        changes: changed inputs with their times [ms]; the last is the end.
-        device: whether a haptic device was the hand.
+        changes: times [ms] and inputs of each change; the last is the end.
+        device: whether a haptic device moved the hand.
     """
 
     scenario: Scenario

@@ -30,7 +30,7 @@ _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy time, states and changeable parameters of the station `before` to `station`."""
+    """Copy time, states, changeable parameters of `before` to `station`, except `excluded`."""
     context.SetTime(then.get_time())
     sources = dict(_blocks_by_path(before))
     for path, block in _blocks_by_path(station):
@@ -128,7 +128,7 @@ class CrossFade(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(self, context: Context, start: float, length: float, rendered: Array) -> None:
-        """Cross-fade from the wrench `rendered` (6,) within `length` [s] from time `start` [s]."""
+        """Cross-fade from the wrench `rendered` (6,), from time `start` [s] for `length` [s]."""
         change = np.concatenate([[start, length], rendered])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0

@@ -37,7 +37,6 @@ class Address:
         return self._parameters.get(name)
 
     def positive_numbers(self, name: str, count: int) -> list[float] | None:
-        """Return a parameter of `count` positive numbers; None if it is absent."""
         text = self._parameters.get(name)
         if text is None:
             return None
@@ -54,7 +53,7 @@ class Address:
         return values
 
     def choose_word(self, name: str, among: tuple[str, ...]) -> str:
-        """Return a parameter among words, by default the first."""
+        """Return a parameter, one of the words `among` (default: the first)."""
         text = self._parameters.get(name, among[0])
         if text not in among:
             raise DrakeTeleopError(
@@ -65,7 +64,7 @@ class Address:
         return text
 
     def wrench_sign(self) -> float:
-        """Factor, 1 or -1, from the source's wrench to that of sensor on load, Eq. (1)."""
+        """Return 1 or -1: factor to the wrench of sensor on load, Eq. (1)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(

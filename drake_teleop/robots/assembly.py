@@ -137,7 +137,7 @@ _PERIOD_SAMPLES = 20  # for the median period of the motion
 
 
 class Parts:
-    """One source of wrenches and motions, made of one or two sources of single samples."""
+    """Source of wrenches and motions, from one or two sources of parts."""
 
     live = True
 
@@ -239,7 +239,7 @@ class MotionWindow:
             self.reset()
 
     def add_part(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Return times [s] and motions [s, omega, alpha, known gravity] that a part completes."""
+        """Add a sample; return new times [s] and motions [s, omega, alpha, gravity if known]."""
         row = self._motion_sample(part)
         if row is None:
             return []
@@ -290,7 +290,7 @@ class MotionWindow:
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
-    """Return the pose (7,), [w x y z, position], of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
+    """Return the pose (7,), [w x y z, position], from x, y, z [m], roll, pitch, yaw [deg]."""
     R = rotation_matrices(np.radians([numbers[3:]]), "euler", "xyz")
     return np.concatenate([quaternions_of(R)[0], numbers[:3]])
 
@@ -354,7 +354,7 @@ class Assembly:
         return [reading for part, now in arrived for reading in self.complete_readings(part, now)]
 
     def complete_readings(self, part: Part, now: float) -> list[Reading]:
-        """Return the readings that a part, received at time `now` [s], completes."""
+        """Add a part received at `now` [s]; return the readings that became complete."""
         if part.stream == WRENCH:
             self._clocks[0].update(part.t, now)
             self._pending.append(part)

@@ -121,7 +121,7 @@ def evaluate_record(
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return half-widths (k,) of both intervals over the tolerances, and degrees of freedom."""
+    """Return half-widths over tolerances (95 %, `CONFIDENCE`), degrees of freedom: (k,) each."""
     load = found.identification
     errors = derivatives_over_tolerances(tolerance, load.phi)
     deviations = deviations_over_tolerances(errors, load.covariance)

@@ -114,7 +114,7 @@ def _find_changes_in_process(rows: Array, dt: float) -> list[Report]:
 
 
 def find_changes(rows: Array, dt: float) -> list[Report]:
-    """Return changes of sensor zero and load; rows (N, 16): time [s], wrench, s, omega, alpha."""
+    """Return changes of sensor zero and load; rows (N, 16): time [s] and `Reading` values."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
     if len(t) * dt < _MIN_RECORD_S:

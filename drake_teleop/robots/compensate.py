@@ -36,7 +36,6 @@ class TareRequestPort:
         self.port = self._socket.getsockname()[1]
 
     def answer_request(self, tare: Callable[[], str]) -> None:
-        """Answer a waiting request, if any."""
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"

@@ -48,8 +48,8 @@ def low_pass_into(x, low_pass, memory):
 def eliminate_into(values, gravity, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
     """Write the contact wrench and scaled wrench of a valid reading to out (12,).
 
-    `values` (15,) is the reading. Row `at` of `rest` (rows, 21) receives it with its unfiltered
-    contact wrench. `gravity` (3,) is used only for different scales of weight and inertia.
+    `values` (15,) is the reading. Row `at` of `rest` (rows, 21), for a tare, receives it and its
+    unfiltered contact wrench. `gravity` (3,) matters if scales of weight and inertia differ.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]

@@ -51,6 +51,7 @@ def open_source(
         real_time: replay a log in real time.
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
+        arm: kinematics, for a source of joint positions.
     """
     kind = _address_kind(address)
     if kind in PART_SOURCES:

@@ -1,4 +1,4 @@
-"""Export of an identified load to the format of a robot, a compensation or a model."""
+"""Export of an identified load to formats of robots, compensations and models."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ExportedLoad:
 
 @dataclass(frozen=True)
 class Format:
-    """Export format.
+    """Format of an exported load.
 
     Args:
         of_sensor: the values are in the sensor's frame.

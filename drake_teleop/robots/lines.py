@@ -1,7 +1,7 @@
 """Readings and wrenches as lines of JSON, and wrenches as tables.
 
-Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output:
-number, t, contact and scaled (6 each), and names of flags.
+Input: t [s], wrench (6), specific force s, omega, alpha (3 each); optionally number and saturated.
+Output: number, t, contact and scaled wrench (6 each), and names of flags.
 """
 
 from __future__ import annotations

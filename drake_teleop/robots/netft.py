@@ -32,7 +32,7 @@ _UNITS = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
 class RdtRecord(NamedTuple):
-    """Record of RDT, with the wrench in counts."""
+    """Record of the RDT protocol, with the wrench in counts."""
 
     rdt_sequence: int
     ft_sequence: int
@@ -142,7 +142,7 @@ def _read_page(address: Address) -> list[float]:
 
 
 def parse_page(content: bytes) -> list[float]:
-    """Return counts per N and per N m, and the rate [Hz], from netftapi2.xml."""
+    """Return counts per N and per N m, and the rate [Hz], of the page netftapi2.xml."""
     from xml.etree import ElementTree
 
     text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}

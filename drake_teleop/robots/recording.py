@@ -44,7 +44,7 @@ _T = TypeVar("_T")
 class SampleRecorder(ABC, Generic[_T]):
     """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
-    If a clock is set, a new record starts; the longest one is written.
+    If the source's clock is set, a new record starts; the longest one is written.
 
     Attributes:
         left_out: number of rejected samples.
@@ -118,7 +118,7 @@ class ReadingRecorder(SampleRecorder[Reading]):
 class PartRecorder(SampleRecorder[tuple[Part, float]]):
     """Recorder of parts: wrenches, and poses or IMU samples.
 
-    `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame.
+    `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame F.
     """
 
     file = "log.yaml"

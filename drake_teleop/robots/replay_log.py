@@ -1,4 +1,4 @@
-"""Source that replays a log, aligned as by `eliminate`."""
+"""Source that replays a log, with motion and wrench aligned as by `eliminate`."""
 
 from __future__ import annotations
 

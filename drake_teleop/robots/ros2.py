@@ -66,7 +66,7 @@ def shared_node(domain: int) -> RosNode:
 
 
 def parse_address(text: str, allowed: tuple[str, ...]) -> Address:
-    """Return the address ros2://TOPIC[?...]; the first name of TOPIC is no host."""
+    """Return the parsed address ros2://TOPIC[?...], which has no host."""
     kind, _, rest = text.partition("://")
     address = Address(f"{kind}:///{rest.lstrip('/')}", None, allowed, host="localhost")
     require_library("rclpy", "rclpy", "ros2", text)

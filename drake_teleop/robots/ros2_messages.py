@@ -1,4 +1,4 @@
-"""Conversion of ROS 2 messages to parts, shared by the sources by rclpy and by zenoh."""
+"""Conversion of ROS 2 messages to parts, for the sources by rclpy and by zenoh."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def topic_of_address(address: Address, text: str) -> str:
 def source_topics(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """Return the topics in an address by name, the frames of `tf`, and the streams."""
+    """Return the topics in an address by stream, the two frames of `tf`, and the streams."""
     topics = {WRENCH: topic_of_address(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
         if (text := address.required_parameter(stream)) is not None:
@@ -88,7 +88,7 @@ class MessageConverter:
         self._links: dict[str, tuple[str, Array]] = {}
 
     def parts_of_message(self, name: str, data: Any, number: int) -> list[Part]:
-        """Return the parts of a message with ROS's fields; `name` is a key of `KINDS`."""
+        """Return the parts of a ROS message; `name` is a key of `MESSAGE_TYPES`."""
         if name == "tf":
             samples = self._transform_pose(data)
         else:

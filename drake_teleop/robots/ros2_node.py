@@ -26,7 +26,7 @@ _CALIBRATE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[
 
 
 class ServedCompensator:
-    """Compensator that the services and parameters of a node replace and change.
+    """Compensator whose load and scales the services and parameters of a node change.
 
     `make` maps a load to a compensator; `calibrate` maps tolerance and seconds to the arguments of
     the command `calibrate`, whose results are written to `out`.

@@ -81,7 +81,7 @@ def liveliness_tokens(
 
 
 def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
-    """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
+    """Return number, time [ns] and sender of a message as bytes (rmw_zenoh since 0.2.4)."""
     return _ATTACHMENT.pack(number, ns, len(sender), sender)
 
 

@@ -18,7 +18,7 @@ VALUES = 15
 
 
 class ReadingFlag(IntFlag):
-    """Reason of a zero wrench, or further information; the bits of the packets."""
+    """Flag of a wrench: reason why it is zero, or information; bits as in the packets."""
 
     SATURATED = 1  #: reported by the sensor, or a channel at its range
     DAMAGED = 2  #: invalid packet

@@ -150,7 +150,7 @@ class PosedSource(_PacketReceiver):
 
 
 class UdpSink:
-    """Sink that sends wrenches to HOST:PORT, with or without a receiver."""
+    """Sink that sends wrenches to udp://HOST:PORT, with or without a receiver."""
 
     def __init__(self, address: str) -> None:
         self._to = host_and_port(address)

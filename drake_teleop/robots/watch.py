@@ -43,7 +43,7 @@ _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def unfiltered_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return a reading's white noise (6,) [N, N m] that explains the residual of `load`."""
+    """Return the white noise of a reading (6,) [N, N m] from the filtered residual of `load`."""
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
@@ -65,7 +65,7 @@ class ContactAndLoadMonitor:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Reset all but the identified load."""
+        """Restart with other sensor offsets (6,)."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = initial_monitor_memory(self._out, self._covariance)
 
@@ -97,9 +97,7 @@ class StreamContactDetector:
         delay: str | float = "auto",
     ) -> None:
         if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
-            raise DrakeTeleopError(
-                "needs a low-pass of the stream", where="--free", remedy="give --cutoff HZ"
-            )
+            raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
         if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
             raise DrakeTeleopError(

@@ -322,15 +322,15 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
         ),
         (
             HEADER + csv_row(0, Inputs()).replace("none", "share"),
-            "the method 'share', which is unknown in this version; it ca",
+            "has the unknown method 'share'; it ca",
         ),
         (
             HEADER + csv_row(0, Inputs()).replace("none", "0"),
-            "the method '0', which is unknown in this version; it cannot be",
+            "has the unknown method '0'; it cannot be",
         ),
         (
             HEADER + csv_row(0, Inputs()).replace("medium", "iron"),
-            "the grip 'iron', which is unknown",
+            "has the unknown grip 'iron'",
         ),
         (
             HEADER.replace("1.2", "1.1"),

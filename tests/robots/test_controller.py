@@ -205,7 +205,7 @@ def test_syntax_that_is_not_supported_is_named(function):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ((), "rate: not given, but required by c99"),
+        ((), "rate: missing, but required by c99"),
         (("--rate", "500", "--sensor-pose", *"000000"), "takes its values in the sensor's frame"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Station and stimulus of an experiment's task under a condition."""
+"""Station and stimulus for a task of an experiment under a condition."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def identified_load_of(scenario: Scenario) -> IdentifiedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task under a condition; `mass` is that of the load at the hand's scale [kg]."""
+    """Station of a task under a condition; `mass`: fully rendered load at the hand [kg]."""
 
     task: Task
     condition: Condition
@@ -50,9 +50,9 @@ class Apparatus:
     mass: float
 
     def stimulus_inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return a stimulus's scales [%]: sigma and sigma_object of the load, gamma of contact.
+        """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
 
-        `level` is a force [N] or mass [kg], `pressed` the expected contact force [N].
+        `level` is the rendered force [N] or mass [kg], `pressed` the expected contact force [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -69,7 +69,7 @@ class Apparatus:
     def interval_result(
         self, shown: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval; `shown` is the intended level, 0 without stimulus."""
+        """Return the result of an interval; `shown`: intended level (0: no stimulus)."""
         force = rows.largest_force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
@@ -114,10 +114,10 @@ def make_apparatus(
 
 
 class IntervalLog:
-    """Measures of an interval, from the log's rows.
+    """Forces and insertion time of an interval, from the log.
 
     Attributes:
-        done_at: time at which the tool was at the slot's floor [s]; 0 before.
+        done_at: time at which the tool reached the slot's floor [s]; 0 before.
     """
 
     def __init__(self, scenario: Scenario, insert: Insert | None) -> None:

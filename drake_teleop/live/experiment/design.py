@@ -1,4 +1,4 @@
-"""Design of an experiment, from its YAML file."""
+"""Tasks and conditions of an experiment, from its YAML file."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,7 +59,7 @@ class _Task:
 @settings
 @dataclass
 class ContactDetection(_Task):
-    """Task to find the interval of two with rendered contact. The tool touches in both."""
+    """Task to name the one of two intervals with rendered contact; both have contact."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -72,7 +72,7 @@ class ContactDetection(_Task):
 @settings
 @dataclass
 class ApparentMass(_Task):
-    """Task to find the interval of two with a heavier tool. It moves back and forth in both."""
+    """Task to name the one of two intervals with a heavier tool; it moves in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest additional mass, also for practice")
@@ -156,9 +156,7 @@ class Experiment:
                 )
             if condition.eta is not None and condition.sigma != 0.0:
                 raise DrakeTeleopError(
-                    f"cannot be combined with sigma = {condition.sigma:g}",
-                    where=f"{place}.eta",
-                    remedy="set sigma: 0",
+                    "cannot be combined with sigma > 0", where=f"{place}.eta", remedy="set sigma: 0"
                 )
             if condition.delay is not None and condition.network != AS_IN_SCENARIO:
                 raise DrakeTeleopError(

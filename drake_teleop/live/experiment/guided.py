@@ -1,4 +1,4 @@
-"""Event handler for an experiment of one participant, in place of `Live`."""
+"""Event handler that replaces `Live` for the experiment of one participant."""
 
 from __future__ import annotations
 
@@ -240,7 +240,7 @@ class GuidedExperiment:
 
 
 def parse_study(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message, or None."""
+    """Return the valid requests of the experiment's page, or None."""
     message = parse_message(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:

@@ -33,11 +33,11 @@ class IntervalResult:
     """Result of an interval.
 
     Attributes:
-        level: level of the stimulus; 0 without one.
-        valid: False without contact.
+        level: measured stimulus [N or kg]; 0 without one.
+        valid: False if contact is missing.
         done: whether the tool reached the floor of the slot.
         time_s: time until the floor.
-        lost_s: simulation time behind the clock.
+        lost_s: delay of the simulation behind real time.
     """
 
     level: float = 0.0
@@ -70,7 +70,7 @@ class Procedure:
 
     Attributes:
         level: intended level of the trial's stimulus [N or kg].
-        prepared_intervals: number of intervals so far.
+        prepared_intervals: number of intervals, also repeated ones.
         said: whether the last answer was right.
         again: whether the trial is repeated because the tool made no contact.
     """
@@ -136,7 +136,7 @@ class Procedure:
             self._next_trial()
 
     def finish_interval(self, result: IntervalResult) -> None:
-        """End the present interval with a result; without contact the trial is repeated."""
+        """End the present interval; repeat the trial if the result has no contact."""
         self._results[self.interval - 1] = result
         if not result.valid:
             self._new_trial()

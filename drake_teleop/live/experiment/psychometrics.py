@@ -32,7 +32,7 @@ def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Arr
 
 
 class Estimate(NamedTuple):
-    """Median of an estimate, with 2.5 % and 97.5 % quantiles."""
+    """Estimate with the limits of its 95 % interval."""
 
     value: float
     low: float
@@ -40,7 +40,7 @@ class Estimate(NamedTuple):
 
 
 class Psi:
-    """Posterior of threshold, slope and lapse on a grid, for levels `low` > 0 to `high`."""
+    """Psi method: posterior of threshold, slope and lapse, for levels `low` > 0 to `high`."""
 
     def __init__(self, low: float, high: float) -> None:
         self.levels = np.geomspace(low, high, _LEVELS)

@@ -1,4 +1,4 @@
-"""Thresholds, d', times and forces of an experiment with 95 % intervals."""
+"""Thresholds, sensitivities, times and forces of an experiment with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DONE_SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
-    """Row of the result table: a quantity with its 95 % interval; participant 0: all."""
+    """Row of the result table: a quantity with its 95 % interval. Participant 0 is the mean."""
 
     task: str
     condition: str

@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """Live session of an experiment with one participant."""
+    """Live session of one participant's experiment, with its server."""
 
     def __init__(
         self,
@@ -90,7 +90,5 @@ def serve_experiment(
             remedy="run the same command again to continue",
         )
     if done < trials:
-        raise KeyboardInterrupt(
-            f"ended by {reason}: {what}; run the same command again to continue"
-        )
+        raise KeyboardInterrupt(f"{reason}: {what}; run the same command again to continue")
     print(f"\nended by {reason}: {what}")

@@ -53,7 +53,7 @@ def make_all_apparatus(
 
 
 def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """Return the scenario with a seed for the present interval."""
+    """Return the scenario with the random seed of the present interval."""
     number = 2 * procedure.trial_number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -67,7 +67,7 @@ def simulate_participant(
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run a participant's remaining trials; `progress` receives the finished and all trials."""
+    """Run the remaining trials; `progress` receives the numbers of finished and all trials."""
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
     while procedure.phase != END:
@@ -92,7 +92,7 @@ def simulate_participant(
 def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """Return the interval, 1 or 2, with the larger response [N] after adding noise."""
+    """Return the interval, 1 or 2, with the larger noisy response [N], or a guess (lapse)."""
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
     noisy = [

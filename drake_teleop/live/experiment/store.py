@@ -1,4 +1,4 @@
-"""Trials on disk: `participants/03.csv`, complete after each trial."""
+"""Trials on disk: one file per participant, such as `participants/03.csv`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TrialRow:
         signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
         correct: 1 if the answer is right, or if the tool reached the floor.
         time_s: time until the answer or the floor.
-        lost_s: simulation time behind the clock.
+        lost_s: delay of the simulation behind real time.
     """
 
     trial: int
@@ -62,7 +62,6 @@ class Store:
         return self.folder / "participants" / f"{participant:02}.csv"
 
     def participants(self) -> list[int]:
-        """Return the numbers of participants with a trial."""
         stems = (path.stem for path in self.folder.glob("participants/*.csv"))
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 

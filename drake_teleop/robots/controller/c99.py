@@ -1,4 +1,4 @@
-"""C99 kernel for an identified load, with a test vector from Python."""
+"""C99 code of the compensation of a load, with a test vector from Python."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def c_header_text() -> str:
 
 
 class Target(NamedTuple):
-    """Load and loop of an export.
+    """Load, rate, low-pass and sensor of an export.
 
     Attributes:
         dt: period of the readings [s].
@@ -90,7 +90,7 @@ class Target(NamedTuple):
     notes: list[str]
 
     def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
-        """Return a C initializer of `wrench_compensator_settings`."""
+        """Return the C initializer of a `wrench_compensator_settings`."""
         loop = self.make_compensator(largest, **scales)
         values = {
             "sigma_weight": 0.0,
@@ -134,7 +134,7 @@ def read_template(name: str) -> str:
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Return a shipped template with its values; nothing is escaped."""
+    """Return a shipped template with inserted values; nothing is escaped."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, str):
@@ -162,7 +162,7 @@ def _test_vector(target: Target) -> str:
 
 
 def _simulated_readings(target: Target) -> tuple[Array, Array]:
-    """Return rows [wrench, s, omega, alpha, gravity] (N, 18) in S and a sensor range (6,)."""
+    """Return rows [wrench, s, omega, alpha, gravity] (N, 18) and a sensor range (6,)."""
     phase = 2.0 * np.pi * np.arange(_VECTOR_READINGS)[:, None] / _VECTOR_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
     alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])

@@ -1,4 +1,4 @@
-"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of the kernel with a load."""
+"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) that compensate a load."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ROS 2 package with the kernel as a filter of wrenches."""
+"""ROS 2 package of a filter that compensates wrenches."""
 
 from __future__ import annotations
 

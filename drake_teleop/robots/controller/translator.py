@@ -46,21 +46,21 @@ _OPERATORS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
 
 
 class _Scalar:
-    """C expression; `array`: of which parameter it is an element; `constant`: no later write."""
+    """C expression of a number, element of parameter `array`; `constant` if never reassigned."""
 
     def __init__(self, text: str, kind: str, array: str = "", constant: bool = False) -> None:
         self.text, self.kind, self.array, self.constant = text, kind, array, constant
 
 
 class _Array:
-    """C pointer to doubles, part of an array parameter; a size may be the name of a parameter."""
+    """C pointer into parameter `array`; a size may be the name of a C parameter."""
 
     def __init__(self, text: str, shape: tuple[int | str, ...], array: str) -> None:
         self.text, self.shape, self.array = text, shape, array
 
 
 class Translator:
-    """C functions, each after the functions that it calls."""
+    """Translator of numba functions to C; called functions come first."""
 
     def __init__(self) -> None:
         self._functions: dict[tuple[Any, ...], _Function] = {}
@@ -72,10 +72,10 @@ class Translator:
     def translate_function(
         self, function: Any, **parameters: str | tuple[int | str, ...]
     ) -> _Function:
-        """Translate a function of `njit`.
+        """Translate a numba function to C.
 
-        `parameters` are, in order, "double", "int" or the shape of an array, which may begin with
-        a name.
+        `parameters` are its types in order: "double", "int" or the shape of an array, whose first
+        size may be a name.
         """
         key = (function, *parameters.items())
         if key not in self._functions:
@@ -98,9 +98,7 @@ class _Function:
         tree, self._globals = _parse_source(function)
         names = [argument.arg for argument in tree.args.args]
         if names != list(parameters):
-            raise TypeError(
-                f"{name}: types are given for {list(parameters)}; give them for {names}"
-            )
+            raise TypeError(f"{name}: the parameters are {names}, not {list(parameters)}")
         self._values: dict[str, Any] = {
             each: _Scalar(each, kind, constant=True)
             if isinstance(kind, str)
@@ -209,9 +207,7 @@ class _Function:
             self._values[target.id] = self._store_in_variables(value)
         elif isinstance(value, (tuple, _Array)):
             if self._indent > 1:
-                raise self._unsupported_error(
-                    target, "no tuple or array is assigned in a branch or loop"
-                )
+                raise self._unsupported_error(target, "a branch or loop assigns only numbers")
             self._values[target.id] = self._store_in_variables(value)
         else:
             if isinstance(self._values.get(target.id), _Scalar) and target.id not in self._locals:
@@ -233,7 +229,7 @@ class _Function:
         )
 
     def _store_in_variables(self, value: Any) -> Any:
-        """Return a value that no later write changes: its expressions are stored in variables."""
+        """Store the value's expressions in new C variables, which no later write changes."""
         if isinstance(value, tuple):
             return tuple(map(self._store_in_variables, value))
         if not isinstance(value, _Scalar) or value.constant:
@@ -295,9 +291,7 @@ class _Function:
         kinds = {_c_type(a), _c_type(b)}
         needed = {"%": {"int"}, "/": {"double"}}.get(sign, kinds)
         if kinds != needed:
-            raise self._unsupported_error(
-                node, f"{sign} of {' and '.join(sorted(kinds))}, not {' and '.join(needed)}"
-            )
+            raise self._unsupported_error(node, f"{sign} is allowed only for {' '.join(needed)}")
         kind = "int" if isinstance(op, ast.cmpop) or kinds == {"int"} else "double"
         return _Scalar(f"({_c_expression(a)} {sign} {_c_expression(b)})", kind)
 
@@ -332,9 +326,7 @@ class _Function:
             return self._translate_c_call(function, values)
         if inspect.isfunction(function):
             return self._expand_call(function, values)
-        raise ValueError(
-            f"{self.name}: a call of {function!r} cannot be translated to C (unknown function)"
-        )
+        raise ValueError(f"{self.name}: a call of {function!r} cannot be translated to C")
 
     def _translate_c_call(self, function: Any, values: list[Any]) -> _Scalar:
         given = dict(zip(inspect.signature(function.py_func).parameters, values, strict=True))
