@@ -35,7 +35,7 @@ from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
-_MAX_AGES = 100_000  # ticks
+_MAX_STORED_DELAYS = 100_000  # ticks
 
 
 class Device(Protocol):
@@ -62,7 +62,7 @@ class DeviceClient:
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
         self.guard = DeviceGuard(device.limits, observe=observe)
-        self.behind: deque[float] = deque(maxlen=_MAX_AGES)
+        self.behind: deque[float] = deque(maxlen=_MAX_STORED_DELAYS)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(host_and_port(address))
@@ -76,7 +76,7 @@ class DeviceClient:
         """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
         pose = self._device.read()
         now = clock()
-        self._receive()
+        self._receive_commands()
         if pose is None:
             self._device.set((0.0,) * 6)
             return None
@@ -88,10 +88,10 @@ class DeviceClient:
         commanded = (0.0,) * 6 if command is None else command.wrench
         wrench = self.guard.limit_wrench(pose.position, commanded, age, period)
         self._device.set(wrench)
-        self._send(pose, now, age)
+        self._send_pose(pose, now, age)
         return wrench
 
-    def _receive(self) -> None:
+    def _receive_commands(self) -> None:
         while True:
             try:
                 packet = self._socket.recv(MAX_PACKET_BYTES + 1)
@@ -105,7 +105,7 @@ class DeviceClient:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send(self, pose: DevicePose, now: float, age: float) -> None:
+    def _send_pose(self, pose: DevicePose, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:

@@ -66,10 +66,10 @@ def unpack_state(packet: bytes) -> DeviceState | None:
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
-    return state_if_plausible(number, t, flags, numbers)
+    return make_plausible_state(number, t, flags, numbers)
 
 
-def state_if_plausible(
+def make_plausible_state(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
     """Return the state, or None if position, orientation or `behind` is implausible."""

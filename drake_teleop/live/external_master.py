@@ -44,7 +44,7 @@ _FADE_S, _RETURN_RATE, _SLEW_RATE = 0.05, 4.0, 150.0
 _HELD, _START_TIME, _START_POSE, _DISPLACEMENT, _ROTATION, _PATH = 0, 1, 2, 9, 12, 15
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT, _ALLOWED, _DISPLAY = 6, 7, 8
-_WRENCH = float(Fault.WRENCH)
+_WRENCH_FAULT = float(Fault.WRENCH)
 
 
 @njit(cache=True)
@@ -66,7 +66,7 @@ def _pose_on_path(path, time, out):
 def _update_displayed_wrench(wrench, held, period, limits, last, now):
     fault = 0.0
     if not all_in_range(wrench):
-        fault = _WRENCH
+        fault = _WRENCH_FAULT
     enabled = held and fault == 0.0
     change = _RETURN_RATE if enabled else -1.0 / _FADE_S
     allowed = min(max(last[_ALLOWED] + period * change, 0.0), 1.0)

@@ -10,7 +10,7 @@ import pytest
 
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, pack_state
-from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.scenarios import with_task_space_device
@@ -103,7 +103,7 @@ def test_rate_ends_one_second_after_its_last_repetition():
         assert inputs.sigma == 0
     assert inputs.x == pytest.approx(1000, abs=6)
     inputs = steering.set_rates({"x": 1e9}, inputs, 0.0)
-    assert steering.advance_inputs(inputs, 5e-3, 0.1).x == RANGES["x"][1]
+    assert steering.advance_inputs(inputs, 5e-3, 0.1).x == INPUT_RANGES["x"][1]
 
 
 def test_a_target_that_is_set_ends_a_rate(scenario, load):

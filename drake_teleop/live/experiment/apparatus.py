@@ -17,7 +17,7 @@ from drake_teleop.live.experiment.design import (
     Task,
 )
 from drake_teleop.live.experiment.procedure import IntervalResult
-from drake_teleop.live.inputs import AS_IN_SCENARIO, RANGES, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO, INPUT_RANGES, Inputs
 from drake_teleop.live.scenarios import adapt_estimate, chosen_scenario, live_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
@@ -27,14 +27,14 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
-_MAX_SCALE = RANGES["gamma"][1]  # %
+_MAX_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].
 _AVERAGING_S, _TOUCH_FORCE_N = 0.02, 0.5
 # The tip is on the floor of the slot within this distance [m] for this time [s].
 _FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
-def identified_load_of(scenario: Scenario) -> IdentifiedLoad | None:
+def load_of_scenario(scenario: Scenario) -> IdentifiedLoad | None:
     """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
@@ -64,7 +64,7 @@ class Apparatus:
         if condition.eta is None:
             sigma = share
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
-        return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
+        return {name: min(round(value), _MAX_SCALE_PERCENT) for name, value in values.items()}
 
     def interval_result(
         self, shown: float, inputs: dict[str, int], rows: IntervalLog
@@ -136,9 +136,9 @@ class IntervalLog:
         self._forces.append(np.linalg.norm(contact[:, :3], axis=1))
         self._rendered.append(rows["force_to_master"][:, :3])
         if self._insert is not None and not self.done_at:
-            self._detect_floor(self._insert, rows)
+            self._detect_slot_floor(self._insert, rows)
 
-    def _detect_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
+    def _detect_slot_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip

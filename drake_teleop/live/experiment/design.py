@@ -24,7 +24,7 @@ from drake_teleop.station.scenario import (
     shipped_file,
 )
 
-_FOLDER = Path(__file__).parent
+_EXPERIMENTS_FOLDER = Path(__file__).parent
 
 
 @settings
@@ -48,7 +48,7 @@ class Condition:
 
 
 @dataclass
-class _Task:
+class _TaskFields:
     scenario: str = plain("touch", "shipped name, or a YAML file with a path relative to this file")
     trials: int = quantity(40, "1", 1, 1000, "number of trials of each condition")
     practice: int = quantity(
@@ -58,7 +58,7 @@ class _Task:
 
 @settings
 @dataclass
-class ContactDetection(_Task):
+class ContactDetection(_TaskFields):
     """Task to name the one of two intervals with rendered contact; both have contact."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
@@ -71,7 +71,7 @@ class ContactDetection(_Task):
 
 @settings
 @dataclass
-class ApparentMass(_Task):
+class ApparentMass(_TaskFields):
     """Task to name the one of two intervals with a heavier tool; it moves in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
@@ -81,7 +81,7 @@ class ApparentMass(_Task):
 
 @settings
 @dataclass
-class PegInSlot(_Task):
+class PegInSlot(_TaskFields):
     """Insertion of the tool into a slot, with completion time and largest contact force."""
 
     scenario: str = plain("insert", "as for other tasks, with an operator's task !Insert")
@@ -168,7 +168,7 @@ class Experiment:
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios."""
-    path = shipped_file("experiment", path, _FOLDER)
+    path = shipped_file("experiment", path, _EXPERIMENTS_FOLDER)
     experiment = settings_from_data(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))
     return experiment, [

@@ -10,7 +10,7 @@ import numpy as np
 from drake_teleop.live.experiment.apparatus import (
     Apparatus,
     IntervalLog,
-    identified_load_of,
+    load_of_scenario,
     make_apparatus,
 )
 from drake_teleop.live.experiment.design import (
@@ -38,7 +38,7 @@ from drake_teleop.station.task_measures import contact_force, task_measures
 
 # Start of the hand's motion [s].
 _MOTION_START_S = 0.4
-_ROWS_PERIOD_MS = 200
+_LOG_READ_PERIOD_MS = 200
 
 
 def make_all_apparatus(
@@ -46,7 +46,7 @@ def make_all_apparatus(
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = identified_load_of(scenario)
+        load = load_of_scenario(scenario)
         for c, condition in enumerate(experiment.conditions):
             stations[t, c] = make_apparatus(task, condition, scenario, load)
     return stations
@@ -120,7 +120,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
         hand = {name: value / LENGTH_UNIT_M for name, value in displacement.items()}
         session.apply_inputs(session.inputs.with_changes(stimulus | hand))
         session.advance(SLICE_MS)
-        if session.ms % _ROWS_PERIOD_MS == 0:
+        if session.ms % _LOG_READ_PERIOD_MS == 0:
             rows.add(session.new_rows())
     rows.add(session.new_rows())
     session.close()
