@@ -125,7 +125,7 @@ def ros_wrenches(path: Path) -> None:
     while content:
         for name, size in _SIZES.items():
             message, content = content[:size], content[size:]
-            parts += _MESSAGES.parts(name, message[:-_SENT], message[-_SENT:])
+            parts += _MESSAGES.parts_of_cdr(name, message[:-_SENT], message[-_SENT:])
     _checked(Assembly(PartStreams(_Told(WRENCH, POSE))), iter(parts))
 
 

@@ -47,7 +47,7 @@ class Device(Protocol):
     def read(self) -> DevicePose | None:
         """Return the next pose; None if none is received for 0.5 s."""
 
-    def set(self, wrench: Sequence[float]) -> None:
+    def set_wrench(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
 
     def close(self) -> None:
@@ -78,7 +78,7 @@ class DeviceClient:
         now = clock()
         self._receive_commands()
         if pose is None:
-            self._device.set((0.0,) * 6)
+            self._device.set_wrench((0.0,) * 6)
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
@@ -87,7 +87,7 @@ class DeviceClient:
         self._last_tick = now
         commanded = (0.0,) * 6 if command is None else command.wrench
         wrench = self.guard.limit_wrench(pose.position, commanded, age, period)
-        self._device.set(wrench)
+        self._device.set_wrench(wrench)
         self._send_pose(pose, now, age)
         return wrench
 
@@ -145,7 +145,7 @@ class RealTimeVirtualDevice:
         self._simulated_until = now
         return DevicePose(self.virtual.position)
 
-    def set(self, wrench: Sequence[float]) -> None:
+    def set_wrench(self, wrench: Sequence[float]) -> None:
         self._wrench = wrench
 
     def close(self) -> None: ...

@@ -112,12 +112,12 @@ class HaplyDevice:
         self._device = message.device
         return DevicePose(message.state.position, message.state.orientation, message.state.flags)
 
-    def set(self, wrench: Sequence[float]) -> None:
+    def set_wrench(self, wrench: Sequence[float]) -> None:
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):  # `read` reports it
             self._socket.send(make_force_message(self._device, wrench) if self._device else "{}")
 
     def close(self) -> None:
-        self.set((0.0,) * 6)
+        self.set_wrench((0.0,) * 6)
         self._open.close()

@@ -128,7 +128,7 @@ class Live:
 
     def _restart_session(self, now: float) -> None:
         self.stopped = ""
-        self._stop_on_failure(self.end)
+        self._stop_on_failure(self.end_session)
         failure = self.stopped
         self._stop_on_failure(lambda: self._start_session(now))
         self._refusal = failure
@@ -209,7 +209,7 @@ class Live:
     def is_idle(self) -> bool:
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
-    def wait(self, now: float) -> float:
+    def time_to_next_tick(self, now: float) -> float:
         frame = self._frame_due - now
         return max(0.0, frame if self.is_idle else min(frame, self.pace.time_to_next_slice(now)))
 
@@ -318,7 +318,7 @@ class Live:
             return "stopped"
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
-    def end(self) -> None:
+    def end_session(self) -> None:
         try:
             self._session.close()
         except DrakeTeleopError as error:
@@ -329,7 +329,7 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        self._stop_on_failure(self.end)
+        self._stop_on_failure(self.end_session)
         if self._link is not None:
             self._link.close()
         if self._write_error:

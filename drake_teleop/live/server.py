@@ -236,10 +236,10 @@ class LiveDrive:
                 await self._sleep_until_tick()
 
     async def _sleep_until_tick(self) -> None:
-        rest = self._live.wait(time.perf_counter()) - 1e-3
+        rest = self._live.time_to_next_tick(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
-        time.sleep(self._live.wait(time.perf_counter()))
+        time.sleep(self._live.time_to_next_tick(time.perf_counter()))
         for _ in range(_LOOP_ITERATIONS):
             await asyncio.sleep(0)
 

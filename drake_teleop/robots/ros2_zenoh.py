@@ -110,10 +110,10 @@ class CdrConverter(MessageConverter):
         self._types, self._damaged = message_types(), SerdeError
         self._counts = dict.fromkeys(MESSAGE_TYPES, 0)
         for name in MESSAGE_TYPES:  # creates the deserializers before the first message
-            self.parts(name, b"", b"")
+            self.parts_of_cdr(name, b"", b"")
         self._counts = dict.fromkeys(MESSAGE_TYPES, 0)
 
-    def parts(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
+    def parts_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
         self._counts[name] += 1
         number = message_number(attachment)
         if number is None:
@@ -147,9 +147,9 @@ class ZenohSource:
     def read(self, timeout_s: float) -> list[Part] | None:
         found: list[Part] = []
         try:
-            found += self.messages.parts(*self._queue.get(timeout=timeout_s))
+            found += self.messages.parts_of_cdr(*self._queue.get(timeout=timeout_s))
             while len(found) < _MAX_QUEUED_MESSAGES:
-                found += self.messages.parts(*self._queue.get_nowait())
+                found += self.messages.parts_of_cdr(*self._queue.get_nowait())
         except queue.Empty:
             pass
         return found

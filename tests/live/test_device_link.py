@@ -279,11 +279,11 @@ class RestingDevice:
     def read(self):
         return DevicePose((0.0, 0.0, 0.0))
 
-    def set(self, wrench):
+    def set_wrench(self, wrench):
         self.was_set.append(wrench)
 
     def close(self):
-        self.set((0.0,) * 6)
+        self.set_wrench((0.0,) * 6)
 
 
 def test_client_displays_the_stations_force_and_none_after_silence(link):
@@ -321,7 +321,7 @@ def test_inverse3_answers_every_message_of_its_service():
         places = []
         for k in range(3):
             places.append(device.read())
-            device.set((float(k), 0.0, 0.0, 0.0, 0.0, 0.0))
+            device.set_wrench((float(k), 0.0, 0.0, 0.0, 0.0, 0.0))
         with pytest.raises(DrakeTeleopError, match="has closed the connection"):
             device.read()
         device.close()

@@ -84,7 +84,7 @@ def test_keys_move_the_hand_equally_per_simulated_second(scenario, load, slow, r
     live.join(1, now)
     live.handle_message(1, json.dumps({"slow": slow, "rates": rates}), now)
     while live.ms < 300:
-        now += max(live.wait(now), 1e-3)
+        now += max(live.time_to_next_tick(now), 1e-3)
         live.tick(lambda now=now: now)
         live.handle_message(1, json.dumps({"rates": rates}), now)
     live.handle_message(1, json.dumps({"rates": {}}), now)
@@ -137,7 +137,7 @@ def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow,
         live.handle_message(1, json.dumps({"set": {"x": target, "z": 0.5 * target}}), now)
         frame = live.tick(lambda now=now: now)
         rendered += [frame["f"][2][1]] if frame and "f" in frame else []
-        now += max(live.wait(now), 1e-3)
+        now += max(live.time_to_next_tick(now), 1e-3)
     assert len(rendered) > 20 and max(rendered) < 0.5
 
 

@@ -93,11 +93,11 @@ def test_pose_equals_drake(model: Path) -> None:
 def test_joint_order_is_arbitrary_and_gripper_joints_are_ignored() -> None:
     messages = CdrConverter(1.0, joints=NAMES)
     sent = joint_state(5_250_000_000, [*NAMES[::-1], "finger"], [4.0, 3.0, 2.0, 1.0, 9.0])
-    (part,) = messages.parts(JOINTS, sent, b"")
+    (part,) = messages.parts_of_cdr(JOINTS, sent, b"")
     assert part.stream == JOINTS and part.t == 5.25
     np.testing.assert_array_equal(part.values, [1.0, 2.0, 3.0, 4.0])
-    assert messages.parts(JOINTS, joint_state(0, ["finger"], [9.0]), b"") == []
-    assert messages.parts(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
+    assert messages.parts_of_cdr(JOINTS, joint_state(0, ["finger"], [9.0]), b"") == []
+    assert messages.parts_of_cdr(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
 
 
 class Joints(StreamStub):

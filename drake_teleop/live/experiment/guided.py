@@ -125,7 +125,7 @@ class GuidedExperiment:
     def _prepare_if_changed(self, now: float) -> None:
         with self._catch_write_error():
             if self._procedure.prepared_intervals != self._prepared:
-                self._live.end()
+                self._live.end_session()
                 self._prepare_interval(now)
 
     @contextmanager
@@ -161,9 +161,11 @@ class GuidedExperiment:
         if procedure.phase == INTERVAL:
             self._live.pace.restart(now)
 
-    def wait(self, now: float) -> float:
+    def time_to_next_tick(self, now: float) -> float:
         return (
-            self._live.wait(now) if self._is_interval_running else max(0.0, self._frame_due - now)
+            self._live.time_to_next_tick(now)
+            if self._is_interval_running
+            else max(0.0, self._frame_due - now)
         )
 
     @property
