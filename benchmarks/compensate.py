@@ -29,7 +29,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensate import compensate_stream
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Compensated, Reading
-from drake_teleop.robots.udp import READING, UdpSink, UdpSource, pack_reading
+from drake_teleop.robots.udp import READING_FORMAT, UdpSink, UdpSource, pack_reading
 
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
 RATES = (1000.0, 8000.0)
@@ -139,7 +139,9 @@ def main() -> None:
     for name, value in figures.items():
         print(f"{name:40} {value:g}")
     if options.json is not None:
-        options.json.write_text(json.dumps({"bytes": READING.size, **figures}, indent=2) + "\n")
+        options.json.write_text(
+            json.dumps({"bytes": READING_FORMAT.size, **figures}, indent=2) + "\n"
+        )
 
 
 if __name__ == "__main__":

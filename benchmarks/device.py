@@ -228,7 +228,7 @@ def driven(seconds: float) -> dict[str, float]:
             if live.pace.time_to_next_slice(clock()) <= 0:
                 late.append(-live.pace.time_to_next_slice(clock()))
             live.tick(clock)
-            time.sleep(live.wait(clock()))
+            time.sleep(live.time_to_next_tick(clock()))
         figures = link.link_statistics(clock())
         device.wait()
         found = json.loads(told.read_text())

@@ -13,13 +13,13 @@ import numpy as np
 
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.assembly import Assembly, Parts
+from drake_teleop.robots.assembly import Assembly, PartStreams
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.netft import RECORD, NetFtSource
-from drake_teleop.robots.ros2_messages import KINDS
+from drake_teleop.robots.netft import RECORD_FORMAT, NetFtSource
+from drake_teleop.robots.ros2_messages import MESSAGE_TYPES
 from drake_teleop.robots.ros2_zenoh import CdrConverter, make_attachment, message_types
 from drake_teleop.robots.rtde import parts_of_sample
-from drake_teleop.robots.rtde_reader import SAMPLE
+from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
 from drake_teleop.robots.streams import IMU, JOINTS, NONZERO_FLAGS, POSE, WRENCH, Part, Reading
 
 LOAD = Identification(
@@ -36,19 +36,19 @@ _SENT, _FRAMES = 33, ("base", "tool0")
 def records(_: Path) -> list[bytes]:
     """Of RDT."""
     counts = [round(1000 * x) for x in _WRENCH]
-    return [b"".join(RECORD.pack(k, 7 * k, 0, *counts) for k in range(COUNT))]
+    return [b"".join(RECORD_FORMAT.pack(k, 7 * k, 0, *counts) for k in range(COUNT))]
 
 
 def samples(_: Path) -> list[bytes]:
     """Of RTDE."""
     pose, gravity = (0.4, 0.1, 0.3, 0.1, 0.2, 0.3), (0.0, 0.0, 9.81)
     rows = [(100.0 + DT * k, *_WRENCH, *pose, *gravity) for k in range(COUNT)]
-    return [b"".join(SAMPLE.pack(*row) for row in rows)]
+    return [b"".join(SAMPLE_FORMAT.pack(*row) for row in rows)]
 
 
 def messages(_: Path) -> list[bytes]:
     """Of ROS 2, each with its attachment."""
-    return [b"".join(_message(name, k) for k in range(COUNT // 2) for name in KINDS)]
+    return [b"".join(_message(name, k) for k in range(COUNT // 2) for name in MESSAGE_TYPES)]
 
 
 def _message(name: str, k: int) -> bytes:
@@ -69,8 +69,10 @@ def _message(name: str, k: int) -> bytes:
         link = kinds["TransformStamped"](header, "tool0", motion)
         message = kinds["TFMessage"]([link])
     else:
-        message = store.types[KINDS[name]](header, *data[name]())
-    return bytes(store.serialize_cdr(message, KINDS[name])) + make_attachment(k, ns, b"x" * 16)
+        message = store.types[MESSAGE_TYPES[name]](header, *data[name]())
+    return bytes(store.serialize_cdr(message, MESSAGE_TYPES[name])) + make_attachment(
+        k, ns, b"x" * 16
+    )
 
 
 class _Told:
@@ -92,22 +94,28 @@ def netft_wrenches(path: Path) -> None:
     still = np.array([0.0, 0.0, 9.81, 0.0, 0.0, 0.0])
 
     def parts() -> Iterator[Part]:
-        for k, packet in enumerate(_pieces(path.read_bytes(), RECORD.size)):
+        for k, packet in enumerate(_pieces(path.read_bytes(), RECORD_FORMAT.size)):
             yield Part(IMU, k, DT * k, still)
             yield source.part_of_packet(packet, DT * k)
 
-    _checked(Assembly(Parts(_Told(WRENCH), _Told(IMU))), parts())
+    _checked(Assembly(PartStreams(_Told(WRENCH), _Told(IMU))), parts())
     source._socket.close()
 
 
 def rtde_wrenches(path: Path) -> None:
     """Samples of RTDE."""
-    whole = [each for each in _pieces(path.read_bytes(), SAMPLE.size) if len(each) == SAMPLE.size]
-    parts = (part for each in whole for part in parts_of_sample(SAMPLE.unpack(each), DT, -1.0))
-    _checked(Assembly(Parts(_Told(WRENCH, POSE))), parts)
+    whole = [
+        each
+        for each in _pieces(path.read_bytes(), SAMPLE_FORMAT.size)
+        if len(each) == SAMPLE_FORMAT.size
+    ]
+    parts = (
+        part for each in whole for part in parts_of_sample(SAMPLE_FORMAT.unpack(each), DT, -1.0)
+    )
+    _checked(Assembly(PartStreams(_Told(WRENCH, POSE))), parts)
 
 
-_SIZES = {name: len(_message(name, 0)) for name in KINDS}
+_SIZES = {name: len(_message(name, 0)) for name in MESSAGE_TYPES}
 _MESSAGES = CdrConverter(-1.0, _FRAMES, _JOINTS)
 
 
@@ -117,8 +125,8 @@ def ros_wrenches(path: Path) -> None:
     while content:
         for name, size in _SIZES.items():
             message, content = content[:size], content[size:]
-            parts += _MESSAGES.parts(name, message[:-_SENT], message[-_SENT:])
-    _checked(Assembly(Parts(_Told(WRENCH, POSE))), iter(parts))
+            parts += _MESSAGES.parts_of_cdr(name, message[:-_SENT], message[-_SENT:])
+    _checked(Assembly(PartStreams(_Told(WRENCH, POSE))), iter(parts))
 
 
 def _pieces(content: bytes, size: int) -> list[bytes]:

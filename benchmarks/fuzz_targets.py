@@ -35,7 +35,7 @@ from drake_teleop.common.parquet_sizes import check_parquet_content
 from drake_teleop.common.texts import parse_yaml, read_json
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
-from drake_teleop.live.inputs import RANGES, Inputs, csv_header, range_of, read_inputs
+from drake_teleop.live.inputs import INPUT_RANGES, Inputs, csv_header, input_range, read_inputs
 from drake_teleop.live.inputs import csv_row as inputs_row
 from drake_teleop.live.live import MAX_SLOWDOWN, parse_message
 from drake_teleop.load.identification import Identification
@@ -48,7 +48,7 @@ from drake_teleop.logs.read.bags import list_topics, read_topic
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.robots import udp
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.lines import read_line
+from drake_teleop.robots.lines import parse_reading
 from drake_teleop.robots.streams import NONZERO_FLAGS, Reading
 from drake_teleop.station.channel import network
 from drake_teleop.station.passivity.packet import PACKET_SIZE
@@ -514,8 +514,8 @@ def _message(path: Path) -> None:
     said = [parse_message(text) for text in (content, content.decode(errors="replace"))]
     for found in filter(None, said):
         inputs = Inputs().with_changes(found.get("set", {}))
-        for name in RANGES:
-            value, (low, high) = getattr(inputs, name), range_of(name)
+        for name in INPUT_RANGES:
+            value, (low, high) = getattr(inputs, name), input_range(name)
             if not (isinstance(value, int) and low <= value <= high):
                 raise AssertionError(f"{name} = {value!r}")
         pose = inputs.with_changes({"held": 1}).intended_pose(np.zeros(3))
@@ -557,7 +557,7 @@ def _wrenches(path: Path) -> None:
         parts = [content[k : k + size] for k in range(0, len(content), size)]
         readings = [udp.unpack_reading(part) for part in parts]
     else:
-        readings = [read_line(line, k) for k, line in enumerate(content.split(b"\n"))]
+        readings = [parse_reading(line, k) for k, line in enumerate(content.split(b"\n"))]
     compensator = Compensator(robots.LOAD, 1e-3, gamma=2.0, largest=np.full(6, 50.0))
     for k, reading in enumerate(readings):
         out = compensator.step(reading, 1e-3 * k)

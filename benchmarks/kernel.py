@@ -28,7 +28,7 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.compensation_step import clip, eliminate_into, value_problem
+from drake_teleop.robots.compensation_step import clip_wrenches, eliminate_into, value_problem
 from drake_teleop.robots.controller.c99 import CFLAGS, Target, kernel_files
 from drake_teleop.robots.streams import Reading
 
@@ -137,7 +137,7 @@ def python_loop(rows, largest, limits, offsets, phi, nothing, scales, low_pass, 
         if value_problem(rows[k, :15], largest, limits) == 0:
             parts = rows[k, :15], rows[k, 15:]
             eliminate_into(*parts, offsets, phi, nothing, scales, low_pass, memory, rest, 0, out)
-            clip(out, limits)
+            clip_wrenches(out, limits)
 
 
 def python_ns(rows: Array) -> float:

@@ -56,7 +56,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
     live.join(1, clock())
     for _ in range(200):  # what is compiled and loaded at the first call
         live.tick(clock)
-        time.sleep(live.wait(clock()))
+        time.sleep(live.time_to_next_tick(clock()))
     late, bytes_sent, touched, frames = [], 0, 0, 0
     start, cpu, lost = clock(), time.process_time(), live.pace.given_up
     next_message = start
@@ -71,7 +71,7 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         if frame is not None:
             bytes_sent += len(json.dumps({"frame": frame}))
             touched, frames = touched + frame["contact"], frames + 1
-        time.sleep(live.wait(clock()))
+        time.sleep(live.time_to_next_tick(clock()))
     elapsed, cpu = clock() - start, time.process_time() - cpu
     p50, p95, p99, most = 1e3 * np.percentile(late, [50, 95, 99, 100])
     lost = live.pace.given_up - lost

@@ -184,7 +184,7 @@ def free_motion(seconds: float) -> dict[str, float]:
         frame = live.tick(clock)
         if frame is not None and clock.now > 2.0:
             seen.append([frame["f"][1][1], frame["f"][0][1]])
-        clock.now += max(live.wait(clock.now), 1e-4)
+        clock.now += max(live.time_to_next_tick(clock.now), 1e-4)
     forces = np.array(seen)
     return {
         "free_s": seconds,

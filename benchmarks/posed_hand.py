@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.assembly import Parts
+from drake_teleop.robots.assembly import PartStreams
 from drake_teleop.robots.recording import PartRecorder
 from drake_teleop.robots.streams import POSE, WRENCH, Part
 
@@ -118,5 +118,5 @@ def posed(rng: np.random.Generator, phi: Array, seconds: float) -> tuple[Played,
     for k, row in enumerate(poses):
         stamp = taken[k] + late + clock
         parts.append((Part(POSE, k, stamp, row), taken[k] + late + ways[1, k]))
-    told = Parts(Told(WRENCH), Told(POSE)) if two else Parts(Told(WRENCH, POSE))
+    told = PartStreams(Told(WRENCH), Told(POSE)) if two else PartStreams(Told(WRENCH, POSE))
     return Played(parts), PartRecorder(told, None, X_FS)

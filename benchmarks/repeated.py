@@ -23,7 +23,7 @@ import numpy as np
 
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.inputs import NETWORKS, RANGES, SLICE_MS, Inputs
+from drake_teleop.live.inputs import INPUT_RANGES, NETWORKS, SLICE_MS, Inputs
 from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.session import Drive, Session, read_drive
 from drake_teleop.station.passivity.methods import METHODS
@@ -31,7 +31,7 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 
 #: Choices, and from which share of the drive on they hold.
-CHOICES = (
+STATION_INPUTS = (
     (0.10, {"object": 1}),
     (0.20, {"detection": 1}),
     (0.25, {"detection": 0}),
@@ -59,7 +59,7 @@ def wanted(now: Inputs, ms: int, end: int) -> Inputs:
     values |= {"sigma": round(50 + 50 * sway), "sigma_object": round(50 + 50 * other)}
     values |= {"gamma": round(100 + 40 * other), "force_scale": round(5714 + 2000 * sway)}
     values |= {"clutch": not 0.1633 < share < 0.17, "held": not 0.34 < share < 0.35}
-    for begins, choices in CHOICES:
+    for begins, choices in STATION_INPUTS:
         if share >= begins:
             values |= choices
     return now.with_changes(values)
@@ -108,9 +108,11 @@ def main() -> None:
         folder, again = Path(name) / "drive", Path(name) / "again"
         driven(options.seconds, folder)
         drive, log = read_drive(folder), SimulationResult.read_parquet(folder / "log.parquet")
-        columns = np.array([[getattr(i, name) for name in RANGES] for _, i in drive.changes])
-        moved = [name for name, column in zip(RANGES, columns.T, strict=True) if np.ptp(column)]
-        figures["inputs_changed"], figures["inputs"] = len(moved), len(RANGES)
+        columns = np.array([[getattr(i, name) for name in INPUT_RANGES] for _, i in drive.changes])
+        moved = [
+            name for name, column in zip(INPUT_RANGES, columns.T, strict=True) if np.ptp(column)
+        ]
+        figures["inputs_changed"], figures["inputs"] = len(moved), len(INPUT_RANGES)
         figures["changes"] = len(drive.changes) - 1
         figures["numbers"] = sum(log[name].size for name in log)
         force = np.abs(log["true_contact_wrench_W"][:, 2])

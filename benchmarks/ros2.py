@@ -39,7 +39,7 @@ from drake_teleop.load.tolerance import (
     required_values,
     tolerances_in_units,
 )
-from drake_teleop.robots.calibration import half_widths
+from drake_teleop.robots.calibration import interval_half_widths
 
 Array = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ class Tables:
     def judged(self, found: Identification) -> NDArray[np.bool_]:
         """(3, k) which numbers are inside the intervals of 95 and 99.98 %, and the tolerance."""
         tolerance = read_tolerance(UNTIL)
-        half, wide, _ = half_widths(SimpleNamespace(identification=found), tolerance)  # type: ignore[arg-type]
+        half, wide, _ = interval_half_widths(SimpleNamespace(identification=found), tolerance)  # type: ignore[arg-type]
         error = np.abs(required_values(tolerance, found.phi) - required_values(tolerance, self.phi))
         error /= tolerances_in_units(tolerance, self.phi)
         return np.array([error <= half, error <= wide, error <= 1.0])

@@ -150,7 +150,7 @@ def test_a_live_session_records_the_registered_name(folder):
     path.write_text(csv_header() + csv_row(0, inputs) + csv_row(10, inputs))
     assert ",share," in path.read_text() and read_inputs(path)[0][1] == inputs
     METHODS.remove("share")
-    with pytest.raises(DrakeTeleopError, match="has an unknown method, 'share'"):
+    with pytest.raises(DrakeTeleopError, match="has the unknown method 'share'"):
         read_inputs(path)
 
 
@@ -167,7 +167,9 @@ def test_export_source_and_sink_by_their_registered_names(folder):
     assert open_sink("serial://tty0") is sink
     assert open_source("serial://tty0", None, rate_hz=500.0) == (source, 0.002)
     SINKS.remove("serial")
-    with pytest.raises(DrakeTeleopError, match=r"serial://tty0: is not a sink; give .*udp://"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"serial://tty0: is not the address of a sink; give .*udp://"
+    ):
         open_sink("serial://tty0")
 
 

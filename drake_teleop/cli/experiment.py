@@ -9,7 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
 from drake_teleop.live.experiment.procedure import plan_trials
 from drake_teleop.live.experiment.results import write_results
-from drake_teleop.live.experiment.store import MAX_PARTICIPANT, Store, open_results
+from drake_teleop.live.experiment.store import MAX_PARTICIPANT, Store, open_trial_store
 from drake_teleop.station.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def experiment_command(
     `simulated` is the total number of simulated participants, 0 for people.
     """
     experiment, scenarios = LoadExperiment(study)
-    with open_results(out, experiment) as store:
+    with open_trial_store(out, experiment) as store:
         try:
             if simulated:
                 _simulate_participants(experiment, scenarios, store, simulated)
@@ -48,7 +48,7 @@ def next_participant(store: Store, trials: int, wanted: int | None = None) -> in
     """Return a participant's number: the requested, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
-    known = store.participants()
+    known = store.participant_numbers()
     for number in known:
         if len(store.read_rows(number)) < trials:
             return number

@@ -151,9 +151,9 @@ def drive(
     """
     options["browser"] = not no_browser
     if study is None:
-        from drake_teleop.live.server import drive_command
+        from drake_teleop.live.server import run_drive_command
 
-        drive_command(scenario, record=record, **options)
+        run_drive_command(scenario, record=record, **options)
         return
     from drake_teleop.cli.experiment import experiment_command
 
@@ -400,9 +400,9 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     delay of the motion behind the wrench; auto starts with the value in the load file.
     The command ends with the source or with Ctrl-C.
     """
-    from drake_teleop.robots.compensate import compensate_command
+    from drake_teleop.robots.compensate import run_compensate_command
 
-    compensate_command(source, load, sink, **options)
+    run_compensate_command(source, load, sink, **options)
 
 
 @cli.command()
@@ -425,7 +425,7 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
     tare, load and calibrate, and the parameters sigma, gamma, sigma_weight, sigma_inertia, load,
     until and seconds. Flags are on /diagnostics. Calibrations are written to --out.
     """
-    from drake_teleop.robots.ros2_node import ros2_command
+    from drake_teleop.robots.ros2_node import run_ros2_command
 
     def calibrate(until: str, seconds: float) -> list[str]:
         words = ["calibrate", source, "--until", until, "--seconds", str(seconds), "--quiet"]
@@ -442,7 +442,7 @@ def ros2(ctx: click.Context, source: str, load: Path, sink: str, out: Path, **op
             x for path in ctx.params["package_paths"] for x in ("--package-path", str(path))
         ]
 
-    ros2_command(source, load, sink, out, calibrate=calibrate, **options)
+    run_ros2_command(source, load, sink, out, calibrate=calibrate, **options)
 
 
 @cli.command()

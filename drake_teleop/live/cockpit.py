@@ -1,4 +1,4 @@
-"""Forces, energy, contact and warnings for the browser page."""
+"""Forces, energy, contact and warnings that the browser page displays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 #: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
 CONTACT_FORCE_N = 2.0
-_LIMIT_SHARE = 0.999
+_AT_LIMIT_FRACTION = 0.999
 _HAND_FORCE_LIMIT_N = 59.0  # N; the limit of a hand is 60 N
 _PACKET_TIMEOUT_S = 0.05  # s
 
@@ -65,14 +65,14 @@ def _integrate_work(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Calculator of the page's values from the log's rows."""
+    """Calculator of the page's values from rows of the log."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints
         self._limits = (
-            ("speed", "slave_state", slice(n, None), _LIMIT_SHARE * arm.velocity_limit),
-            ("torque", "joint_torque", slice(None), _LIMIT_SHARE * arm.effort_limit),
+            ("speed", "slave_state", slice(n, None), _AT_LIMIT_FRACTION * arm.velocity_limit),
+            ("torque", "joint_torque", slice(None), _AT_LIMIT_FRACTION * arm.effort_limit),
         )
         self._peak = scenario.master.device(0.0, 0.0).peak_force
         self._energy = np.zeros(2)
@@ -80,7 +80,7 @@ class Cockpit:
         self._forces = np.zeros((3, 2))
 
     def page_values(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
-        """Return the page's values for at least one new row, finite and ready for JSON."""
+        """Return the page's values for the new rows (at least one), as finite numbers for JSON."""
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)
         measured, contact, rendered = self._forces
@@ -103,13 +103,13 @@ class Cockpit:
             "f": [_round_finite(pair, 4) for pair in self._forces],
             "contact": bool(in_contact),
             "energy": _round_finite(self._energy, 5),
-            "words": list(dict.fromkeys(self._warnings(rows, inputs, zeros))),
+            "words": list(dict.fromkeys(self._find_warnings(rows, inputs, zeros))),
             "t": round(float(self._last_row[0]), 3),
             "tool": _round_finite(self._last_row[1:], 5),
             "stylus": _round_finite(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
+    def _find_warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -118,7 +118,7 @@ class Cockpit:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _LIMIT_SHARE * self._peak:
+        if self._forces[2, 1] >= _AT_LIMIT_FRACTION * self._peak:
             yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
         smallest_and_largest_norm_into(rows["hand_wrench_E"], zeros, hand)
@@ -131,7 +131,7 @@ class Cockpit:
                 yield f"joint {', '.join(joints)} at the limit of its {quantity}"
         if "ports" in rows and rows["ports"][:, 4:6].max() > _PACKET_TIMEOUT_S:
             yield "the network delivers no packets"
-        if any(abs(getattr(inputs, name)) == RANGES[name][1] for name in ("x", "y", "z")):
+        if any(abs(getattr(inputs, name)) == INPUT_RANGES[name][1] for name in ("x", "y", "z")):
             yield "the hand is at the edge of its box, 0.3 m wide"
 
 

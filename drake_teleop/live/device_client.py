@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import socket
 import sys
 import time
@@ -34,7 +35,7 @@ from drake_teleop.robots.udp import host_and_port
 from drake_teleop.station.operator.operator import GRIP_IMPEDANCES
 
 _PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
-_MAX_AGES = 100_000  # ticks
+_MAX_STORED_DELAYS = 100_000  # ticks
 
 
 class Device(Protocol):
@@ -46,22 +47,22 @@ class Device(Protocol):
     def read(self) -> DevicePose | None:
         """Return the next pose; None if none is received for 0.5 s."""
 
-    def set(self, wrench: Sequence[float]) -> None:
+    def set_wrench(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the device's base frame B [N, N m]."""
 
     def close(self) -> None:
-        """Disconnect the device with zero force."""
+        """Set zero force and disconnect the device."""
 
 
 class DeviceClient:
-    """Connection of a haptic device and a station.
+    """Connection of a haptic device to a station.
 
-    `behind` is the delay [s] between each device position and the force that answers it.
+    `behind` contains the delays [s] from each device position to the force that answers it.
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
         self.guard = DeviceGuard(device.limits, observe=observe)
-        self.behind: deque[float] = deque(maxlen=_MAX_AGES)
+        self.behind: deque[float] = deque(maxlen=_MAX_STORED_DELAYS)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(host_and_port(address))
@@ -72,12 +73,12 @@ class DeviceClient:
     def exchange_once(
         self, clock: Callable[[], float] = time.perf_counter
     ) -> tuple[float, ...] | None:
-        """Exchange pose and force once; return the displayed wrench, or None without a pose."""
+        """Send the pose, display the newest wrench (6,) and return it; None without a pose."""
         pose = self._device.read()
         now = clock()
-        self._receive()
+        self._receive_commands()
         if pose is None:
-            self._device.set((0.0,) * 6)
+            self._device.set_wrench((0.0,) * 6)
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
@@ -86,11 +87,11 @@ class DeviceClient:
         self._last_tick = now
         commanded = (0.0,) * 6 if command is None else command.wrench
         wrench = self.guard.limit_wrench(pose.position, commanded, age, period)
-        self._device.set(wrench)
-        self._send(pose, now, age)
+        self._device.set_wrench(wrench)
+        self._send_pose(pose, now, age)
         return wrench
 
-    def _receive(self) -> None:
+    def _receive_commands(self) -> None:
         while True:
             try:
                 packet = self._socket.recv(MAX_PACKET_BYTES + 1)
@@ -104,7 +105,7 @@ class DeviceClient:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send(self, pose: DevicePose, now: float, age: float) -> None:
+    def _send_pose(self, pose: DevicePose, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
@@ -144,34 +145,35 @@ class RealTimeVirtualDevice:
         self._simulated_until = now
         return DevicePose(self.virtual.position)
 
-    def set(self, wrench: Sequence[float]) -> None:
+    def set_wrench(self, wrench: Sequence[float]) -> None:
         self._wrench = wrench
 
     def close(self) -> None: ...
 
 
 def open_device(address: str, grip: str, depth: float) -> Device:
-    """Return the device at an address: `virtual` or haply://HOST:PORT."""
+    """Return the device at `virtual` (tapping `depth` [m] deep) or haply://HOST:PORT."""
     if address == "virtual":
         return RealTimeVirtualDevice(VirtualDevice(tapping_motion(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
     raise DrakeTeleopError(
-        "is not a device", where=address, remedy="use virtual or haply://HOST:PORT"
+        "is not the address of a haptic device",
+        where=address,
+        remedy="use virtual or haply://HOST:PORT",
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("device", help="virtual, or haply://HOST:PORT")
-    parser.add_argument("station", help="udp://127.0.0.1:PORT")
-    parser.add_argument(
-        "--grip", choices=tuple(GRIP_IMPEDANCES), default="medium", help="of the virtual hand"
-    )
-    parser.add_argument("--depth", type=float, default=0.08, help="stroke of that hand [m]")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="duration")
-    parser.add_argument("--no-observer", action="store_true", help="no passivity observer")
-    parser.add_argument("--json", type=Path, help="output file of the figures")
+    add = parser.add_argument
+    add("device", help="haptic device: virtual, or haply://HOST:PORT")
+    add("station", help="station: udp://127.0.0.1:PORT of `drake-teleop drive`")
+    add("--grip", choices=[*GRIP_IMPEDANCES], default="medium", help="grip on the virtual device")
+    add("--depth", type=float, default=0.08, help="tapping depth of the virtual device [m]")
+    add("--seconds", type=float, default=math.inf, help="duration [s] (default: no limit)")
+    add("--no-observer", action="store_true", help="disable the passivity observer")
+    add("--json", type=Path, help="JSON file for the force delays, largest force and energy")
     options = parser.parse_args(arguments)
     device = open_device(options.device, options.grip, options.depth)
     client = DeviceClient(device, options.station, observe=not options.no_observer)

@@ -18,7 +18,7 @@ from drake_teleop.common.numeric import Array
 
 COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
 _FADE_START_S = 0.02  # s
-_FORCE_RETURN_N_S = 100.0  # N/s
+_FORCE_RISE_N_S = 100.0  # N/s
 _MAX_ENERGY_J, _RESERVE_J = 0.3, 3e-5  # J
 _MAX_DAMPING_NS_M = 100.0  # N s/m
 
@@ -51,7 +51,7 @@ class DeviceGuard:
     def limit_wrench(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
     ) -> tuple[float, ...]:
-        """Return the wrench to display (6,) [N, N m]; `age` is the age of the command [s]."""
+        """Return the displayed wrench (6,); `age` of the command, `period` between calls [s]."""
         x = np.array(position, dtype=float)
         motion = np.zeros(3) if self._position is None else x - self._position
         work = -float(self._force @ motion)
@@ -62,7 +62,7 @@ class DeviceGuard:
         next_motion = period * (2.0 * velocity - self._velocity)
         self._position, self._velocity = x, velocity
 
-        share = self._fading_share(age, period)
+        share = self._timeout_fraction(age, period)
         force, torque = _finite_or_zero(wrench[:3]), _finite_or_zero(wrench[3:])
         limits = self._limits
         force = _limit_norm(share * force, min(limits.force, self._force_limit))
@@ -72,23 +72,23 @@ class DeviceGuard:
         if share == 0.0:  # the timeout overrides the slew limit
             force, torque = np.zeros((2, 3))
         elif self._observe:
-            force = _limit_norm(self._limit_energy(force, next_motion), limits.force)
+            force = _limit_norm(self._limit_returned_energy(force, next_motion), limits.force)
         self._force, self._torque = force, torque
         return tuple(np.concatenate([force, torque]).tolist())
 
-    def _fading_share(self, age: float, period: float) -> float:
+    def _timeout_fraction(self, age: float, period: float) -> float:
         if not age < COMMAND_TIMEOUT_S:
             self._was_silent = True
         elif self._was_silent:
             self._was_silent, self._force_limit = False, 0.0
-        self._force_limit = min(self._force_limit + _FORCE_RETURN_N_S * period, self._limits.force)
+        self._force_limit = min(self._force_limit + _FORCE_RISE_N_S * period, self._limits.force)
         return (
             min(max((COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FADE_START_S), 0.0), 1.0)
             if age < COMMAND_TIMEOUT_S
             else 0.0
         )
 
-    def _limit_energy(self, force: Array, next_motion: Array) -> Array:
+    def _limit_returned_energy(self, force: Array, next_motion: Array) -> Array:
         distance, available = math.hypot(*next_motion), self._stored_energy - _RESERVE_J
         returned = float(force @ next_motion)
         if returned <= available or distance < 1e-12 or not force.any():

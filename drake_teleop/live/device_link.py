@@ -34,7 +34,7 @@ _CLIENT_TIMEOUT_S = 2.0  # s
 _MAX_PACKETS = 256  # packets per poll
 _STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_CLUTCH_OPEN_S = 0.05
+_CLUTCH_OPEN_TIME_S = 0.05
 
 
 class DeviceLink:
@@ -127,12 +127,12 @@ class DeviceLink:
         for k, name in enumerate("xyz"):
             values[name] = (state.position[k] - first.position[k]) / LENGTH_UNIT_M
             values["r" + name] = turn[k] / ANGLE_UNIT_RAD
-        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_S:
+        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_TIME_S:
             values["clutch"] = 0
         return values
 
     def link_statistics(self, now: float) -> dict[str, float]:
-        """Return packet rate [Hz], lost packets and lateness [ms]."""
+        """Return packet rate [Hz], lost packets, lateness and delays [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (
@@ -150,11 +150,11 @@ class DeviceLink:
 
     def status_text(self) -> str:
         if not self.refused:
-            return self._lateness_text()
+            return self._delay_text()
         reason = f"the last one {self.refusal}"
-        return f"{self._lateness_text()}. Refused packets: {self.refused}; {reason}"
+        return f"{self._delay_text()}. Refused packets: {self.refused}; {reason}"
 
-    def _lateness_text(self) -> str:
+    def _delay_text(self) -> str:
         now = self._polled_at
         if self.is_silent(now):
             what = "The device is silent: no force" if self._peer else "No device yet"
@@ -191,7 +191,7 @@ class DeviceConnection:
         kind = address.partition("://")[0]
         if kind not in ("udp", "haply"):
             raise DrakeTeleopError(
-                "is not a haptic device address",
+                "is not the address of a haptic device",
                 where=address,
                 remedy="use udp://127.0.0.1:PORT or haply://localhost:10001",
             )

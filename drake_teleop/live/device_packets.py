@@ -1,7 +1,8 @@
 """Packets between a haptic device and the station: little-endian, in the device's base frame B.
 
 From the device: "DTD1", flags, number, time [s], position (3) [m], orientation (4) [w, x, y, z],
-behind [s]. To the device: "DTF1", 0, number and time of the answered packet, wrench (6) [N, N m].
+delay of the force [s]. To the device: "DTF1", 0, number and time of the answered packet, wrench (6)
+[N, N m].
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class DeviceState(NamedTuple):
         position: p_BE [m].
         orientation: R_BE, unit quaternion.
         flags: 0 or `CLUTCH_OPEN`.
-        behind: age of the position that the force answers [s]; 0 without a force.
+        behind: age of the position that the displayed force answers [s]; 0 without a force.
     """
 
     number: int
@@ -65,13 +66,13 @@ def unpack_state(packet: bytes) -> DeviceState | None:
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
-    return state_if_plausible(number, t, flags, numbers)
+    return make_plausible_state(number, t, flags, numbers)
 
 
-def state_if_plausible(
+def make_plausible_state(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
-    """Return the device state, or None if a value is implausible."""
+    """Return the state, or None if position, orientation or `behind` is implausible."""
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.

@@ -1,4 +1,4 @@
-"""Master side of a real haptic device."""
+"""Master side of a station with a real haptic device."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _FADE_S, _RETURN_RATE, _SLEW_RATE = 0.05, 4.0, 150.0
 _HELD, _START_TIME, _START_POSE, _DISPLACEMENT, _ROTATION, _PATH = 0, 1, 2, 9, 12, 15
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT, _ALLOWED, _DISPLAY = 6, 7, 8
-_WRENCH = float(Fault.WRENCH)
+_WRENCH_FAULT = float(Fault.WRENCH)
 
 
 @njit(cache=True)
@@ -66,7 +66,7 @@ def _pose_on_path(path, time, out):
 def _update_displayed_wrench(wrench, held, period, limits, last, now):
     fault = 0.0
     if not all_in_range(wrench):
-        fault = _WRENCH
+        fault = _WRENCH_FAULT
     enabled = held and fault == 0.0
     change = _RETURN_RATE if enabled else -1.0 / _FADE_S
     allowed = min(max(last[_ALLOWED] + period * change, 0.0), 1.0)
@@ -100,8 +100,8 @@ class ExternalMaster(LeafSystem):
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - master_state: (12,) position [m], yaw, pitch, roll [rad]; zero speeds
         - force_to_master: (6,) wrench for the device [N, N m]
-        - fault_at_hand: a `Fault`
-        - displayed_and_fault: the last two side by side
+        - fault_at_hand: number of a `Fault`; 0: none
+        - displayed_and_fault: (7,) force_to_master and fault_at_hand
         - hand_wrench_E: (6,) minus the displayed wrench
     """
 
@@ -140,7 +140,7 @@ class ExternalMaster(LeafSystem):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Do nothing: a real hand has no setting."""
+        """Do nothing: a real hand keeps its impedance."""
 
     def _current_pose_and_twist(self, context: Context) -> Array:
         _pose_on_path(

@@ -46,25 +46,25 @@ Array = NDArray[np.float64]
 # for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
 # half the distance in 46 ms. After a change of the grip the path is slower.
 _TRANSLATION_POLE = 2 * math.pi * 16.0
-_SLOW_POLE = _ROTATION_POLE = 2 * math.pi * 5.0
+_GRIP_CHANGE_POLE = _ROTATION_POLE = 2 * math.pi * 5.0
 #: Lead time of a target at constant speed that compensates the lag of the hand [s]. At start and
 #: stop the error is at most the distance of 5 ms.
 LEAD_TIME_S = 2.5 / _TRANSLATION_POLE
 # Path: held flag, start time [s], poles [rad/s], target X_BE (7,); at the start, relative to the
 # target: position, velocity, acceleration (3,) each, rotation vector in B and its rate (3,) each.
 _HELD, _START_TIME, _POLES, _TARGET, _OFFSET, _ROTATION, _PATH = 0, 1, 2, 3, 10, 19, 25
-_INTENTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
+_INTENDED_MOTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
 
 
 @njit(cache=True)
-def _intention_into(path, time, pose, out):
-    """Write X_BE (7,), twist (6,), acceleration (3,): (d/dt + w)^3 x = 0, (d/dt + w)^2 r = 0."""
+def _intended_motion_into(path, time, pose, out):
+    """Write intended X_BE (7,), twist (6,), acceleration (3,) of a smooth path to the target."""
     if path[_HELD] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
         return
     t = time - path[_START_TIME]
-    w = path[_POLES]
+    w = path[_POLES]  # (d/dt + w)^3 x = 0, and (d/dt + _ROTATION_POLE)^2 r = 0
     decay, turning_decay = math.exp(-w * t), math.exp(-_ROTATION_POLE * t)
     r, rate = np.empty(3), np.empty(3)
     for k in range(3):
@@ -122,8 +122,8 @@ def _start_path_into(path, time, now, target, poles):
 
 
 @njit(cache=True, borrows=True)
-def _wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
-    _intention_into(path, time, pose, intention)
+def _live_hand_wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
+    _intended_motion_into(path, time, pose, intention)
     for k in range(3):
         intention[4 + k] += mass / impedance[0] * intention[13 + k]
     hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
@@ -136,7 +136,7 @@ class LiveHand(Operator):
 
         name: LiveHand
         input_ports:
-        - pose_master: (7,) X_BE
+        - pose_master: (7,) X_BE of the stylus
         - twist_master: (6,) [v; omega] of E in B
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
@@ -147,7 +147,7 @@ class LiveHand(Operator):
 
     def __init__(self, config: OperatorConfig, start: Array) -> None:
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
-        self._scratch, self._mass = np.empty(_INTENTION_SIZE), config.hand.mass
+        self._scratch, self._mass = np.empty(_INTENDED_MOTION_SIZE), config.hand.mass
 
     def _declare_intended_motion(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH)
@@ -162,7 +162,7 @@ class LiveHand(Operator):
             _start_path_into(
                 path,
                 context.get_time(),
-                self._current_intention(context),
+                self._current_motion(context),
                 target,
                 _TRANSLATION_POLE,
             )
@@ -174,7 +174,7 @@ class LiveHand(Operator):
         if path[_HELD] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
-        intention = self._current_intention(context)
+        intention = self._current_motion(context)
         rotation = np.array(
             quaternion_logarithm(
                 quaternion_product(tuple(intention[:4]), conjugate_quaternion(tuple(pose[:4])))
@@ -191,17 +191,17 @@ class LiveHand(Operator):
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
         _start_path_into(
-            path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _SLOW_POLE
+            path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _GRIP_CHANGE_POLE
         )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def _current_intention(self, context: Context) -> Array:
+    def _current_motion(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
-        _intention_into(path, context.get_time(), self._pose.Eval(context), self._scratch)
+        _intended_motion_into(path, context.get_time(), self._pose.Eval(context), self._scratch)
         return self._scratch
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        _wrench_into(
+        _live_hand_wrench_into(
             context.get_numeric_parameter(self._path).value(),
             context.get_time(),
             self._impedance,
@@ -213,11 +213,11 @@ class LiveHand(Operator):
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._current_intention(context)[:7])
+        output.SetFromVector(self._current_motion(context)[:7])
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the Diagram of the master side with a `LiveHand`, which follows external targets."""
+    """Return the master side with a `LiveHand`; `cross_fade`: with a block `CrossFade`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)

@@ -17,43 +17,43 @@ from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
     DevicePose,
     DeviceState,
-    state_if_plausible,
+    make_plausible_state,
 )
 
 _MAX_MESSAGE_BYTES, _TIMEOUT_S = 65536, 0.5  # bytes of a message, s
-_GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
+_GRIP_KEYS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
 
 
 class Message(NamedTuple):
-    """Content of a message: name of the device, and its state in the base frame B."""
+    """Content of a message: name of the device, and its state in its base frame B."""
 
     device: str
     state: DeviceState
 
 
 def read_message(text: Any) -> Message | None:
-    """Return the content of a message, or None without a plausible pose."""
+    """Return the content of a message, or None without a plausible device pose."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
         content = json.loads(text)
         cursor = content["inverse3"][0]
         place, name = cursor["state"]["cursor_position"], cursor["device_id"]
-        x, y, z = (_number(place[axis]) for axis in "xyz")
-        grip: Any = next((content[kind][0]["state"] for kind in _GRIPS if content.get(kind)), {})
+        x, y, z = (_check_number(place[axis]) for axis in "xyz")
+        grip: Any = next((content[key][0]["state"] for key in _GRIP_KEYS if content.get(key)), {})
         turn = grip.get("orientation") or {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
-        w, i, j, k = (_number(turn[axis]) for axis in "wxyz")
+        w, i, j, k = (_check_number(turn[axis]) for axis in "wxyz")
         pressed = (grip.get("buttons") or {}).get("a") is True
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
         return None
     if not isinstance(name, str):
         return None
     flags = CLUTCH_OPEN if pressed else 0
-    state = state_if_plausible(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
+    state = make_plausible_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
     return None if state is None else Message(name, state)
 
 
-def force_message(device: str, wrench: Sequence[float]) -> str:
+def make_force_message(device: str, wrench: Sequence[float]) -> str:
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(
@@ -61,7 +61,7 @@ def force_message(device: str, wrench: Sequence[float]) -> str:
     )
 
 
-def _number(value: Any) -> float:
+def _check_number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
         raise ValueError(value)
     return float(value)
@@ -90,7 +90,7 @@ class HaplyDevice:
             self._socket = self._open.enter_context(opened)
         except (OSError, TimeoutError, ValueError) as error:
             raise DrakeTeleopError(
-                f"does not answer ({error})", where=address, remedy="start Haply's service"
+                f"Haply's service does not answer ({error})", where=address, remedy="start it"
             ) from error
         self._device = ""
 
@@ -103,21 +103,21 @@ class HaplyDevice:
             return None
         except ConnectionClosed as error:
             raise DrakeTeleopError(
-                "the service has closed the connection",
+                "Haply's service has closed the connection",
                 where="haply",
-                remedy="restart the Haply service",
+                remedy="restart the service",
             ) from error
         if message is None:
             return None
         self._device = message.device
         return DevicePose(message.state.position, message.state.orientation, message.state.flags)
 
-    def set(self, wrench: Sequence[float]) -> None:
+    def set_wrench(self, wrench: Sequence[float]) -> None:
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):  # `read` reports it
-            self._socket.send(force_message(self._device, wrench) if self._device else "{}")
+            self._socket.send(make_force_message(self._device, wrench) if self._device else "{}")
 
     def close(self) -> None:
-        self.set((0.0,) * 6)
+        self.set_wrench((0.0,) * 6)
         self._open.close()

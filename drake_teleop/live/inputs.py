@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 AS_IN_SCENARIO = "as in the scenario"
 NETWORKS = (AS_IN_SCENARIO, *NETWORK_PRESETS, "custom")
-SENSORS = (AS_IN_SCENARIO, *SENSOR_PRESETS)
+SENSOR_NAMES = (AS_IN_SCENARIO, *SENSOR_PRESETS)
 
 #: Name of the file with the inputs of a recorded drive.
 INPUTS_FILE = "inputs.csv"
@@ -38,8 +38,8 @@ MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
 def choice_names() -> dict[str, tuple[str, ...]]:
-    """Return the names of each choice; a choice is the index of its name."""
-    shipped = {"network": NETWORKS, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSORS}
+    """Return the names that the inputs network, grip, sensor and method index."""
+    shipped = {"network": NETWORKS, "grip": tuple(GRIP_IMPEDANCES), "sensor": SENSOR_NAMES}
     return shipped | {"method": tuple(METHODS)}
 
 
@@ -69,7 +69,7 @@ class Inputs:
         sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
         force_scale: scale from slave to master force [1e-5].
-        network, method, grip, sensor: index into `names()`.
+        network, method, grip, sensor: index into `choice_names()`.
         delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
         object: 1 with a gripped object.
         detection: 1 with contact detection.
@@ -118,8 +118,8 @@ class Inputs:
     def with_changes(self, values: Mapping[str, Any]) -> Inputs:
         """Return the inputs with new values, clipped to their range; invalid ones are ignored."""
         changes = {}
-        for name in values.keys() & RANGES.keys():
-            value, (low, high) = values[name], range_of(name)
+        for name in values.keys() & INPUT_RANGES.keys():
+            value, (low, high) = values[name], input_range(name)
             if isinstance(value, (int, float)) and abs(value) < 1e15:
                 changes[name] = round(min(max(value, low), high))
         return dataclasses.replace(self, **changes) if changes else self
@@ -142,7 +142,7 @@ class Inputs:
         return self.station_choices[:2] + self.station_choices[6:]
 
     def intended_pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,) of the stylus; None if released."""
+        """Return the intended pose X_BE (7,) from the `start` (3,); None if released."""
         if not self.held:
             return None
         turn = quaternion_exponential(
@@ -168,20 +168,20 @@ class Inputs:
         }
 
 
-_CHOICE_RANGES = {
+_STATION_INPUT_RANGES = {
     "network": (0, len(NETWORKS) - 1),
     "delay": (0, 20_000),
     "jitter": (0, 100),
     "loss": (0, 500),
-    "method": (0, 0),  # see `range_of`
+    "method": (0, 0),  # see `input_range`
     "grip": (0, len(GRIP_IMPEDANCES) - 1),
     **dict.fromkeys(("object", "detection"), (0, 1)),
-    "sensor": (0, len(SENSORS) - 1),
+    "sensor": (0, len(SENSOR_NAMES) - 1),
 }
 #: Inputs whose change requires another station.
-CHOICES = frozenset(_CHOICE_RANGES)
+STATION_INPUTS = frozenset(_STATION_INPUT_RANGES)
 #: Range of each input. The end stops of the device are outside the hand's 0.3 m wide box.
-RANGES = {
+INPUT_RANGES = {
     **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
     **dict.fromkeys(("rx", "ry", "rz"), (-10_000, 10_000)),
     **dict.fromkeys(("held", "clutch"), (0, 1)),
@@ -189,40 +189,40 @@ RANGES = {
     "sigma_weight": (-1, 300),
     **dict.fromkeys(("sigma_object", "gamma"), (0, 300)),
     "force_scale": (0, 100_000),
-    **_CHOICE_RANGES,
+    **_STATION_INPUT_RANGES,
 }
-_COLUMNS = ("ms", *RANGES)
+_CSV_COLUMNS = ("ms", *INPUT_RANGES)
 
 
-def range_of(name: str) -> tuple[int, int]:
-    return (0, len(METHODS) - 1) if name == "method" else RANGES[name]
+def input_range(name: str) -> tuple[int, int]:
+    return (0, len(METHODS) - 1) if name == "method" else INPUT_RANGES[name]
 
 
-_VERSION = {"drake_teleop": __version__}
+_VERSIONS = {"drake_teleop": __version__}
 
 
-def csv_header(made_by: Mapping[str, str] = _VERSION) -> str:
+def csv_header(made_by: Mapping[str, str] = _VERSIONS) -> str:
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
-    return f"# {comment}\n{','.join(_COLUMNS)}\n"
+    return f"# {comment}\n{','.join(_CSV_COLUMNS)}\n"
 
 
 def csv_row(ms: int, inputs: Inputs) -> str:
-    values = {name: getattr(inputs, name) for name in RANGES}
+    values = {name: getattr(inputs, name) for name in INPUT_RANGES}
     values |= {name: words[values[name]] for name, words in choice_names().items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
-def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """Return the recorded changes with their times [ms]; the last one is the end."""
+def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSIONS) -> list[tuple[int, Inputs]]:
+    """Return the recorded times [ms] and inputs of each change; the last is the end."""
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
-    if tuple(lines[0]) == _COLUMNS:
-        raise _repeat_error("has choices as numbers and no version of this package", path)
-    if tuple(lines[1:2]) != (list(_COLUMNS),) or not complete.startswith("# "):
+    if tuple(lines[0]) == _CSV_COLUMNS:
+        raise _no_repeat_error("does not contain the version of drake_teleop that wrote it", path)
+    if tuple(lines[1:2]) != (list(_CSV_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
-            "is not a record of a drive",
+            "does not contain the inputs of a recorded live session",
             where=str(path),
-            remedy=f"use the columns {', '.join(_COLUMNS)}",
+            remedy=f"use the columns {', '.join(_CSV_COLUMNS)}",
         )
     recorded_with = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
@@ -230,16 +230,16 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             found = recorded_with.get(name, "unknown")
             what = f"was recorded with {name} {found}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
-            raise _repeat_error(changed if name == "files" else what, path)
+            raise _no_repeat_error(changed if name == "files" else what, path)
     changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         raise DrakeTeleopError(
-            "has a duration of 0 s", where=str(path), remedy="record the drive again"
+            "has a duration of 0 s", where=str(path), remedy="record the session again"
         )
     return changes
 
 
-def _repeat_error(what: str, path: Path) -> DrakeTeleopError:
+def _no_repeat_error(what: str, path: Path) -> DrakeTeleopError:
     remedy = f"it cannot be repeated exactly; for its log: drake-teleop replay {path.parent}"
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
@@ -248,34 +248,34 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
     earlier, choices = -1, choice_names()
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
-        if len(line) != len(_COLUMNS):
+        if len(line) != len(_CSV_COLUMNS):
             raise DrakeTeleopError(
-                f"has {len(line)} values, must have {len(_COLUMNS)}",
+                f"has {len(line)} values, must have {len(_CSV_COLUMNS)}, one for each column",
                 where=where,
                 remedy="use the file as recorded",
             )
-        for column, name in enumerate(_COLUMNS):
+        for column, name in enumerate(_CSV_COLUMNS):
             if line[column] in choices.get(name, ()):
                 line[column] = str(choices[name].index(line[column]))
             elif name in choices:
-                raise _repeat_error(f"has an unknown {name}, {line[column]!r}", path)
+                raise _no_repeat_error(f"has the unknown {name} {line[column]!r}", path)
         try:
             ms, *values = map(int, line)
         except ValueError:
             raise DrakeTeleopError(
-                "has a value that is not a whole number",
+                "has a value that is not a whole number (all inputs are integers)",
                 where=where,
                 remedy="use the file as recorded",
             ) from None
         if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
             raise DrakeTeleopError(
-                f"{ms} ms is not a valid time",
+                f"{ms} ms is not a valid time (first 0, never decreasing, at most 10 hours)",
                 where=where,
-                remedy="use increasing times in whole milliseconds from 0",
+                remedy="use the file as recorded",
             )
-        earlier, inputs = ms, dict(zip(RANGES, values, strict=True))
-        for name in RANGES:
-            low, high = range_of(name)
+        earlier, inputs = ms, dict(zip(INPUT_RANGES, values, strict=True))
+        for name in INPUT_RANGES:
+            low, high = input_range(name)
             if not low <= inputs[name] <= high:
                 raise DrakeTeleopError(
                     f"{name} = {inputs[name]} is outside {low} to {high}",

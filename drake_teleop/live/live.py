@@ -19,13 +19,13 @@ from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import POSE_PERIOD_MS
 from drake_teleop.live.inputs import (
-    CHOICES,
+    INPUT_RANGES,
     MAX_DURATION_MS,
-    RANGES,
     SLICE_MS,
+    STATION_INPUTS,
     Inputs,
     choice_names,
-    range_of,
+    input_range,
 )
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
@@ -33,7 +33,7 @@ from drake_teleop.live.scenarios import SCENES
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
 
-ShowScene = Callable[[dict[str, np.ndarray]], dict[str, Any]]
+SceneFunction = Callable[[dict[str, np.ndarray]], dict[str, Any]]
 """Function from rows of a log to the 3D scene's part of a frame."""
 
 #: Period of the frames for the page [s].
@@ -45,7 +45,7 @@ TOUCH_FORCE_N = 0.12
 # of messages.
 _SLEEP_AFTER_S, _SLICES_PER_TICK = 0.25, 4
 _MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
-_RELEASE_STYLUS = {"held": 0, "clutch": 0}
+_RELEASED_INPUTS = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _FAILURE_EXCEPTIONS = (DrakeTeleopError, RuntimeError, SystemExit)
 
@@ -75,7 +75,7 @@ class Live:
         scenario: Scenario,
         load: IdentifiedLoad | None,
         record: Path | None,
-        show: ShowScene,
+        show: SceneFunction,
         now: float,
         link: DeviceLink | None = None,
         *,
@@ -119,16 +119,16 @@ class Live:
         self.pace.restart(now)
 
     def change_scene(
-        self, scenario: Scenario, load: IdentifiedLoad | None, show: ShowScene, now: float
+        self, scenario: Scenario, load: IdentifiedLoad | None, show: SceneFunction, now: float
     ) -> None:
         """Complete the record and start a new session with the requested scene."""
         self._scenario, self._load, self._scene_part = scenario, load, show
         self.scene, self.requested_scene = self.requested_scene, ""
-        self._restart(now)
+        self._restart_session(now)
 
-    def _restart(self, now: float) -> None:
+    def _restart_session(self, now: float) -> None:
         self.stopped = ""
-        self._stop_on_failure(self.end)
+        self._stop_on_failure(self.end_session)
         failure = self.stopped
         self._stop_on_failure(lambda: self._start_session(now))
         self._refusal = failure
@@ -139,11 +139,11 @@ class Live:
         self.pace.restart(now)
 
     def hello(self) -> dict[str, Any]:
-        """Return the scenario's constants, which a new page receives first."""
+        """Return the scenario's constants for a new page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
-            "ranges": {name: range_of(name) for name in RANGES},
+            "ranges": {name: input_range(name) for name in INPUT_RANGES},
             "names": choice_names(),
             "object": self._scenario.force_scaling.gripper_phi is not None,
             "touch": TOUCH_FORCE_N,
@@ -163,10 +163,8 @@ class Live:
         """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
-            self._requested, self._rates = (
-                self._requested.with_changes(_RELEASE_STYLUS),
-                RateInputs(),
-            )
+            self._requested = self._requested.with_changes(_RELEASED_INPUTS)
+            self._rates = RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
         message = parse_message(text)
@@ -178,7 +176,7 @@ class Live:
         if client != self._driver:
             return
         if "set" in message:
-            if not CHOICES.isdisjoint(message["set"]):
+            if not STATION_INPUTS.isdisjoint(message["set"]):
                 self._refusal = ""
             self._requested = self._requested.with_changes(message["set"])
             self._rates = RateInputs()
@@ -193,7 +191,7 @@ class Live:
         if "scene" in message and not self.requested_scene:
             self.requested_scene = message["scene"]
         if "reset" in message:
-            self._restart(now)
+            self._restart_session(now)
 
     def _set_driver(self, client: int, now: float) -> None:
         self._driver = client
@@ -211,7 +209,7 @@ class Live:
     def is_idle(self) -> bool:
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
-    def wait(self, now: float) -> float:
+    def time_to_next_tick(self, now: float) -> float:
         frame = self._frame_due - now
         return max(0.0, frame if self.is_idle else min(frame, self.pace.time_to_next_slice(now)))
 
@@ -264,7 +262,7 @@ class Live:
                 self.stopped = to_one_line(str(error))
             else:  # there is no such station: keep the present one
                 self._refusal = to_one_line(str(error))
-                removed = {name: getattr(present, name) for name in CHOICES}
+                removed = {name: getattr(present, name) for name in STATION_INPUTS}
                 self._requested = self._requested.with_changes(removed)
         if not self.stopped:
             self._stop_on_failure(lambda: self._session.advance(self._slice_ms))
@@ -304,23 +302,23 @@ class Live:
             "factor": round(self.pace.real_time_factor * self.pace.slow, 3),
             "late": round(1e3 * self.pace.lateness(), 1),
             "lost": round(self.pace.given_up, 2),
-            "state": self._state(),
+            "state": self._state_name(),
             "driver": self._driver,
             "drive": self._drives,
             "scene": self.requested_scene or self.scene,
             "record": self._folder,
             "stopped": self.stopped,
-            "inputs": {name: getattr(inputs, name) for name in RANGES},
+            "inputs": {name: getattr(inputs, name) for name in INPUT_RANGES},
         }
 
-    def _state(self) -> str:
+    def _state_name(self) -> str:
         if self.requested_scene:
             return "preparing"
         if self.stopped:
             return "stopped"
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
-    def end(self) -> None:
+    def end_session(self) -> None:
         try:
             self._session.close()
         except DrakeTeleopError as error:
@@ -331,7 +329,7 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        self._stop_on_failure(self.end)
+        self._stop_on_failure(self.end_session)
         if self._link is not None:
             self._link.close()
         if self._write_error:
@@ -360,10 +358,10 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     for kind in ("set", "rates"):
         values = message.get(kind)
         if isinstance(values, dict):
-            found[kind] = {name: value for name, value in values.items() if _is_number(value)}
+            found[kind] = {name: value for name, value in values.items() if _is_finite(value)}
     if isinstance(message.get("pause"), bool):
         found["pause"] = message["pause"]
-    if _is_number(message.get("slow")):
+    if _is_finite(message.get("slow")):
         found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
     if isinstance(message.get("scene"), str) and message["scene"] in SCENES:
         found["scene"] = message["scene"]
@@ -371,7 +369,7 @@ def parse_message(text: Any) -> dict[str, Any] | None:
     return found or None
 
 
-def _is_number(value: Any) -> bool:
+def _is_finite(value: Any) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) < 1e15 and math.isfinite(value)

@@ -1,4 +1,4 @@
-"""Rate inputs of keys and sticks, and motion limits, in simulated time."""
+"""Motion of the hand by keys and sticks, and its limits, in simulated time."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import math
 from collections.abc import Mapping
 
 from drake_teleop.live.hand import LEAD_TIME_S
-from drake_teleop.live.inputs import ANGLE_UNIT_RAD, LENGTH_UNIT_M, RANGES, Inputs
+from drake_teleop.live.inputs import ANGLE_UNIT_RAD, INPUT_RANGES, LENGTH_UNIT_M, Inputs
 
 _RATE_TIMEOUT_S = 1.0  # s
 # Lead time of the target, which compensates the lag of the hand at constant speed [s].
-_LEAD_TIMES = dict.fromkeys(("x", "y", "z"), LEAD_TIME_S) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
+_LEAD_TIMES_S = dict.fromkeys(("x", "y", "z"), LEAD_TIME_S) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
 # Limits of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. Accelerations are
 # limited only for a device; the path of a page's hand is smooth.
 _TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
-    """Integrator of input rates (keys, sticks) per simulated second."""
+    """Integrator of rates (of keys, sticks) in simulated time."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
@@ -27,8 +27,8 @@ class RateInputs:
     def set_rates(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
         """Set new rates by input name [input units/s] for 1 s; return the inputs at this time."""
         if not self._rates:
-            self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
-        self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
+            self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES_S}
+        self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES_S}
         self._end_time = now + _RATE_TIMEOUT_S
         return inputs.with_changes(self._at)
 
@@ -39,17 +39,17 @@ class RateInputs:
             return self.set_rates({}, inputs, now)
         values = dict(self._at)
         for name, rate in self._rates.items():
-            low, high = RANGES[name]
+            low, high = INPUT_RANGES[name]
             self._at[name] = min(max(self._at[name] + slice_s * rate, low), high)
-            values[name] = self._at[name] + _LEAD_TIMES[name] * rate
+            values[name] = self._at[name] + _LEAD_TIMES_S[name] * rate
         return inputs.with_changes(values)
 
 
 class MotionLimiter:
-    """Limiter of the target's speed, and for a device also of its acceleration."""
+    """Limiter of the hand's target: its speed, and for a device also its acceleration."""
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
-        self._axes: dict[str, _Axis] = {}
+        self._axes: dict[str, _AxisLimiter] = {}
         limits = (
             (("x", "y", "z"), LENGTH_UNIT_M, _TRANSLATION_LIMITS),
             (("rx", "ry", "rz"), ANGLE_UNIT_RAD, _ROTATION_LIMITS),
@@ -57,7 +57,8 @@ class MotionLimiter:
         for (names, unit, (speed, acceleration)), scale in zip(limits, scales, strict=True):
             units = slice_s / (unit * max(scale, 1e-3))
             change = slice_s * units * acceleration if device else math.inf
-            self._axes |= {name: _Axis(units * speed, change, RANGES[name]) for name in names}
+            for name in names:
+                self._axes[name] = _AxisLimiter(units * speed, change, INPUT_RANGES[name])
 
     def limit_inputs(self, inputs: Inputs, *, free: bool) -> Inputs:
         """Return the limited inputs of the next period; `free` permits jumps of the target."""
@@ -68,7 +69,7 @@ class MotionLimiter:
         return inputs.with_changes(followed)
 
 
-class _Axis:
+class _AxisLimiter:
     def __init__(self, speed: float, change: float, ends: tuple[float, float]) -> None:
         self._speed, self._change, self._ends = speed, change, ends
         self._at = self._target = self._moved = 0.0

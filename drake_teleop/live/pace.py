@@ -32,7 +32,6 @@ class Pace:
         self._starts.clear()
 
     def time_to_next_slice(self, now: float) -> float:
-        """Return the time until the next slice is due [s]."""
         return self._due - now
 
     def begin_slice(self, now: float) -> None:

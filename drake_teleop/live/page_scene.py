@@ -17,13 +17,13 @@ from drake_teleop.station.film import silence_drake_log
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import Scenario
 
-Rows = dict[str, NDArray[np.float64]]
+LogRows = dict[str, NDArray[np.float64]]
 
 _FAILURE_EXCEPTIONS = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
 
 # Commands in base64 and their files in the static page of Meshcat.
-_COMMAND = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
-_FILE = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
+_COMMAND_PATTERN = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
+_FILE_PATTERN = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
 
 
 class PageScene:
@@ -45,25 +45,25 @@ class PageScene:
             self.objects = _extract_objects(meshcat.StaticHtml())
             self._scene.canvas = _SceneRecorder()  # only this thread may destroy Meshcat
         except _FAILURE_EXCEPTIONS as error:
-            self._fail(error)
+            self._report_failure(error)
 
-    def show(self, rows: Rows) -> dict[str, Any]:
-        """Return poses (4x4 matrices by columns) and sizes of the objects by path."""
+    def show(self, rows: LogRows) -> dict[str, Any]:
+        """Return poses (4x4 matrices by columns) and sizes of the objects by Meshcat path."""
         moves = {} if self.failure else self._scene_changes(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
 
-    def _scene_changes(self, rows: Rows) -> dict[str, Any]:
+    def _scene_changes(self, rows: LogRows) -> dict[str, Any]:
         moves = _SceneRecorder()
         try:
             self._scene.canvas = moves
             self._scene.show_sample(0.0, rows, -1)
         except _FAILURE_EXCEPTIONS as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
-                self._fail(error)
+                self._report_failure(error)
             return {}
         return moves.rounded_changes()
 
-    def _fail(self, error: BaseException) -> None:
+    def _report_failure(self, error: BaseException) -> None:
         self.failure = to_one_line(f"no 3D scene: {error}")
         print(f"warning: {self.failure}; the drive continues without it", file=sys.stderr)
 
@@ -88,7 +88,7 @@ class _SceneRecorder:
 
 
 def _extract_objects(html: str) -> bytes:
-    commands = _COMMAND.findall(html)
+    commands = _COMMAND_PATTERN.findall(html)
     if not commands:
-        raise ValueError("Drake's Meshcat writes its static page in an unknown form")
-    return json.dumps({"commands": commands, "files": dict(_FILE.findall(html))}).encode()
+        raise ValueError("the static page of Drake's Meshcat has an unknown format")
+    return json.dumps({"commands": commands, "files": dict(_FILE_PATTERN.findall(html))}).encode()

@@ -29,7 +29,7 @@ DEVICE_MARKER_FILE = "device.txt"
 
 
 def versions_and_digest(scenario: Scenario) -> dict[str, str]:
-    """Return the versions, and a digest of the files that the scenario names."""
+    """Return versions of drake_teleop and Drake, and a digest of the scenario's files."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
         value = left.pop()
@@ -66,33 +66,33 @@ class Record:
                 )
             if load is not None:
                 write_load(folder / LOAD_FILE, load)
-            self._append(csv_header(versions_and_digest(scenario)))
+            self._append_line(csv_header(versions_and_digest(scenario)))
             self.write(0, inputs)
         except BaseException:
-            self._remove()
+            self._remove_files()
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Write the inputs at a time [ms], if they have changed."""
+        """Write time [ms] and inputs, if these have changed."""
         line = csv_row(ms, inputs)
         if line != self._last:
-            self._append(line)
+            self._append_line(line)
             self._last = line
 
-    def _append(self, line: str) -> None:
+    def _append_line(self, line: str) -> None:
         with wrap_write_errors(Path(self._file.name)):
             self._file.write(line)
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end at a time [ms]; remove the record if no time was simulated."""
+        """Write the end time [ms] and close the files; remove an empty record."""
         if not ms:
-            return self._remove()
+            return self._remove_files()
         self.write(ms, inputs)
         with wrap_write_errors(Path(self._file.name)):
             self._file.close()
 
-    def _remove(self) -> None:
+    def _remove_files(self) -> None:
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):  # the folder contains other files

@@ -1,4 +1,4 @@
-"""Scenarios of a live session: scenes of the page, and results of the driver's choices."""
+"""Scenarios of a live session: scenes of the page, and changes by the driver's choices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS, SENSORS, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO, NETWORKS, SENSOR_NAMES, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.environment.solids import Wall
@@ -34,13 +34,13 @@ _MIN_ROTATIONAL_IMPEDANCE = 0.5
 _DELAY_UNIT_S, _JITTER_UNIT, _LOSS_UNIT = 1e-4, 1e-2, 1e-3
 
 #: Shipped scenario of each scene; "own" is the scenario of the user.
-_SHIPPED = {
+_SCENARIO_OF_SCENE = {
     "leaf": "touch",
     "slot": "peg_in_slot",
     "wall": "touch",
     "block": "push_block",
 }
-SCENES = ("own", *_SHIPPED)
+SCENES = ("own", *_SCENARIO_OF_SCENE)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
@@ -67,7 +67,7 @@ def load_scene(name: str, own: Scenario) -> Scenario:
     """Return the scenario of a scene in `SCENES`; `own` is the user's scenario."""
     if name == "own":
         return own
-    scenario = LoadScenario(_SHIPPED[name])
+    scenario = LoadScenario(_SCENARIO_OF_SCENE[name])
     if name == "wall":
         wall = Wall(position=[0.55, 0.0, 0.17], stiffness=1e4)
         changes = {"sheet_spring": None, "environment": [wall], "description": "a wall to press on"}
@@ -99,7 +99,7 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
     elif name != AS_IN_SCENARIO:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
-        changes["wrist_sensor"] = SENSOR_PRESETS[SENSORS[inputs.sensor]]
+        changes["wrist_sensor"] = SENSOR_PRESETS[SENSOR_NAMES[inputs.sensor]]
     if not (inputs.detection and _has_noise_floor(load, inputs)):
         changes["contact_detection"] = None
     elif scenario.contact_detection is None:
@@ -110,7 +110,7 @@ def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inp
         changes["slave__payload"] = payload
     changed = replace(scenario, **changes)
     if inputs.object and load is not None and scenario.force_scaling.gripper_phi is None:
-        gripper = load.identification.phi - has_payload * _object_phi(changed)
+        gripper = load.identification.phi - has_payload * _payload_phi(changed)
         changed = replace(changed, force_scaling__gripper_phi=gripper.tolist())
     return changed
 
@@ -119,14 +119,14 @@ def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
     return load is not None and load.noise_floor is not None and inputs.sensor == 0
 
 
-def _object_phi(scenario: Scenario) -> Array:
+def _payload_phi(scenario: Scenario) -> Array:
     payload = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
     return payload - NominalSlave(empty.slave).arm.phi_load
 
 
 def adapt_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the load estimate (16,) of `before`, adapted to load and sensor offsets of `now`."""
+    """Return the load estimate (16,) of `before`, adapted to payload and sensor of `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()

@@ -79,7 +79,7 @@ class LiveDrive:
             make_folder(record)
         self.ended, self.ms = "", 0
         self._views: dict[str, PageScene] = {}
-        self._prepare(setup, device is not None)
+        self._prepare_scenes(setup, device is not None)
         self._pages: dict[ServerConnection, int] = {}
         self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
@@ -88,7 +88,7 @@ class LiveDrive:
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
         self._page_numbers = itertools.count(1)  # of pages
         self._threads: list[threading.Thread] = []
-        self._start_thread(self._run, setup, record)
+        self._start_thread(self._run_thread, setup, record)
         try:
             self._ready.wait()
         except KeyboardInterrupt:
@@ -100,7 +100,7 @@ class LiveDrive:
         self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
         self._threads[-1].start()
 
-    def _prepare(self, scenario: Scenario, device: bool) -> None:
+    def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
         with show_progress(True) as stage:
             self._load = _identify_load(scenario, stage)
             self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
@@ -164,9 +164,9 @@ class LiveDrive:
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" style="width:100%;height:44rem;border:0"></iframe>'
 
-    def _run(self, scenario: Scenario, record: Path | None) -> None:
+    def _run_thread(self, scenario: Scenario, record: Path | None) -> None:
         try:
-            self._live = self._make(scenario, record)
+            self._live = self._make_live(scenario, record)
             asyncio.run(self._serve())
         except (Exception, SystemExit) as error:  # SystemExit is a failed assertion of Drake
             self._failed = error
@@ -176,7 +176,7 @@ class LiveDrive:
             self._over.set()
             self._ready.set()
 
-    def _make(self, scenario: Scenario, record: Path | None) -> Live:
+    def _make_live(self, scenario: Scenario, record: Path | None) -> Live:
         show = self._views[SCENES[0]].show
         link = None if self._device is None else self._device.link
         live = Live(scenario, self._load, record, show, time.perf_counter(), link)
@@ -189,7 +189,7 @@ class LiveDrive:
                 self._serve_page,
                 _HOST,
                 self._port,
-                process_request=self._request,
+                process_request=self._answer_request,
                 max_size=MAX_MESSAGE_BYTES,
                 max_queue=8,
                 compression=None,
@@ -206,7 +206,7 @@ class LiveDrive:
         self.url = f"http://{_HOST}:{self._port}/?token={self._token}"
         self._ready.set()
         try:
-            await self._drive(server)
+            await self._run_loop(server)
         finally:
             self.ended, self.ms = self._live.stopped, self._live.ms
             try:
@@ -216,7 +216,7 @@ class LiveDrive:
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
 
-    async def _drive(self, server: Server) -> None:
+    async def _run_loop(self, server: Server) -> None:
         refusal = ""
         with without_garbage_collection():
             while not self._stop.is_set():
@@ -233,13 +233,13 @@ class LiveDrive:
                 if self._device is not None and self._device.link.refusal != refusal:
                     refusal = self._device.link.refusal
                     _print_note(f"a packet of the device was refused: it {refusal}")
-                await self._sleep()
+                await self._sleep_until_tick()
 
-    async def _sleep(self) -> None:
-        rest = self._live.wait(time.perf_counter()) - 1e-3
+    async def _sleep_until_tick(self) -> None:
+        rest = self._live.time_to_next_tick(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
-        time.sleep(self._live.wait(time.perf_counter()))
+        time.sleep(self._live.time_to_next_tick(time.perf_counter()))
         for _ in range(_LOOP_ITERATIONS):
             await asyncio.sleep(0)
 
@@ -269,22 +269,22 @@ class LiveDrive:
             return
         for page in tuple(self._pages):
             with contextlib.suppress(ConnectionClosed):
-                await page.send(self._hello(page))
+                await page.send(self._hello_text(page))
 
     def _raise_when_stopped(self, name: str) -> UpdateProgress:
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
-                raise DrakeTeleopError("the drive has ended")
+                raise DrakeTeleopError("the live session was stopped")
 
         return progress
 
-    def _hello(self, page: ServerConnection) -> str:
+    def _hello_text(self, page: ServerConnection) -> str:
         return json.dumps({"hello": self._live.hello() | {"you": self._pages[page]}})
 
-    def _page(self) -> str:
+    def _page_html(self) -> str:
         return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")
 
-    def _request(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
         host = f"{_HOST}:{self._port}"
         path, _, query = request.path.partition("?")
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
@@ -303,7 +303,7 @@ class LiveDrive:
                 )
             return None
         if path == "/":
-            page = self._page()
+            page = self._page_html()
             content_policy = content_security_policy(page, host)
             return _make_response(
                 HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), content_policy
@@ -323,7 +323,7 @@ class LiveDrive:
         number = self._pages[connection] = next(self._page_numbers)
         live.join(number, time.perf_counter())
         try:
-            await connection.send(self._hello(connection))
+            await connection.send(self._hello_text(connection))
             async for text in connection:
                 live.handle_message(number, text, time.perf_counter())
         except ConnectionClosed:
@@ -386,7 +386,7 @@ def drive(
     the page; elsewhere open its `url`.
 
     Args:
-        scenario: scenario, shipped name, or YAML file; its operator specifies only the grip.
+        scenario: scenario, shipped name, or YAML file; of its operator only the grip is used.
         record: folder for `run --inputs`; None: no record.
         port: TCP port of the page on 127.0.0.1; 0: any free port.
         browser: whether to open the page.
@@ -404,7 +404,7 @@ def drive(
     return live
 
 
-def drive_command(
+def run_drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
@@ -414,11 +414,11 @@ def drive_command(
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
     if live.ended:
-        raise DrakeTeleopError(f"the session has ended: {live.ended}", where="drive")
+        raise DrakeTeleopError(f"the simulation has stopped: {live.ended}", where="drive")
 
 
 def start_condition(device: str | None) -> str:
-    """Return as text the event for which the simulation waits."""
+    """Return as text what starts the waiting simulation."""
     return "the simulation waits until this page is open" + _DEVICE_CONDITIONS[device is not None]
 
 

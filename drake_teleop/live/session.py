@@ -49,7 +49,7 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 #: Rows in a part of a log on disk, two seconds. Copying a longer part would delay a slice; each
 #: part takes at least 10 ms of CPU.
-_PART_ROWS = 2000
+_ROWS_PER_LOG_PART = 2000
 # Duration of a change of scales [s]. A moving slider starts a ramp 60 times a second, and ramps
 # start slowly: longer ones would not progress until the slider rests.
 _SCALE_RAMP_S = 0.05
@@ -59,12 +59,12 @@ _MIN_STEP_S = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
 _MAX_FORCE_RISE_N = 0.9
 # Duration of short steps after a rejected one [s].
-_SHORT_STEPS_S = 4e-3
+_SHORT_STEPS_TIME_S = 4e-3
 _NO_EVENT = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Limit the integrator's steps of error control to at least `shortest` [s]."""
+    """Integrate in steps of `shortest` [s] for 4 ms after a step is rejected."""
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
     shortest = min(shortest, longest)
@@ -79,7 +79,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
         integrator = station().get_mutable_integrator()
         number = integrator.get_num_step_shrinkages_from_error_control()
         if number != rejected:
-            rejected, until = number, context.get_time() + _SHORT_STEPS_S
+            rejected, until = number, context.get_time() + _SHORT_STEPS_TIME_S
             integrator.set_maximum_step_size(shortest)
             integrator.set_fixed_step_mode(True)
         elif context.get_time() >= until:
@@ -92,7 +92,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def add_missing_signals(log: SimulationResult) -> SimulationResult:
-    """Return the log with missing signals added."""
+    """Return the log with signals that some stations lack."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -129,7 +129,7 @@ class _Station:
         self.sink = self.station.GetSubsystemByName(LOG_BLOCK_NAME).FindMutableLog(self.context)
         self.columns = log_columns(self.station)
 
-    def block(self, name: str) -> tuple[Any, Context]:
+    def block_and_context(self, name: str) -> tuple[Any, Context]:
         inner_side = self.station.GetSubsystemByName("master_side").GetSubsystemByName("inner_side")
         inside = inner_side.HasSubsystemNamed(name)
         block = inner_side.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
@@ -142,33 +142,33 @@ class _Station:
     def set_clutch(self, closed: bool) -> None:
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
-    def continue_from(self, other: _Station, channel_anew: bool) -> float:
-        """Continue another station's state; return how long the clutch stays open [s]."""
-        excluded = {"channel"} if channel_anew else set()
+    def continue_from(self, other: _Station, new_channel: bool) -> float:
+        """Copy another station's state; return how long the clutch must stay open [s]."""
+        excluded = {"channel"} if new_channel else set()
         if not self.scenario.load_estimator.enabled:
             excluded.add("load_estimator")  # its configured load differs
         copy_state(other.station, other.context, self.station, self.context, excluded)
         if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
-            sensor, context = self.block("wrist_sensor")
+            sensor, context = self.block_and_context("wrist_sensor")
             sensor.reset_queue(context)
-        wait_s = channel_fill_time(self.scenario) if channel_anew else 0.0
-        cross_fade, context = self.block("cross_fade")
+        wait_s = channel_fill_time(self.scenario) if new_channel else 0.0
+        cross_fade, context = self.block_and_context("cross_fade")
         rendered = other.signal_value("force_to_master")
-        cross_fade.Begin(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
-        if channel_anew:
-            cross_fade.Limit(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
+        cross_fade.StartFade(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
+        if new_channel:
+            cross_fade.LimitForce(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
         impedances = other.scenario.operator.hand, self.scenario.operator.hand
         if impedances[0] != impedances[1]:
-            hand, context = self.block("live_hand")
+            hand, context = self.block_and_context("live_hand")
             hand.SetImpedance(context, *impedances)
-        if not channel_anew:
+        if not new_channel:
             return 0.0
         name = "pose_command" if other.scenario.is_direct else "pose_received"
         command = other.signal_value(name)
-        scaling, context = self.block("kinematic_scaling")
+        scaling, context = self.block_and_context("kinematic_scaling")
         scaling.Open(context, command)
         if not self.scenario.is_direct:
-            channel, context = self.block("channel")
+            channel, context = self.block_and_context("channel")
             side = self.station.GetSubsystemByName("slave_side")
             pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))
             channel.Begin(context, command, pose, wait_s)
@@ -218,12 +218,12 @@ class Session:
             self._swap_station(inputs)
         self.inputs = inputs
         if inputs.hand_inputs != before.hand_inputs:
-            hand, context = self._station.block("live_hand")
+            hand, context = self._station.block_and_context("live_hand")
             hand.SetTarget(context, inputs.intended_pose(self._start))
         if inputs.clutch != before.clutch or inputs.station_choices != before.station_choices:
             self._station.set_clutch(bool(inputs.clutch) and self.ms >= self._filled_at_ms)
         if inputs.force_scales != before.force_scales:
-            scaling, context = self._station.block("force_scaling")
+            scaling, context = self._station.block_and_context("force_scaling")
             scaling.SetScales(context, **inputs.force_scales, duration=_SCALE_RAMP_S)
         if self._record is not None:
             self._record.write(self.ms, inputs)
@@ -242,7 +242,7 @@ class Session:
             self._on_disk.write_and_clear()
             self._on_disk.continue_with(station.simulator)
         else:
-            self._earlier_rows.append(self._rows())
+            self._earlier_rows.append(self._recorded_signals())
         station.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         station.sink.Clear()  # the previous station has recorded this row
         self._station, self._rows_read, self._station_count = station, 0, self._station_count + 1
@@ -258,7 +258,7 @@ class Session:
             self._advance_to(self._filled_at_ms)
             self._station.set_clutch(bool(self.inputs.clutch))
         self._advance_to(end)
-        if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _PART_ROWS:
+        if self._on_disk is not None and self._on_disk.num_unwritten_rows() >= _ROWS_PER_LOG_PART:
             self._on_disk.write_and_clear()
             self._rows_read = 0
 
@@ -297,10 +297,10 @@ class Session:
         return self._station.signal_value("force_to_master")
 
     def removed_force(self) -> float:
-        """Return the force [N] that the limit after a channel change removes."""
+        """Return the force [N] that the force limit after a channel change removes."""
         if self._station_count == 1:
             return 0.0
-        cross_fade, context = self._station.block("cross_fade")
+        cross_fade, context = self._station.block_and_context("cross_fade")
         return float(cross_fade.removed_force(context))
 
     def write_log(self) -> None:
@@ -310,11 +310,11 @@ class Session:
             self._on_disk.write_and_keep()
             self._on_disk.finish()
 
-    def _rows(self) -> SimulationResult:
+    def _recorded_signals(self) -> SimulationResult:
         return add_missing_signals(read_recorded_signals(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
-        parts = [*self._earlier_rows, self._rows()]
+        parts = [*self._earlier_rows, self._recorded_signals()]
         values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
         t = np.concatenate([part.t for part in parts])
         return SimulationResult(t, values, parts[0].specs)
@@ -334,8 +334,8 @@ class Drive:
     """Recorded live session.
 
     Attributes:
-        changes: changed inputs with their times [ms]; the last is the end.
-        device: whether a haptic device was the hand.
+        changes: times [ms] and inputs of each change; the last is the end.
+        device: whether a haptic device moved the hand.
     """
 
     scenario: Scenario
@@ -367,9 +367,9 @@ def read_drive(folder: str | Path) -> Drive:
     known = load is None or (load.estimate.shape == (16,) and np.isfinite(load.estimate).all())
     if not known or (load is None and (folder / LOAD_FILE).exists()):
         raise DrakeTeleopError(
-            "is damaged, or not a load of a drive",
+            "is not an identified load (16 finite parameters)",
             where=str(folder / LOAD_FILE),
-            remedy="record the drive again",
+            remedy="record the session again",
         )
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
     return Drive(driven, load, changes, (folder / DEVICE_MARKER_FILE).exists(), folder)

@@ -30,7 +30,7 @@ _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy time, states and changeable parameters of the station `before` to `station`."""
+    """Copy time, states, changeable parameters of `before` to `station`, except `excluded`."""
     context.SetTime(then.get_time())
     sources = dict(_blocks_by_path(before))
     for path, block in _blocks_by_path(station):
@@ -75,7 +75,7 @@ def _copy_block(source: Context, target: Context, with_parameters: bool) -> None
 
 
 @njit(cache=True)
-def _cross_fade_share(change, time):
+def _cross_fade_weight(change, time):
     u = min(max((time - change[0]) / change[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
@@ -124,21 +124,21 @@ class CrossFade(LeafSystem):
         self._state = int(self.DeclareDiscreteState([1.0, math.inf]))
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
         inputs = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
-        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), inputs)
+        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc_wrench), inputs)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def Begin(self, context: Context, start: float, length: float, rendered: Array) -> None:
-        """Cross-fade from the wrench `rendered` (6,) within `length` [s] from time `start` [s]."""
+    def StartFade(self, context: Context, start: float, length: float, rendered: Array) -> None:
+        """Cross-fade from the wrench `rendered` (6,), from time `start` [s] for `length` [s]."""
         change = np.concatenate([[start, length], rendered])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 
-    def Limit(self, context: Context, most: float) -> None:
+    def LimitForce(self, context: Context, most: float) -> None:
         """Limit the force to `most` [N] until the new wrench is at most that large."""
         context.get_mutable_discrete_state(self._state)[1] = most
 
     def removed_force(self, context: Context) -> float:
-        """Return the force [N] by which `Limit` reduces the wrench; 0 during a cross-fade."""
+        """Return the force [N] by which `LimitForce` reduces the wrench; 0 during a cross-fade."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force_norm(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 
@@ -146,11 +146,11 @@ class CrossFade(LeafSystem):
         share, most = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()
-            state.get_mutable_value(self._state)[0] = _cross_fade_share(change, context.get_time())
+            state.get_mutable_value(self._state)[0] = _cross_fade_weight(change, context.get_time())
         elif most < math.inf and _force_norm(self._wrench.Eval(context)) <= most:
             state.get_mutable_value(self._state)[1] = math.inf
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         share, most = context.get_discrete_state(self._state).value()
         wrench = self._wrench.Eval(context)
         if share == 1.0 and most == math.inf:  # the usual case, in half the time

@@ -14,7 +14,7 @@ class VirtualDevice:
     """Simulated device of given mass [kg] and damping [N s/m] in a moving hand.
 
     `hand` maps time [s] to intended position [m] and velocity [m/s]; `energy` is the work of
-    device and hand against the force [J].
+    device and hand against the rendered force [J].
     """
 
     def __init__(

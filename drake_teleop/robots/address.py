@@ -22,7 +22,7 @@ class Address:
         except ValueError as error:
             raise DrakeTeleopError(str(error), where=text) from error
         if not self.host:
-            raise DrakeTeleopError("has no host", where=text, remedy=f"{parts.scheme}://HOST")
+            raise DrakeTeleopError("has no host", where=text, remedy=f"use {parts.scheme}://HOST")
         self.path = parts.path.strip("/")
         self._parameters = parameters
         for name in parameters:
@@ -33,11 +33,10 @@ class Address:
                     remedy=f"use {', '.join(allowed)}",
                 )
 
-    def required_parameter(self, name: str) -> str | None:
+    def optional_parameter(self, name: str) -> str | None:
         return self._parameters.get(name)
 
-    def positive_numbers(self, name: str, count: int) -> list[float] | None:
-        """Return a parameter of `count` positive numbers; None if it is absent."""
+    def read_numbers(self, name: str, count: int) -> list[float] | None:
         text = self._parameters.get(name)
         if text is None:
             return None
@@ -53,8 +52,8 @@ class Address:
             )
         return values
 
-    def choose_word(self, name: str, among: tuple[str, ...]) -> str:
-        """Return a parameter among words, by default the first."""
+    def read_word(self, name: str, among: tuple[str, ...]) -> str:
+        """Return a parameter, one of the words `among` (default: the first)."""
         text = self._parameters.get(name, among[0])
         if text not in among:
             raise DrakeTeleopError(
@@ -65,7 +64,7 @@ class Address:
         return text
 
     def wrench_sign(self) -> float:
-        """Factor, 1 or -1, from the source's wrench to that of sensor on load, Eq. (1)."""
+        """Return 1 or -1: factor to the wrench of sensor on load, Eq. (1)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(

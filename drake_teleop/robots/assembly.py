@@ -23,33 +23,33 @@ from drake_teleop.logs.read.alignment import (
     smoother_weights,
     vectors_of_skew_parts,
 )
-from drake_teleop.robots.compensator import CLOCK_DRIFT, JUMP_S, MAX_OFFSET_DRIFT, STALE_S
+from drake_teleop.robots.compensator import CLOCK_DRIFT, CLOCK_JUMP_S, MAX_OFFSET_DRIFT, STALE_AGE_S
 from drake_teleop.robots.streams import (
     IMU,
     JOINTS,
+    NUM_VALUES,
     POSE,
-    VALUES,
     WRENCH,
     Part,
     PartSource,
     Reading,
     ReadingFlag,
 )
-from drake_teleop.robots.watch import MODEL_ERROR, unfiltered_noise
+from drake_teleop.robots.watch import MODEL_ERROR_FRACTION, unfiltered_noise
 
-FADE_TIME_S = 10.0
+DELAY_FADE_TIME_S = 10.0
 """Time constant of the weights [s]."""
-MAX_STD_S = 5e-4
+MAX_DELAY_STD_S = 5e-4
 """Maximum standard deviation of a usable estimate [s]."""
-MAX_SLEW = 0.005
+MAX_DELAY_SLEW = 0.005
 """Maximum rate of change of the delay [s/s]."""
 MAX_DELAY_S = 0.1
 """Maximum magnitude of the delay [s]."""
-INITIAL_ERROR_S = 0.03
+INITIAL_DELAY_ERROR_S = 0.03
 """Delay error that the residual of a sample may contain before the delay is known [s]."""
-TRACKING_ERROR_S = 0.004
+TRACKING_DELAY_ERROR_S = 0.004
 """Delay error in a residual once the delay is known, besides the remaining correction [s]."""
-SAMPLE_PERIOD_S = 0.004
+DELAY_SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
 _OUTLIER_SIGMAS, _MIN_SAMPLES = 5.0, 50  # samples before offsets are estimated
 
@@ -74,16 +74,16 @@ class DelayTracker:
     def _reset(self, t: float) -> None:
         self._t = self._fitted = t
         self._samples, self._count, self._sums = 0, 0.0, np.zeros((5, 6))
-        self._delay_error = INITIAL_ERROR_S
+        self._delay_error = INITIAL_DELAY_ERROR_S
 
     def update_delay(self, at: Motion, wrench: Array, before: Motion, after: Motion) -> None:
         """Update the delay with a wrench (6,), its motion `at`, and the neighbouring motions."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
-        if 0.0 <= elapsed < SAMPLE_PERIOD_S or step <= 0.0:
+        if 0.0 <= elapsed < DELAY_SAMPLE_PERIOD_S or step <= 0.0:
             return
         # Another clock, or no explained sample for long.
-        if not 0.0 <= t - self._fitted < FADE_TIME_S:
+        if not 0.0 <= t - self._fitted < DELAY_FADE_TIME_S:
             self._reset(t)
             elapsed = 0.0
         self._t = t
@@ -94,17 +94,17 @@ class DelayTracker:
         if self._is_explained(residual, slope):
             # The sums refer to zero delay; the motion is already shifted by the present one.
             residual = residual + slope * self.delay_s
-            fade = math.exp(-(t - self._fitted) / FADE_TIME_S)
+            fade = math.exp(-(t - self._fitted) / DELAY_FADE_TIME_S)
             self._fitted, self._samples = t, self._samples + 1
             self._count = fade * self._count + 1.0
             products = slope, residual, slope * slope, slope * residual, residual * residual
             self._sums = fade * self._sums + np.stack(products)
-            self._slew_delay(min(elapsed, FADE_TIME_S))
+            self._slew_delay(min(elapsed, DELAY_FADE_TIME_S))
 
     def _is_explained(self, residual: Array, slope: Array) -> bool:
         starting = self._samples < _MIN_SAMPLES
         limit = _OUTLIER_SIGMAS * self._noise + self._delay_error * np.abs(slope)
-        limit += MODEL_ERROR * np.abs(self._wrenches[0]) + starting * MAX_OFFSET_DRIFT
+        limit += MODEL_ERROR_FRACTION * np.abs(self._wrenches[0]) + starting * MAX_OFFSET_DRIFT
         offsets = self._offsets
         if not starting:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count
@@ -120,24 +120,24 @@ class DelayTracker:
         estimate = float(self._weights @ (gr - g * r)) / information
         rest = rr - r * r - estimate * (gr - g * r)
         noise_ratio = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
-        self._delay_error = INITIAL_ERROR_S
-        if math.sqrt(noise_ratio / (information * self._count)) < MAX_STD_S:
-            max_change = MAX_SLEW * elapsed
+        self._delay_error = INITIAL_DELAY_ERROR_S
+        if math.sqrt(noise_ratio / (information * self._count)) < MAX_DELAY_STD_S:
+            max_change = MAX_DELAY_SLEW * elapsed
             correction = min(MAX_DELAY_S, max(-MAX_DELAY_S, estimate)) - self.delay_s
             self.delay_s += min(max_change, max(-max_change, correction))
-            self._delay_error = min(INITIAL_ERROR_S, TRACKING_ERROR_S + abs(correction))
+            self._delay_error = min(INITIAL_DELAY_ERROR_S, TRACKING_DELAY_ERROR_S + abs(correction))
 
 
-_GRAVITY = np.array([0.0, 0.0, -9.81])
+_GRAVITY_W = np.array([0.0, 0.0, -9.81])
 IDENTITY_POSE = np.array([1.0, 0, 0, 0, 0, 0, 0])
 """Identity: the sensor's frame is the posed frame."""
-_BUFFER_S = 0.5  # buffer of motions and wrenches
+_BUFFER_TIME_S = 0.5  # buffer of motions and wrenches
 _MIN_DT_S, _MAX_TIME_S, _MAX_VALUE = 1e-4, 1e11, 1e5  # [s], [s], any unit
-_PERIOD_SAMPLES = 20  # for the median period of the motion
+_PERIOD_MEDIAN_SAMPLES = 20  # for the median period of the motion
 
 
-class Parts:
-    """One source of wrenches and motions, made of one or two sources of single samples."""
+class PartStreams:
+    """Source of wrenches and motions, from one or two sources of parts."""
 
     live = True
 
@@ -218,7 +218,7 @@ class MotionWindow:
         gravity_W: (3,) gravity [m/s^2].
     """
 
-    def __init__(self, cutoff_hz: float | None, X_FS: Array, gravity_W: Array = _GRAVITY) -> None:
+    def __init__(self, cutoff_hz: float | None, X_FS: Array, gravity_W: Array = _GRAVITY_W) -> None:
         self._cutoff_hz, self._dt, self._gravity_W = cutoff_hz, 0.0, gravity_W
         self._weights, self._size = np.zeros((3, 1)), 1
         self._R_FS, self._p_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0], X_FS[4:]
@@ -232,24 +232,24 @@ class MotionWindow:
 
     def _measure_period(self, step: float) -> None:
         self._steps.append(step)
-        if len(self._steps) == _PERIOD_SAMPLES:
+        if len(self._steps) == _PERIOD_MEDIAN_SAMPLES:
             self._dt = float(np.median(self._steps))
             self._weights = smoother_weights(10**9, self._dt, self._cutoff_hz)[:3]
             self._size = self._weights.shape[1]
             self.reset()
 
     def add_part(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Return times [s] and motions [s, omega, alpha, known gravity] that a part completes."""
+        """Add a sample; return new times [s] and motions [s, omega, alpha, gravity if known]."""
         row = self._motion_sample(part)
         if row is None:
             return []
         last = self._last
         step = math.inf if last is None else part.t - last[0]
-        if step <= 0.0 and now - self._arrival <= STALE_S:
+        if step <= 0.0 and now - self._arrival <= STALE_AGE_S:
             return []  # out of order or repeated
-        if not self._dt and _MIN_DT_S <= step <= STALE_S:
+        if not self._dt and _MIN_DT_S <= step <= STALE_AGE_S:
             self._measure_period(step)
-        if self._last is None or not 0.0 < step <= STALE_S:
+        if self._last is None or not 0.0 < step <= STALE_AGE_S:
             self.reset()
             self._next_t, last = part.t, (part.t, row)
         self._last, self._arrival = (part.t, row), now
@@ -290,7 +290,7 @@ class MotionWindow:
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
-    """Return the pose (7,), [w x y z, position], of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
+    """Return the pose (7,), [w x y z, position], from x, y, z [m], roll, pitch, yaw [deg]."""
     R = rotation_matrices(np.radians([numbers[3:]]), "euler", "xyz")
     return np.concatenate([quaternions_of(R)[0], numbers[:3]])
 
@@ -302,7 +302,7 @@ class _ClockOffset:
     def update(self, t: float, now: float) -> None:
         if math.isfinite(t):
             ahead, faded = now - t, self.offset + CLOCK_DRIFT * (now - self._now)
-            known = abs(ahead - self.offset) <= JUMP_S
+            known = abs(ahead - self.offset) <= CLOCK_JUMP_S
             self.offset, self._now = min(ahead, faded) if known else ahead, now
 
 
@@ -320,7 +320,7 @@ class Assembly:
 
     def __init__(
         self,
-        parts: Parts,
+        parts: PartStreams,
         *,
         cutoff_hz: float | None = 30.0,
         delay_s: float = 0.0,
@@ -334,13 +334,13 @@ class Assembly:
         self._tracker = None
         if track is not None:
             self._tracker = DelayTracker(track, self.dt, cutoff_hz, delay_s)
-        self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY)
+        self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY_W)
         self.lag_s = max(0.0, delay_s)
         if cutoff_hz is not None:
             self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW_OVER_PERIOD / cutoff_hz + delay_s)
         self._clocks = _ClockOffset(), _ClockOffset()
         self._motions: deque[tuple[float, Array]] = deque()
-        self._pending: deque[Part] = deque(maxlen=round(_BUFFER_S / self.dt))
+        self._pending: deque[Part] = deque(maxlen=round(_BUFFER_TIME_S / self.dt))
 
     @property
     def delay_s(self) -> float:
@@ -354,7 +354,7 @@ class Assembly:
         return [reading for part, now in arrived for reading in self.complete_readings(part, now)]
 
     def complete_readings(self, part: Part, now: float) -> list[Reading]:
-        """Return the readings that a part, received at time `now` [s], completes."""
+        """Add a part received at `now` [s]; return the readings that became complete."""
         if part.stream == WRENCH:
             self._clocks[0].update(part.t, now)
             self._pending.append(part)
@@ -373,17 +373,17 @@ class Assembly:
 
     def _add_motion(self, t: float, motion: Array) -> None:
         motions = self._motions
-        if motions and not motions[-1][0] - STALE_S < t < motions[-1][0] + _BUFFER_S:
+        if motions and not motions[-1][0] - STALE_AGE_S < t < motions[-1][0] + _BUFFER_TIME_S:
             motions.clear()  # another clock: wrenches on the old one would wait forever
-            waiting = [each for each in self._pending if not abs(each.t - t) > _BUFFER_S]
+            waiting = [each for each in self._pending if not abs(each.t - t) > _BUFFER_TIME_S]
             self._pending = deque(waiting, self._pending.maxlen)
         if math.isfinite(t) and (not motions or t > motions[-1][0]):
             motions.append((t, motion))
-            while t - motions[0][0] > _BUFFER_S:
+            while t - motions[0][0] > _BUFFER_TIME_S:
                 motions.popleft()
 
     def _make_reading(self, part: Part) -> Reading | None:
-        values, flags, motions = np.zeros(VALUES), part.flags, self._motions
+        values, flags, motions = np.zeros(NUM_VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):
             return Reading(part.number, part.t, values, flags)
@@ -391,7 +391,7 @@ class Assembly:
             return None
         at = bisect_right(motions, part.t, key=lambda each: each[0])
         after, before = motions[min(at, len(motions) - 1)], motions[max(0, at - 1)]
-        if part.t < before[0] or after[0] - before[0] > STALE_S:
+        if part.t < before[0] or after[0] - before[0] > STALE_AGE_S:
             return Reading(part.number, part.t, values, flags | ReadingFlag.STALE)
         share = (part.t - before[0]) / max(after[0] - before[0], 1e-9)
         motion = before[1] + share * (after[1] - before[1])

@@ -39,20 +39,20 @@ FIRST_RECORD_S = 1.0
 """Length of the record at the first result [s]."""
 MIN_DEGREES_OF_FREEDOM = 20.0
 """Minimum degrees of freedom of the variance of a known parameter."""
-_START_AGAIN = "start again: the record has another zero or another load from t = {t:.2f} s on"
-_GRAVITY = 9.81
+_RESTART_ADVICE = "start again: the record has another zero or another load from t = {t:.2f} s on"
+_GRAVITY_M_S2 = 9.81
 # Load and noise [N, N m] for the advice before the first identification.
 _INITIAL_PHI = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
 _INITIAL_NOISE = np.repeat([0.25, 0.012], 3)
 _REGULARIZATION = 1e-12  # relative information that keeps matrices regular
 # Motions: words, angle [rad], rate [Hz]; duration [s] and samples of each.
-_MOTIONS = (
+_ADVISED_MOTIONS = (
     ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
     ("swing the wrist about {axis}, briskly, by 20 deg back and forth", np.radians(20.0), 1.5),
 )
 _MOTION_S, _MOTION_SAMPLES = 4.0, 80
 # Independent samples per second and hertz of the low-pass.
-_INDEPENDENT_PER_S_HZ = 2.2
+_INDEPENDENT_RATE_PER_HZ = 2.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def evaluate_record(
     phi, noise, log = _INITIAL_PHI, _INITIAL_NOISE, None
     if found is not None:
         load, log = found.identification, found.log
-        half, wider, degrees = half_widths(found, tolerance)
+        half, wider, degrees = interval_half_widths(found, tolerance)
         doubts = record_problems(found)
         sure = (wider <= 1.0) & (degrees >= MIN_DEGREES_OF_FREEDOM) & (not doubts)
         if load.mass > 0.0:
@@ -107,21 +107,21 @@ def evaluate_record(
     with suppress(DrakeTeleopError):  # too few samples
         log = log or low_pass_log(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
     if log is None:
-        advice = _MOTIONS[0][0].format(axis="x")
+        advice = _ADVISED_MOTIONS[0][0].format(axis="x")
     elif sure.all():
         advice = ""
     elif changes:
-        advice = _START_AGAIN.format(t=min(changes))
+        advice = _RESTART_ADVICE.format(t=min(changes))
     else:
-        advice = best_motion(
+        advice = advise_motion(
             log.motion, log.dt, cutoff_hz, derivatives_over_tolerances(tolerance, phi), noise
         )
     t = 0.0 if log is None else float(log.t[-1])
     return Evaluation(t, found, why, half, sure, known, doubts, advice)
 
 
-def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return half-widths (k,) of both intervals over the tolerances, and degrees of freedom."""
+def interval_half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
+    """Return half-widths over tolerances (95 %, `CONFIDENCE`), degrees of freedom: (k,) each."""
     load = found.identification
     errors = derivatives_over_tolerances(tolerance, load.phi)
     deviations = deviations_over_tolerances(errors, load.covariance)
@@ -140,7 +140,7 @@ def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
     return tuple(doubts)
 
 
-def best_motion(
+def advise_motion(
     motion: tuple[Array, Array, Array],
     dt: float,
     cutoff_hz: float | None,
@@ -151,7 +151,7 @@ def best_motion(
 
     `motion` is s, omega, alpha of the record, (N, 3) each.
     """
-    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_PER_S_HZ * cutoff_hz)
+    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_RATE_PER_HZ * cutoff_hz)
     equations = NormalEquations(noise)
     equations.add(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]
@@ -168,9 +168,9 @@ def best_motion(
 
 
 def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
-    s0 = _GRAVITY * up / max(float(np.linalg.norm(up)), 1e-9)
+    s0 = _GRAVITY_M_S2 * up / max(float(np.linalg.norm(up)), 1e-9)
     t = np.arange(_MOTION_SAMPLES) * (_MOTION_S / _MOTION_SAMPLES)
-    for words, size, hertz in _MOTIONS:
+    for words, size, hertz in _ADVISED_MOTIONS:
         w = 2.0 * np.pi * hertz
         angle, speed = 0.5 * size * (1.0 - np.cos(w * t)), 0.5 * size * w * np.sin(w * t)
         change = 0.5 * size * w * w * np.cos(w * t)
@@ -191,7 +191,7 @@ def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[s
 
 DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
-_IDLE_S = 0.05
+_READ_TIMEOUT_S = 0.05
 _T = TypeVar("_T")
 
 
@@ -231,7 +231,7 @@ def calibrate(
     try:
         with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
             while not (done or INTERRUPTED_EVENT.is_set()):
-                if (samples := source.read(_IDLE_S)) is None:
+                if (samples := source.read(_READ_TIMEOUT_S)) is None:
                     break
                 for sample in samples:
                     recorder.add(sample)

@@ -19,12 +19,12 @@ from drake_teleop.logs.causes.explain import explain_misfit
 from drake_teleop.logs.causes.instants import S, block_means_of_record
 from drake_teleop.logs.causes.model import StepChange
 from drake_teleop.logs.causes.state import State
-from drake_teleop.robots.compensator import JUMP_S
-from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Reading, ReadingFlag
+from drake_teleop.robots.compensator import CLOCK_JUMP_S
+from drake_teleop.robots.streams import NONZERO_FLAGS, NUM_VALUES, Reading, ReadingFlag
 
-SPAN_S = 20.0
+RECORD_SPAN_S = 20.0
 """Length of the record that a test examines [s]."""
-SETTLED_S = 2.0
+MIN_FLAGGED_TIME_S = 2.0
 """Minimum duration of contact or load flags before a test [s]."""
 _WATCH_FLAGS, _INVALID_FLAGS = (
     int(ReadingFlag.IN_CONTACT | ReadingFlag.OTHER_LOAD),
@@ -36,7 +36,7 @@ _MIN_RECORD_S, _MIN_LIKELIHOOD_RATIO = 4.0, 40.0
 _MIN_FORCE_STD = 0.5  # m/s^2, minimum standard deviation of the specific force after a change
 _NICENESS, _TIMEOUT_S = 10, 60.0
 
-Report = tuple[float, str]
+ReportedChange = tuple[float, str]
 """Time of a change [s], and the change in words."""
 
 
@@ -45,17 +45,17 @@ class ChangeMonitor:
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
-        self._rows = np.zeros((round(SPAN_S / dt), 1 + VALUES))
+        self._rows = np.zeros((round(RECORD_SPAN_S / dt), 1 + NUM_VALUES))
         self._count, self._last = 0, -math.inf
         self._flagged_since, self._last_flagged, self._next_attempt = math.inf, -math.inf, math.inf
         self._executor = ThreadPoolExecutor(1, "changes of a stream")
-        self._pending: Future[list[Report]] | None = None
+        self._pending: Future[list[ReportedChange]] | None = None
         self._reported: list[float] = []
 
     def add_reading(self, reading: Reading, flags: int) -> None:
         if flags & _INVALID_FLAGS:
             return
-        if not 0.0 < reading.t - self._last < JUMP_S:
+        if not 0.0 < reading.t - self._last < CLOCK_JUMP_S:
             self._count, self._flagged_since = 0, math.inf
         t = self._last = reading.t
         row = self._rows[self._count % len(self._rows)]
@@ -64,12 +64,12 @@ class ChangeMonitor:
         if flags & _WATCH_FLAGS:
             self._last_flagged = t
             if self._flagged_since > t:
-                self._flagged_since, self._next_attempt = t, t + SETTLED_S
+                self._flagged_since, self._next_attempt = t, t + MIN_FLAGGED_TIME_S
         elif t - self._last_flagged > _END_S:
             self._flagged_since = math.inf
         if self._pending is None and t >= self._next_attempt and self._flagged_since <= t:
             self._next_attempt = t + min(
-                max(SETTLED_S, 0.5 * (t - self._flagged_since)), _MAX_RETRY_S
+                max(MIN_FLAGGED_TIME_S, 0.5 * (t - self._flagged_since)), _MAX_RETRY_S
             )
             find = _find_changes_in_process if self._live else find_changes
             self._pending = self._executor.submit(find, self._recorded_rows(), self._dt)
@@ -89,7 +89,7 @@ class ChangeMonitor:
             return self._rows[: self._count].copy()
         return np.concatenate([self._rows[first:], self._rows[:first]])
 
-    def _report_changes(self, found: Future[list[Report]]) -> None:
+    def _report_changes(self, found: Future[list[ReportedChange]]) -> None:
         error = found.exception()
         if error is not None:  # the loop continues
             self._report(f"the test for a tare or another load failed ({error})")
@@ -101,7 +101,7 @@ class ChangeMonitor:
                 self._report(words)
 
 
-def _find_changes_in_process(rows: Array, dt: float) -> list[Report]:
+def _find_changes_in_process(rows: Array, dt: float) -> list[ReportedChange]:
     done = subprocess.run(
         [sys.executable, "-m", __name__, repr(dt)],
         input=rows.tobytes(),
@@ -113,8 +113,8 @@ def _find_changes_in_process(rows: Array, dt: float) -> list[Report]:
     return [(time, words) for time, words in json.loads(done.stdout)]
 
 
-def find_changes(rows: Array, dt: float) -> list[Report]:
-    """Return changes of sensor zero and load; rows (N, 16): time [s], wrench, s, omega, alpha."""
+def find_changes(rows: Array, dt: float) -> list[ReportedChange]:
+    """Return changes of sensor zero and load; rows (N, 16): time [s] and `Reading` values."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
     if len(t) * dt < _MIN_RECORD_S:
@@ -160,7 +160,7 @@ def _change_text(cause: Cause) -> str:
 def main() -> None:
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
-    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + VALUES)
+    rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + NUM_VALUES)
     json.dump(find_changes(rows, float(sys.argv[1])), sys.stdout)
 
 

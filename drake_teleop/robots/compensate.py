@@ -17,14 +17,14 @@ from drake_teleop.common.interruption import INTERRUPTED_EVENT, handled_sigint
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import ChangeMonitor
-from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
+from drake_teleop.robots.compensator import STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.connections import is_file_address, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import Compensated, Reading, Sink, Source
 from drake_teleop.robots.udp import LOCALHOST, open_udp_receiver
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
-_IDLE_S = 0.01  # period of zero wrenches while nothing comes
+_STALE_WRENCH_PERIOD_S = 0.01  # period of zero wrenches while nothing comes
 
 
 class TareRequestPort:
@@ -36,7 +36,6 @@ class TareRequestPort:
         self.port = self._socket.getsockname()[1]
 
     def answer_request(self, tare: Callable[[], str]) -> None:
-        """Answer a waiting request, if any."""
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"
@@ -62,7 +61,7 @@ def compensate_stream(
 ) -> Counter[str]:
     """Compensate readings until the source ends, or Ctrl-C; count wrenches and flags."""
     counts: Counter[str] = Counter(wrenches=0)
-    tare_count = np.inf if not tare else round(TARE_S / source.dt)
+    tare_count = np.inf if not tare else round(TARE_REST_S / source.dt)
 
     def write(out: Compensated) -> None:
         sink.write(out)
@@ -74,7 +73,7 @@ def compensate_stream(
 
     def longest_wait_s() -> float:
         left = compensator.time_to_stale(time.monotonic())
-        return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
+        return min(left, _STALE_WRENCH_PERIOD_S) if left > 0.0 else _STALE_WRENCH_PERIOD_S
 
     with suppress(KeyboardInterrupt), handled_sigint():
         while (
@@ -100,7 +99,7 @@ def compensate_stream(
     return counts
 
 
-def compensate_command(
+def run_compensate_command(
     source: str,
     load: Path,
     sink: str,
@@ -160,8 +159,8 @@ def compensate_command(
     control_port = None if control is None else TareRequestPort(control)
     changes = ChangeMonitor(readings.dt, live=readings.live, report=report) if watch else None
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
-    report(f"late by {1e3 * late:.1f} ms")
-    report(f"readings are stale after {1e3 * STALE_S:.0f} ms; invalid wrenches are zero")
+    report(f"outputs are {1e3 * late:.1f} ms late")
+    report(f"readings are stale after {1e3 * STALE_AGE_S:.0f} ms; invalid wrenches are zero")
     if largest is None:
         report("no --range: saturation of the sensor is not detected")
     try:

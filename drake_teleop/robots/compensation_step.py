@@ -45,19 +45,19 @@ def low_pass_into(x, low_pass, memory):
 
 
 @njit(cache=True)
-def eliminate_into(values, gravity, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
+def eliminate_into(values, gravity, offsets, phi, no_load, scales, low_pass, memory, rest, at, out):
     """Write the contact wrench and scaled wrench of a valid reading to out (12,).
 
-    `values` (15,) is the reading. Row `at` of `rest` (rows, 21) receives it with its unfiltered
-    contact wrench. `gravity` (3,) is used only for different scales of weight and inertia.
+    `values` (15,) is the reading. Row `at` of `rest` (rows, 21), for a tare, receives it and its
+    unfiltered contact wrench. `gravity` (3,) matters if scales of weight and inertia differ.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]
-    scaled_wrench_into(wrench, offsets, s, omega, alpha, phi, nothing, 0.0, 0.0, 1.0, contact)
+    scaled_wrench_into(wrench, offsets, s, omega, alpha, phi, no_load, 0.0, 0.0, 1.0, contact)
     a, b, c = scales[0], scales[1], scales[2]
-    scaled_wrench_into(wrench, offsets, s, omega, alpha, nothing, phi, a, b, c, scaled)
+    scaled_wrench_into(wrench, offsets, s, omega, alpha, no_load, phi, a, b, c, scaled)
     if scales[3] != 0.0:
-        add_weight_into(gravity, nothing, phi, 0.0, scales[3], scaled)
+        add_weight_into(gravity, no_load, phi, 0.0, scales[3], scaled)
     rest[at, :15] = values
     rest[at, 15:] = contact
     if len(low_pass) > 0:
@@ -100,7 +100,7 @@ def tare_into(count, mean, squares, noise_limits, offsets):
 
 
 @njit(cache=True)
-def clip(wrenches, limits):
+def clip_wrenches(wrenches, limits):
     """Limit two wrenches (12,) to the sensor's range (6,); return whether a value exceeded it."""
     beyond = False
     for i in range(12):

@@ -26,30 +26,30 @@ from drake_teleop.robots.compensation_step import (
     TOO_LARGE,
     VARIES,
     add_to_statistics,
-    clip,
+    clip_wrenches,
     eliminate_into,
     scales_into,
     tare_into,
     value_problem,
 )
-from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Reading, ReadingFlag
+from drake_teleop.robots.streams import NONZERO_FLAGS, NUM_VALUES, Compensated, Reading, ReadingFlag
 from drake_teleop.robots.watch import ContactAndLoadMonitor, StreamContactDetector
 
-STALE_S = 0.05
+STALE_AGE_S = 0.05
 """Age of a reading above which the output wrench is zero [s]."""
-JUMP_S = 1.0
+CLOCK_JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
 CLOCK_DRIFT = 1e-3
 """Maximum relative drift of two clocks [s/s]."""
 RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, measured over `_RATE_READINGS` and `_RATE_S`."""
-TARE_S = 0.5
+TARE_REST_S = 0.5
 """Time at rest before a tare [s]."""
 MAX_OFFSET_DRIFT = np.repeat([MAX_FORCE_DRIFT, MAX_TORQUE_DRIFT], 3)
 """Maximum drift of the offsets [N, N m]."""
 _RATE_READINGS, _RATE_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_S = 1e12  # [s]
-_NO_GRAVITY = np.zeros(3)
+_ZERO_GRAVITY = np.zeros(3)
 _MAX_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Integers, because each operation on a `ReadingFlag` takes a microsecond.
 _DAMAGED, _STALE, _CLIPPED = (
@@ -141,11 +141,11 @@ class Compensator:
         self._min_offset = math.inf  # least (now - t)
         self._last_in_time = -math.inf  # arrival of the last reading in time
         self._rate = _RateCheck(dt)
-        self._tare_rows = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
+        self._tare_rows = np.zeros((max(2, round(TARE_REST_S / dt)), NUM_VALUES + 6))
         self.good_count = 0
         # Load compiled code now; otherwise the first readings would be stale.
-        value_problem(np.zeros(VALUES), self._largest, self._range)
-        clip(self._eliminate(np.zeros(VALUES), np.zeros(3)), self._range)
+        value_problem(np.zeros(NUM_VALUES), self._largest, self._range)
+        clip_wrenches(self._eliminate_load(np.zeros(NUM_VALUES), np.zeros(3)), self._range)
         self._compute_tare()
         self._reset_filters()
         self.good_count = 0
@@ -162,8 +162,8 @@ class Compensator:
             "range": np.minimum(self._range, np.finfo(float).max),
             "largest": self._largest,
             "noise_limits": self._noise_limit,
-            # Readings after which more than STALE_S has passed, by the tolerance of rounding.
-            "stale_steps": math.floor(STALE_S / self._dt + 1e-9) - 1,
+            # Readings after which more than STALE_AGE_S has passed, by the tolerance of rounding.
+            "stale_steps": math.floor(STALE_AGE_S / self._dt + 1e-9) - 1,
             "tare_steps": len(self._tare_rows),
         }
 
@@ -182,10 +182,10 @@ class Compensator:
         invalid = flags & ~_NONZERO_FLAGS
         if invalid & ~_GAP:
             return self._zero_output(flags)
-        if now - self._now > STALE_S:
+        if now - self._now > STALE_AGE_S:
             self._reset_filters()
         self._now, self._number, self._t = now, reading.number, reading.t
-        self._delay_line.append(self._eliminate(reading.values, reading.gravity))
+        self._delay_line.append(self._eliminate_load(reading.values, reading.gravity))
         if invalid:
             return self._zero_output(flags)
         if self._watch is not None:
@@ -194,23 +194,23 @@ class Compensator:
             flags &= ~_IN_CONTACT
             flags |= self._detector.contact_flag(reading.values, self._delay_line[-1][:6])
         wrench = self._delay_line[0].copy()
-        if clip(wrench, self._range):
+        if clip_wrenches(wrench, self._range):
             flags |= _CLIPPED
         return Compensated(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
     def stale_output(self, now: float) -> Compensated | None:
-        """Return a zero wrench, flagged as stale, after `STALE_S` of silence; else None."""
-        if now - self._now <= STALE_S:
+        """Return a zero wrench, flagged as stale, after `STALE_AGE_S` of silence; else None."""
+        if now - self._now <= STALE_AGE_S:
             return None
         return self._zero_output(_STALE)
 
     def time_to_stale(self, now: float) -> float:
-        return max(0.0, self._now + STALE_S - now)
+        return max(0.0, self._now + STALE_AGE_S - now)
 
     def tare(self) -> str:
         """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_count < len(self._tare_rows):
-            return f"refused: fewer than {TARE_S:g} s of good readings so far"
+            return f"refused: fewer than {TARE_REST_S:g} s of good readings so far"
         problem, step, offsets = self._compute_tare()
         if problem == MOVES:
             return "refused: the sensor moves"
@@ -231,11 +231,12 @@ class Compensator:
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
     def _compute_tare(self) -> tuple[int, Array, Array]:
-        mean, squares, offsets = np.zeros(VALUES + 6), np.zeros(VALUES + 6), self.offsets.copy()
+        (mean, squares), offsets = np.zeros((2, NUM_VALUES + 6)), self.offsets.copy()
         for number, row in enumerate(self._tare_rows, 1):
             add_to_statistics(row, float(number), mean, squares)
         count = float(len(self._tare_rows))
-        return tare_into(count, mean, squares, self._noise_limit, offsets), mean[VALUES:], offsets
+        problem = tare_into(count, mean, squares, self._noise_limit, offsets)
+        return problem, mean[NUM_VALUES:], offsets
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
         flags = reading.flags
@@ -254,10 +255,10 @@ class Compensator:
         started = not math.isinf(self._min_offset)
         step = reading.t - self._t
         # Out-of-order readings are mixed with ordered ones; only such readings mean a restart.
-        lost = now - self._now > STALE_S
-        if started and reading.number <= self._number and (abs(step) > JUMP_S or lost):
+        lost = now - self._now > STALE_AGE_S
+        if started and reading.number <= self._number and (abs(step) > CLOCK_JUMP_S or lost):
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
-        if started and (abs(ahead - self._min_offset) > JUMP_S or (step <= 0.0 and lost)):
+        if started and (abs(ahead - self._min_offset) > CLOCK_JUMP_S or (step <= 0.0 and lost)):
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         if started and step <= 0.0:
             return flags | int(ReadingFlag.REORDERED)
@@ -265,9 +266,9 @@ class Compensator:
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.RESTART))
         drift = CLOCK_DRIFT * self._dt if started else 0.0
         self._min_offset = min(ahead, self._min_offset + drift)
-        if ahead - self._min_offset <= STALE_S:
+        if ahead - self._min_offset <= STALE_AGE_S:
             self._last_in_time = now
-        elif now - self._last_in_time > JUMP_S:
+        elif now - self._last_in_time > CLOCK_JUMP_S:
             return self._restart_clock(reading, ahead, flags | int(ReadingFlag.CLOCK_JUMP))
         else:
             flags |= _STALE
@@ -287,12 +288,12 @@ class Compensator:
             self._detector.restart()
         self._delay_line.clear()
 
-    def _eliminate(self, values: Array, gravity: Array | None) -> Array:
+    def _eliminate_load(self, values: Array, gravity: Array | None) -> Array:
         if gravity is None:
             if self._scales[3] != 0.0:
                 remedy = "use a source with poses or joint positions, or --sigma alone"
                 raise unknown_gravity_error("gravity in the sensor frame", remedy)
-            gravity = _NO_GRAVITY
+            gravity = _ZERO_GRAVITY
         out = np.empty(12)
         at = self.good_count % len(self._tare_rows)
         phi, zero, scales = self._phi, self._zero_phi, self._scales

@@ -15,7 +15,7 @@ from drake_teleop.logs.aligned_log import missing_orientation_error
 from drake_teleop.robots.assembly import (
     IDENTITY_POSE,
     Assembly,
-    Parts,
+    PartStreams,
     PosedByJoints,
     SensorPoseOfJoints,
     pose_from_rpy,
@@ -26,7 +26,7 @@ from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
-_REPLAY = "replay:"
+_REPLAY_PREFIX = "replay:"
 _UNUSED_RATE_HZ = 1000.0
 
 
@@ -51,6 +51,7 @@ def open_source(
         real_time: replay a log in real time.
         motion: address of a second source, for the motion.
         sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
+        arm: kinematics, for a source of joint positions.
     """
     kind = _address_kind(address)
     if kind in PART_SOURCES:
@@ -73,15 +74,15 @@ def open_source(
             remedy="remove --motion, --model and --sensor-pose",
         )
     if kind == "replay":
-        path = address.removeprefix(_REPLAY)
+        path = address.removeprefix(_REPLAY_PREFIX)
         options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
         return ReplayLogSource(path, load, **options)  # type: ignore[arg-type]
     if kind not in SOURCES:
         remedy = f"give {_address_forms(SOURCES, PART_SOURCES)}, or replay:LOG"
-        raise DrakeTeleopError("is not a source", where=address, remedy=remedy)
+        raise DrakeTeleopError("is not the address of a source", where=address, remedy=remedy)
     if load is not None and load.weight_removed:
         raise missing_orientation_error(address)
-    return SOURCES[kind](address, _period(rate_hz, address))
+    return SOURCES[kind](address, _required_period(rate_hz, address))
 
 
 def open_recording(
@@ -112,7 +113,7 @@ def open_sink(address: str) -> Sink:
     kind = _address_kind(address) or Path(address).suffix
     if kind not in SINKS:
         remedy = f"give {_address_forms(SINKS)}"
-        raise DrakeTeleopError("is not a sink", where=address, remedy=remedy)
+        raise DrakeTeleopError("is not the address of a sink", where=address, remedy=remedy)
     return SINKS[kind](address)
 
 
@@ -122,12 +123,12 @@ def _address_forms(*tables: Registry[Any]) -> str:
 
 
 def _address_kind(address: str) -> str:
-    if address.startswith(_REPLAY):
+    if address.startswith(_REPLAY_PREFIX):
         return "replay"
     return address.partition("://")[0] if "://" in address or address == "-" else ""
 
 
-def _period(rate_hz: float | None, address: str) -> float:
+def _required_period(rate_hz: float | None, address: str) -> float:
     if rate_hz is None:
         raise DrakeTeleopError(
             "the low-pass needs the rate of the readings", where=address, remedy="give --rate HZ"
@@ -147,14 +148,14 @@ def _open_part_source(
 
 def _open_parts(
     address: str, rate_hz: float | None, motion: str | None, arm: SensorPoseOfJoints | None
-) -> Parts:
+) -> PartStreams:
     names = () if arm is None else arm.joint_names
     wrench = _open_part_source(address, rate_hz, names)
     other: PartSource | None = None
     try:
         other = None if motion is None else _open_part_source(motion, 1.0 / wrench.dt, names)
         if arm is None:
-            return Parts(wrench, other)
+            return PartStreams(wrench, other)
         motion_source = wrench if other is None else other
         if JOINTS not in motion_source.streams:
             raise DrakeTeleopError(
@@ -163,7 +164,7 @@ def _open_parts(
                 remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
             )
         posed = PosedByJoints(motion_source, arm)
-        return Parts(posed) if other is None else Parts(wrench, posed)
+        return PartStreams(posed) if other is None else PartStreams(wrench, posed)
     except BaseException:
         for each in (wrench, other):
             if each is not None:
@@ -190,13 +191,13 @@ def _open_netft(address: str, rate_hz: float | None, joints: tuple[str, ...]) ->
 def _open_zenoh(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
     from drake_teleop.robots.ros2_zenoh import ZenohSource
 
-    return ZenohSource(address, _period(rate_hz, address), joints)
+    return ZenohSource(address, _required_period(rate_hz, address), joints)
 
 
 def _open_ros2(address: str, rate_hz: float | None, joints: tuple[str, ...]) -> PartSource:
     from drake_teleop.robots.ros2 import Ros2Source
 
-    return Ros2Source(address, _period(rate_hz, address), joints)
+    return Ros2Source(address, _required_period(rate_hz, address), joints)
 
 
 def _open_zenoh_sink(address: str) -> Sink:
@@ -230,7 +231,7 @@ SOURCES: Registry[Callable[[str, float], Source[Reading]]] = Registry(
 PART_SOURCES: Registry[Callable[[str, float | None, tuple[str, ...]], PartSource]] = Registry(
     "source of parts",
     {
-        "posed": lambda address, hz, joints: PosedSource(address, _period(hz, address)),
+        "posed": lambda address, hz, joints: PosedSource(address, _required_period(hz, address)),
         "rtde": _open_rtde,
         "netft": _open_netft,
         "zenoh": _open_zenoh,

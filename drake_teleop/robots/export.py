@@ -1,4 +1,4 @@
-"""Export of an identified load to the format of a robot, a compensation or a model."""
+"""Export of an identified load to formats of robots, compensations and models."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ExportedLoad:
 
 @dataclass(frozen=True)
 class Format:
-    """Export format.
+    """Format of an exported load.
 
     Args:
         of_sensor: the values are in the sensor's frame.
@@ -91,7 +91,7 @@ def export_text(
             " that the sign of the wrench is wrong",
         )
     load = ExportedLoad(*mass_com_inertia(phi), sign * found.offsets)
-    warnings = _warnings(found, to, format)
+    warnings = _export_warnings(found, to, format)
     notes = "".join(f"{format.comment} {text}\n" for text in warnings if format.comment)
     return notes + format.write(load), warnings
 
@@ -114,7 +114,7 @@ def refuse_removed_weight(found: Identification, to: str) -> None:
         )
 
 
-def _warnings(found: Identification, to: str, format: Format) -> list[str]:
+def _export_warnings(found: Identification, to: str, format: Format) -> list[str]:
     written = {name: name.startswith(("m", "I")) for name in PARAMETER_NAMES}
     written |= {name: format.inertia for name in PARAMETER_NAMES if name.startswith("I")}
     written |= {
@@ -142,12 +142,12 @@ def _format_row(values: Any) -> str:
     return ", ".join(map(_format_number, values))
 
 
-def _ur(load: ExportedLoad) -> str:
+def _ur_script(load: ExportedLoad) -> str:
     com, inertia = _format_row(load.com), _format_row(load.inertia_entries)
     return f"set_target_payload({_format_number(load.mass)}, [{com}], [{inertia}])\n"
 
 
-def _franka(load: ExportedLoad) -> str:
+def _franka_json(load: ExportedLoad) -> str:
     return _json_text(
         {
             "mass": load.mass,
@@ -158,11 +158,11 @@ def _franka(load: ExportedLoad) -> str:
     )
 
 
-def _xarm(load: ExportedLoad) -> str:
+def _xarm_call(load: ExportedLoad) -> str:
     return f"arm.set_tcp_load({_format_number(load.mass)}, [{_format_row(1e3 * load.com)}])\n"
 
 
-def _kth(load: ExportedLoad) -> str:
+def _kth_yaml(load: ExportedLoad) -> str:
     return to_yaml_text(
         {
             "bias": _float_list(load.offsets),
@@ -173,7 +173,7 @@ def _kth(load: ExportedLoad) -> str:
     )
 
 
-def _ft_tools(load: ExportedLoad) -> str:
+def _ft_yaml(load: ExportedLoad) -> str:
     return to_yaml_text(
         {
             "mass": float(load.mass),
@@ -184,14 +184,14 @@ def _ft_tools(load: ExportedLoad) -> str:
     )
 
 
-def _admittance(load: ExportedLoad) -> str:
+def _admittance_yaml(load: ExportedLoad) -> str:
     centre = {"pos": _float_list(load.com), "force": float(load.mass * STANDARD_GRAVITY)}
     compensation = {"frame": {"id": "ft_sensor", "external": False}, "CoG": centre}
     parameters = {"gravity_compensation": compensation}
     return to_yaml_text({"admittance_controller": {"ros__parameters": parameters}})
 
 
-def _bota(load: ExportedLoad) -> str:
+def _bota_json(load: ExportedLoad) -> str:
     six = dict(zip(("Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz"), load.inertia_entries, strict=True))
     bias = dict(zip(("Fx", "Fy", "Fz", "Tx", "Ty", "Tz"), load.offsets.tolist(), strict=True))
     properties = {
@@ -207,7 +207,7 @@ def _bota(load: ExportedLoad) -> str:
 _INERTIA_NAMES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 
-def _urdf(load: ExportedLoad) -> str:
+def _urdf_xml(load: ExportedLoad) -> str:
     root = Element("robot", name="load")
     inertial = SubElement(SubElement(root, "link", name="load"), "inertial")
     SubElement(inertial, "origin", xyz=_space_separated(load.com), rpy="0 0 0")
@@ -220,7 +220,7 @@ def _urdf(load: ExportedLoad) -> str:
     return _xml_text(root)
 
 
-def _sdf(load: ExportedLoad) -> str:
+def _sdf_xml(load: ExportedLoad) -> str:
     root = Element("sdf", version="1.9")
     link = SubElement(SubElement(root, "model", name="load"), "link", name="load")
     inertial = SubElement(link, "inertial")
@@ -232,7 +232,7 @@ def _sdf(load: ExportedLoad) -> str:
     return _xml_text(root)
 
 
-def _mjcf(load: ExportedLoad) -> str:
+def _mjcf_xml(load: ExportedLoad) -> str:
     root = Element("mujoco", model="load")
     body = SubElement(SubElement(root, "worldbody"), "body", name="load")
     SubElement(body, "freejoint")
@@ -266,13 +266,13 @@ _FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
 FORMATS = Registry(
     "export format",
     {
-        "ur": Format(_ur, comment="#"),
+        "ur": Format(_ur_script, comment="#"),
         "franka": Format(
-            _franka, note="transformation is the identity: replace it by that of your end effector"
+            _franka_json, note="transformation is the identity: use that of your end effector"
         ),
-        "xarm": Format(_xarm, inertia=False, comment="#"),
+        "xarm": Format(_xarm_call, inertia=False, comment="#"),
         "kth": Format(
-            _kth,
+            _kth_yaml,
             of_sensor=True,
             inertia=False,
             offsets=True,
@@ -280,19 +280,19 @@ FORMATS = Registry(
             note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
             " compensated force is twice the weight, change the sign of the mass",
         ),
-        "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
+        "ft_tools": Format(_ft_yaml, of_sensor=True, inertia=False, offsets=True, comment="#"),
         "ros2-admittance": Format(
-            _admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME_NOTE
+            _admittance_yaml, of_sensor=True, inertia=False, comment="#", note=_FRAME_NOTE
         ),
         "bota": Format(
-            _bota,
+            _bota_json,
             of_sensor=True,
             offsets=True,
             note="the inertia is about the centre of mass; Bota does not document the point",
         ),
-        "urdf": Format(_urdf, body=True),
-        "sdf": Format(_sdf, body=True),
-        "mjcf": Format(_mjcf, body=True),
+        "urdf": Format(_urdf_xml, body=True),
+        "sdf": Format(_sdf_xml, body=True),
+        "mjcf": Format(_mjcf_xml, body=True),
     },
 )
 """Export formats by name."""

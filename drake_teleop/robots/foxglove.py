@@ -15,27 +15,27 @@ from drake_teleop.robots.udp import host_and_port
 
 PORT = 8765
 TOPIC = "/wrench"
-_VECTOR = {"type": "object", "properties": {name: {"type": "number"} for name in WRENCH_COLUMNS}}
-_SCHEMA = {
+_WRENCH_SCHEMA = {"type": "object", "properties": {c: {"type": "number"} for c in WRENCH_COLUMNS}}
+_MESSAGE_SCHEMA = {
     "title": "drake_teleop.Wrench",
     "type": "object",
     "properties": {
         "number": {"type": "integer"},
         "t": {"type": "number"},
-        "contact": _VECTOR,
-        "scaled": _VECTOR,
+        "contact": _WRENCH_SCHEMA,
+        "scaled": _WRENCH_SCHEMA,
         "flags": {"type": "array", "items": {"type": "string"}},
     },
 }
 
 
-class _Channel:
+class _WrenchChannel:
     def __init__(self, where: str) -> None:
         require_library("foxglove", "foxglove-sdk", "robots", where)
         import foxglove
 
         self.context = foxglove.Context()
-        self._channel = foxglove.Channel(TOPIC, schema=_SCHEMA, context=self.context)
+        self._channel = foxglove.Channel(TOPIC, schema=_MESSAGE_SCHEMA, context=self.context)
 
     def log_wrench(self, out: Compensated, ns: int | None) -> None:
         data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
@@ -52,7 +52,7 @@ class FoxgloveSink:
 
     def __init__(self, address: str) -> None:
         host, port = host_and_port(address, PORT)
-        self._channel = _Channel(address)
+        self._channel = _WrenchChannel(address)
         import foxglove
 
         try:
@@ -75,7 +75,7 @@ class McapSink:
     """Sink that writes an MCAP file continuously; messages have the times of the readings."""
 
     def __init__(self, path: Path) -> None:
-        self._channel = _Channel(str(path))
+        self._channel = _WrenchChannel(str(path))
         import foxglove
 
         make_folder(path.parent)

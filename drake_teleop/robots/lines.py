@@ -1,7 +1,7 @@
 """Readings and wrenches as lines of JSON, and wrenches as tables.
 
-Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output:
-number, t, contact and scaled (6 each), and names of flags.
+Input: t [s], wrench (6), specific force s, omega, alpha (3 each); optionally number and saturated.
+Output: number, t, contact and scaled wrench (6 each), and names of flags.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from drake_teleop.common.files import (
 )
 from drake_teleop.logs.read.canonical import WRENCH_COLUMNS
 from drake_teleop.robots.streams import (
-    DAMAGED,
-    VALUES,
+    DAMAGED_READING,
+    NUM_VALUES,
     Compensated,
     Reading,
     ReadingFlag,
@@ -35,13 +35,13 @@ from drake_teleop.robots.streams import (
 )
 
 _MAX_LINE_BYTES = 4096  # bytes per line
-_BLOCK_BYTES = 65536
+_READ_BLOCK_BYTES = 65536
 
 
-def read_line(line: bytes, number: int) -> Reading:
+def parse_reading(line: bytes, number: int) -> Reading:
     """Return the reading in a line, flagged as damaged if it is invalid."""
     if len(line) > _MAX_LINE_BYTES:
-        return DAMAGED
+        return DAMAGED_READING
     try:
         data = json.loads(line)
         parts = [np.array(data[name], float) for name in ("wrench", "s", "omega", "alpha")]
@@ -49,9 +49,9 @@ def read_line(line: bytes, number: int) -> Reading:
         t, number = float(data["t"]), int(data.get("number", number))
         flags = int(ReadingFlag.SATURATED) if data.get("saturated") else 0
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-        return DAMAGED
-    good = values.shape == (VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
-    return Reading(number, t, values, flags) if good and 0 <= number < 2**64 else DAMAGED
+        return DAMAGED_READING
+    good = values.shape == (NUM_VALUES,) and [len(part) for part in parts] == [6, 3, 3, 3]
+    return Reading(number, t, values, flags) if good and 0 <= number < 2**64 else DAMAGED_READING
 
 
 def wrench_line(out: Compensated) -> str:
@@ -83,7 +83,7 @@ class LineSource(Source[Reading]):
             return None
         if not select.select([self._file], [], [], timeout_s)[0]:
             return []
-        block = os.read(self._file, _BLOCK_BYTES)
+        block = os.read(self._file, _READ_BLOCK_BYTES)
         self._ended = not block
         *lines, self._partial = (self._partial + block).split(b"\n")
         if self._ended or len(self._partial) > _MAX_LINE_BYTES:
@@ -91,7 +91,7 @@ class LineSource(Source[Reading]):
         found = []
         for line in lines:
             if line.strip():
-                found.append(read_line(line, self._number))
+                found.append(parse_reading(line, self._number))
                 self._number += 1
         return found
 
@@ -108,7 +108,7 @@ class LineSink(Sink):
 
 
 #: Time between two writes [s]; a killed process loses its rows. A Parquet file takes milliseconds.
-PERIOD_S = {".csv": 0.1, ".parquet": 1.0}
+WRITE_PERIOD_S = {".csv": 0.1, ".parquet": 1.0}
 
 
 class TableSink:
@@ -119,7 +119,7 @@ class TableSink:
 
     def __init__(self, path: Path) -> None:
         make_folder(path.parent)
-        self._path, self._period = path, PERIOD_S[path.suffix]
+        self._path, self._period = path, WRITE_PERIOD_S[path.suffix]
         self._rows: list[Compensated] = []
         self._written, self._end = 0, 0  # rows; bytes of the CSV file
         self._due = -np.inf

@@ -20,19 +20,19 @@ from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Part, ReadingFlag
 
 PORT = 49152
-REQUEST = struct.Struct(">HHI")
-RECORD = struct.Struct(">III6i")
+REQUEST_FORMAT = struct.Struct(">HHI")
+RECORD_FORMAT = struct.Struct(">III6i")
 START, STOP = 2, 0
-_HEADER = 0x1234
+_REQUEST_HEADER = 0x1234
 _SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
 _REQUEST_PERIOD_S, _MAX_UNCHANGED_S = 0.1, 0.05
 _MAX_RECORDS = 256  # records per call
 _PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
-_UNITS = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
+_SI_VALUE_OF_UNIT = SI_VALUE_OF_UNIT | {"klbf": 1e3 * SI_VALUE_OF_UNIT["lbf"]}
 
 
 class RdtRecord(NamedTuple):
-    """Record of RDT, with the wrench in counts."""
+    """Record of the RDT protocol, with the wrench in counts."""
 
     rdt_sequence: int
     ft_sequence: int
@@ -41,9 +41,9 @@ class RdtRecord(NamedTuple):
 
 
 def unpack_record(packet: bytes) -> RdtRecord | None:
-    if len(packet) != RECORD.size:
+    if len(packet) != RECORD_FORMAT.size:
         return None
-    rdt, ft, status, *counts = RECORD.unpack(packet)
+    rdt, ft, status, *counts = RECORD_FORMAT.unpack(packet)
     return RdtRecord(rdt, ft, status, tuple(counts))
 
 
@@ -54,12 +54,12 @@ class NetFtSource:
 
     def __init__(self, address: str, dt: float | None = None) -> None:
         parsed = Address(address, PORT, allowed=("counts", "rate", "sign"))
-        counts, rate = parsed.positive_numbers("counts", 2), parsed.positive_numbers("rate", 1)
+        counts, rate = parsed.read_numbers("counts", 2), parsed.read_numbers("rate", 1)
         sign = parsed.wrench_sign()
         if rate is None and dt is not None:
             rate = [1.0 / dt]
         if counts is None or rate is None:
-            page = _read_page(parsed)
+            page = _read_sensor_page(parsed)
             counts = counts or page[:2]
             rate = rate or page[2:]
         self.dt = 1.0 / rate[0]
@@ -80,7 +80,7 @@ class NetFtSource:
         self._socket.settimeout(timeout_s)
         try:
             while len(found) < _MAX_RECORDS:
-                packet = self._socket.recv(RECORD.size + 1)
+                packet = self._socket.recv(RECORD_FORMAT.size + 1)
                 found.append(self.part_of_packet(packet, time.monotonic()))
                 self._socket.settimeout(0.0)
         except OSError:  # no further record, or no box
@@ -111,18 +111,18 @@ class NetFtSource:
         now = time.monotonic()
         if now - max(self._last_received, self._last_request) > _REQUEST_PERIOD_S:
             self._last_request = now
-            self._send(START)
+            self._send_command(START)
 
-    def _send(self, command: int) -> None:
+    def _send_command(self, command: int) -> None:
         with suppress(OSError):  # no box yet
-            self._socket.send(REQUEST.pack(_HEADER, command, 0))
+            self._socket.send(REQUEST_FORMAT.pack(_REQUEST_HEADER, command, 0))
 
     def close(self) -> None:
-        self._send(STOP)
+        self._send_command(STOP)
         self._socket.close()
 
 
-def _read_page(address: Address) -> list[float]:
+def _read_sensor_page(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
     remedy = "check the host, or give netft://HOST?counts=FORCE,TORQUE&rate=HZ"
@@ -130,7 +130,7 @@ def _read_page(address: Address) -> list[float]:
     connection = HTTPConnection(address.host, timeout=_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
-        return parse_page(connection.getresponse().read(_MAX_PAGE_BYTES))
+        return parse_sensor_page(connection.getresponse().read(_MAX_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
             f"counts per unit, units and rate cannot be read from the sensor's page ({error!r})",
@@ -141,13 +141,13 @@ def _read_page(address: Address) -> list[float]:
         connection.close()
 
 
-def parse_page(content: bytes) -> list[float]:
-    """Return counts per N and per N m, and the rate [Hz], from netftapi2.xml."""
+def parse_sensor_page(content: bytes) -> list[float]:
+    """Return counts per N and per N m, and the rate [Hz], of the page netftapi2.xml."""
     from xml.etree import ElementTree
 
     text = {each.tag: (each.text or "").strip() for each in ElementTree.fromstring(content).iter()}
     counts = [
-        float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"].replace("-", " ")]
+        float(text[f"cfgcp{kind}"]) / _SI_VALUE_OF_UNIT[text[f"scfg{kind}u"].replace("-", " ")]
         for kind in ("f", "t")
     ]
     values = [*counts, float(text["comrdtrate"])]
@@ -157,7 +157,7 @@ def parse_page(content: bytes) -> list[float]:
 
 
 _MIN_SPAN_S, _MAX_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
-_JUMP_S = 1.0  # a larger step of the number is a restart
+_RESTART_STEP_S = 1.0  # a larger step of the number is a restart
 
 
 class SampleClock:
@@ -174,7 +174,7 @@ class SampleClock:
     def time_of_sample(self, number: int, now: float) -> float:
         """Return the time [s] of a sample that is received at `now` [s] of our monotonic clock."""
         step = number - self._number
-        if self._first is None or abs(step) * self._dt > _JUMP_S:
+        if self._first is None or abs(step) * self._dt > _RESTART_STEP_S:
             self._first = number, now
         elif now - self._first[1] >= _MIN_SPAN_S and number > self._first[0]:
             self._period = (now - self._first[1]) / (number - self._first[0])

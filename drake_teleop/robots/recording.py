@@ -16,9 +16,9 @@ from drake_teleop.common.rotations import rotation_matrices
 from drake_teleop.common.texts import to_yaml_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.assembly import Parts
-from drake_teleop.robots.compensator import JUMP_S
-from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Part, Reading, ReadingFlag
+from drake_teleop.robots.assembly import PartStreams
+from drake_teleop.robots.compensator import CLOCK_JUMP_S
+from drake_teleop.robots.streams import IMU, NUM_VALUES, POSE, WRENCH, Part, Reading, ReadingFlag
 
 _INVALID_FLAGS = (
     ReadingFlag.DAMAGED
@@ -27,7 +27,7 @@ _INVALID_FLAGS = (
     | ReadingFlag.SATURATED
     | ReadingFlag.GAP
 )
-_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
+_LOG_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
     WRENCH: {"force": canonical.WRENCH_COLUMNS[:3], "torque": canonical.WRENCH_COLUMNS[3:]},
     POSE: {"orientation": canonical.QUATERNION_COLUMNS, "position": canonical.POSITION_COLUMNS},
     IMU: {
@@ -35,16 +35,16 @@ _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
         "angular_velocity": canonical.ANGULAR_VELOCITY_COLUMNS,
     },
 }
-_GRAVITY = 9.81  # as in `compensate`
+_GRAVITY_M_S2 = 9.81  # as in `compensate`
 _NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
-_CLOCK_SAMPLES = 50  # successive samples that confirm another clock
+_NEW_CLOCK_SAMPLES = 50  # successive samples that confirm another clock
 _T = TypeVar("_T")
 
 
 class SampleRecorder(ABC, Generic[_T]):
     """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
-    If a clock is set, a new record starts; the longest one is written.
+    If the source's clock is set, a new record starts; the longest one is written.
 
     Attributes:
         left_out: number of rejected samples.
@@ -60,8 +60,8 @@ class SampleRecorder(ABC, Generic[_T]):
         self._part, self._other_clock = self._empty_part(), self._empty_part()
         self._longest = self._part
 
-    def _empty_part(self) -> dict[str, _Samples]:
-        return {stream: _Samples() for stream in self._largest}
+    def _empty_part(self) -> dict[str, _SampleSeries]:
+        return {stream: _SampleSeries() for stream in self._largest}
 
     def _add_sample(
         self, stream: str, t: float, values: Array, flags: int, now: float = 0.0
@@ -75,14 +75,14 @@ class SampleRecorder(ABC, Generic[_T]):
         same_clock = not samples.is_clock_jump(t)
         if same_clock or other.is_clock_jump(t):
             self.left_out += len(other.t)
-            other = self._other_clock[stream] = _Samples()
+            other = self._other_clock[stream] = _SampleSeries()
         self.left_out += not (samples if same_clock else other).add(t, values, now)
-        if len(other.t) == _CLOCK_SAMPLES:
+        if len(other.t) == _NEW_CLOCK_SAMPLES:
             self.clock_changes += 1
             self._longest = self._longest_part()
             self._part, self._other_clock = self._other_clock, self._empty_part()
 
-    def _longest_part(self) -> dict[str, _Samples]:
+    def _longest_part(self) -> dict[str, _SampleSeries]:
         return max(self._part, self._longest, key=_duration_s)
 
     @property
@@ -110,7 +110,7 @@ class ReadingRecorder(SampleRecorder[Reading]):
         self._add_sample(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
-        t, values = self._longest_part()[WRENCH].times_and_values(VALUES, self.left_out)
+        t, values = self._longest_part()[WRENCH].times_and_values(NUM_VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
 
@@ -118,13 +118,13 @@ class ReadingRecorder(SampleRecorder[Reading]):
 class PartRecorder(SampleRecorder[tuple[Part, float]]):
     """Recorder of parts: wrenches, and poses or IMU samples.
 
-    `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame.
+    `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame F.
     """
 
     file = "log.yaml"
-    files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _FIELDS))
+    files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _LOG_FIELDS))
 
-    def __init__(self, parts: Parts, largest: Array | None, X_FS: Array) -> None:
+    def __init__(self, parts: PartStreams, largest: Array | None, X_FS: Array) -> None:
         super().__init__({WRENCH: largest, parts.motion_stream: None})
         self._motion_stream, self._two_clocks = parts.motion_stream, parts.two_clocks
         self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
@@ -150,16 +150,16 @@ class PartRecorder(SampleRecorder[tuple[Part, float]]):
             (WRENCH, wrench, -start),
             (self._motion_stream, motion, behind - start),
         ):
-            names = [name for columns in _FIELDS[stream].values() for name in columns]
+            names = [name for columns in _LOG_FIELDS[stream].values() for name in columns]
             t, values = samples.times_and_values(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
         write_text(path, to_yaml_text(self._log_description()))
 
     def _log_description(self) -> dict[str, Any]:
-        found: dict[str, Any] = {"gravity": _GRAVITY}
+        found: dict[str, Any] = {"gravity": _GRAVITY_M_S2}
         for stream in (WRENCH, self._motion_stream):
-            fields = {name: {"columns": list(names)} for name, names in _FIELDS[stream].items()}
+            fields = {name: {"columns": list(names)} for name, names in _LOG_FIELDS[stream].items()}
             found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}} | fields
         if self._motion_stream == POSE:
             R_SF = self._R_FS.T
@@ -169,14 +169,14 @@ class PartRecorder(SampleRecorder[tuple[Part, float]]):
         return found
 
 
-class _Samples:
+class _SampleSeries:
     def __init__(self) -> None:
         self.t: list[float] = []
         self._values: list[Array] = []
         self.min_offset = math.inf
 
     def is_clock_jump(self, t: float) -> bool:
-        return bool(self.t) and abs(t - self.t[-1]) > JUMP_S
+        return bool(self.t) and abs(t - self.t[-1]) > CLOCK_JUMP_S
 
     def add(self, t: float, values: Array, now: float) -> bool:
         if self.t and t <= self.t[-1]:
@@ -196,5 +196,5 @@ class _Samples:
         return np.array(self.t), np.array(self._values).reshape(-1, width)
 
 
-def _duration_s(part: dict[str, _Samples]) -> float:
+def _duration_s(part: dict[str, _SampleSeries]) -> float:
     return min(samples.t[-1] - samples.t[0] if samples.t else 0.0 for samples in part.values())

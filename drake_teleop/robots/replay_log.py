@@ -1,4 +1,4 @@
-"""Source that replays a log, aligned as by `eliminate`."""
+"""Source that replays a log, with motion and wrench aligned as by `eliminate`."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ReplayLogSource(Source[Reading]):
         log = read_log(path, bandwidth_hz=cutoff_hz)
         if log.static:
             raise DrakeTeleopError(
-                "static poses have no order in time",
+                "is a log of static poses, which have no order in time",
                 where=str(path),
                 remedy="give a log of a motion",
             )

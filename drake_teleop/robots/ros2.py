@@ -15,7 +15,7 @@ from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.ros2_messages import (
-    KINDS,
+    MESSAGE_TYPES,
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
@@ -26,10 +26,10 @@ from drake_teleop.robots.ros2_messages import (
 )
 from drake_teleop.robots.streams import NONZERO_FLAGS, Compensated, Part, ReadingFlag
 
-_NODE = "drake_teleop"
-_DIAGNOSTICS_S = 1.0  # longest period of diagnostics [s]
+_NODE_NAME = "drake_teleop"
+_DIAGNOSTICS_PERIOD_S = 1.0  # longest period of diagnostics [s]
 _MAX_MESSAGES = 256  # queued messages of a stream
-_SPIN_S = 0.05  # longest time between two waits for services [s]
+_SPIN_PERIOD_S = 0.05  # longest time between two waits for services [s]
 
 
 class RosNode:
@@ -44,7 +44,7 @@ class RosNode:
         self._context = rclpy.Context()
         handlers = SignalHandlerOptions.NO
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=handlers)
-        self.node = rclpy.create_node(_NODE, context=self._context)
+        self.node = rclpy.create_node(_NODE_NAME, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 
@@ -65,8 +65,8 @@ def shared_node(domain: int) -> RosNode:
     return RosNode(domain)
 
 
-def parse_address(text: str, allowed: tuple[str, ...]) -> Address:
-    """Return the address ros2://TOPIC[?...]; the first name of TOPIC is no host."""
+def parse_ros2_address(text: str, allowed: tuple[str, ...]) -> Address:
+    """Return the parsed address ros2://TOPIC[?...], which has no host."""
     kind, _, rest = text.partition("://")
     address = Address(f"{kind}:///{rest.lstrip('/')}", None, allowed, host="localhost")
     require_library("rclpy", "rclpy", "ros2", text)
@@ -94,10 +94,10 @@ class Ros2Source:
 
     @delayed_signals()
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        parsed = parse_address(address, SOURCE_PARAMETERS)
+        parsed = parse_ros2_address(address, SOURCE_PARAMETERS)
         self.dt, sign, domain = dt, parsed.wrench_sign(), domain_of_address(parsed)
         topics, frames, self.streams = source_topics(parsed, joints)
-        classes = {name: message_class(KINDS[name], address) for name in topics}
+        classes = {name: message_class(MESSAGE_TYPES[name], address) for name in topics}
         self._converter = MessageConverter(sign, frames, joints)
         self._found: list[Part] = []
         self._counts: Counter[str] = Counter()
@@ -108,20 +108,20 @@ class Ros2Source:
 
     @delayed_signals()
     def read(self, timeout_s: float) -> list[Part] | None:
-        self._take_all()
+        self._take_messages()
         if not self._found:
             self._node.spin(timeout_s)
-            self._take_all()
+            self._take_messages()
         elif time.monotonic() >= self._next_spin:  # services, under a constant load
             self._node.spin(0.0)
-            self._next_spin = time.monotonic() + _SPIN_S
+            self._next_spin = time.monotonic() + _SPIN_PERIOD_S
         found, self._found = self._found, []
         return found
 
     def close(self) -> None:
         self._node.close()
 
-    def _take_all(self) -> None:
+    def _take_messages(self) -> None:
         # An executor needs 0.3 ms to find each message; taking those that are there needs 0.02 ms.
         for subscription, receive in self._subscriptions:
             with subscription.handle:
@@ -163,18 +163,18 @@ class Ros2Sink:
 
     @delayed_signals()
     def __init__(self, address: str) -> None:
-        parsed = parse_address(address, ("frame", "wrench", "domain"))
+        parsed = parse_ros2_address(address, ("frame", "wrench", "domain"))
         from rclpy.qos import qos_profile_sensor_data
 
         topic, domain = topic_of_address(parsed, parsed.path), domain_of_address(parsed)
-        self._which = parsed.choose_word("wrench", ("contact", "scaled"))
+        self._which = parsed.read_word("wrench", ("contact", "scaled"))
         kinds = [WRENCH_STAMPED]
         kinds += [f"diagnostic_msgs/msg/Diagnostic{name}" for name in ("Array", "Status")]
         kinds += ["diagnostic_msgs/msg/KeyValue"]
         classes = {kind.rpartition("/")[2]: message_class(kind, address) for kind in kinds}
         self._kinds = SimpleNamespace(**classes)
         self._message = self._kinds.WrenchStamped()
-        self._message.header.frame_id = parsed.required_parameter("frame") or ""
+        self._message.header.frame_id = parsed.optional_parameter("frame") or ""
         self._node = shared_node(domain)
         self._topic, self._flags, self._next = f"/{topic}", -1, 0.0
         self._counts: Counter[str] = Counter()
@@ -198,7 +198,7 @@ class Ros2Sink:
         self._counts.update(flag_names(out.flags) if out.flags else ())
         now = time.monotonic()
         if out.flags != self._flags or now >= self._next:
-            self._flags, self._next = out.flags, now + _DIAGNOSTICS_S
+            self._flags, self._next = out.flags, now + _DIAGNOSTICS_PERIOD_S
             self._diagnostics.publish(self._diagnostics_message(out, ns))
 
     def close(self) -> None:
@@ -213,7 +213,7 @@ class Ros2Sink:
         values = [self._kinds.KeyValue(key=key, value=str(value)) for key, value in pairs.items()]
         status = kind(
             level=level,
-            name=f"{_NODE}: {self._topic}",
+            name=f"{_NODE_NAME}: {self._topic}",
             message=", ".join(flag_names(out.flags)) or "ok",
             values=values,
         )

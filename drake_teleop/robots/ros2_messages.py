@@ -1,4 +1,4 @@
-"""Conversion of ROS 2 messages to parts, shared by the sources by rclpy and by zenoh."""
+"""Conversion of ROS 2 messages to parts, for the sources by rclpy and by zenoh."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Part
 
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
-KINDS = {
+MESSAGE_TYPES = {
     WRENCH: WRENCH_STAMPED,
     "tf": "tf2_msgs/msg/TFMessage",
     POSE: "geometry_msgs/msg/PoseStamped",
     IMU: "sensor_msgs/msg/Imu",
     JOINTS: "sensor_msgs/msg/JointState",
 }
-_STREAMS = {"tf": POSE}
+_STREAM_OF_TOPIC = {"tf": POSE}
 _MAX_FRAMES = 64  # frames in a chain
 SOURCE_PARAMETERS = ("pose", "imu", "joints", "tf", "domain", "sign")
 """Parameters of a source's address."""
 
 
 def domain_of_address(address: Address) -> int:
-    text = address.required_parameter("domain") or "0"
+    text = address.optional_parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         raise DrakeTeleopError(
             f"domain={text!r} is not a ROS domain",
@@ -41,9 +41,9 @@ def topic_of_address(address: Address, text: str) -> str:
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
-            f"{text!r} is not a topic",
+            f"{text!r} is not the name of a ROS topic",
             where=address.text,
-            remedy="give one, such as zenoh://HOST/ft_sensor/wrench",
+            remedy="give one such as /ft_sensor/wrench",
         )
     return topic
 
@@ -51,13 +51,13 @@ def topic_of_address(address: Address, text: str) -> str:
 def source_topics(
     address: Address, joints: tuple[str, ...]
 ) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """Return the topics in an address by name, the frames of `tf`, and the streams."""
+    """Return the topics in an address by stream, the two frames of `tf`, and the streams."""
     topics = {WRENCH: topic_of_address(address, address.path)}
     for stream in (POSE, IMU, JOINTS):
-        if (text := address.required_parameter(stream)) is not None:
+        if (text := address.optional_parameter(stream)) is not None:
             topics[stream] = topic_of_address(address, text)
     frames: tuple[str, ...] = ()
-    if (text := address.required_parameter("tf")) is not None:
+    if (text := address.optional_parameter("tf")) is not None:
         frames, topics["tf"] = tuple(text.split(",")), "tf"
         if len(frames) != 2 or not all(frames):
             raise DrakeTeleopError(
@@ -71,11 +71,11 @@ def source_topics(
             where=address.text,
             remedy="give --model and --sensor-frame",
         )
-    return topics, frames, tuple(_STREAMS.get(name, name) for name in topics)
+    return topics, frames, tuple(_STREAM_OF_TOPIC.get(name, name) for name in topics)
 
 
 def damaged_part(name: str) -> Part:
-    return DAMAGED_WRENCH._replace(stream=_STREAMS.get(name, name))
+    return DAMAGED_WRENCH._replace(stream=_STREAM_OF_TOPIC.get(name, name))
 
 
 class MessageConverter:
@@ -88,14 +88,14 @@ class MessageConverter:
         self._links: dict[str, tuple[str, Array]] = {}
 
     def parts_of_message(self, name: str, data: Any, number: int) -> list[Part]:
-        """Return the parts of a message with ROS's fields; `name` is a key of `KINDS`."""
+        """Return the parts of a ROS message; `name` is a key of `MESSAGE_TYPES`."""
         if name == "tf":
             samples = self._transform_pose(data)
         else:
-            values = self._values(name, data)
+            values = self._message_values(name, data)
             samples = [] if values is None else [(data.header.stamp, values)]
         return [
-            Part(_STREAMS.get(name, name), number, stamp.sec + 1e-9 * stamp.nanosec, values)
+            Part(_STREAM_OF_TOPIC.get(name, name), number, stamp.sec + 1e-9 * stamp.nanosec, values)
             for stamp, values in samples
         ]
 
@@ -108,7 +108,7 @@ class MessageConverter:
                 _pose_array(X.translation, X.rotation),
             )
 
-    def _values(self, name: str, data: Any) -> Array | None:
+    def _message_values(self, name: str, data: Any) -> Array | None:
         if name == WRENCH:
             wrench = data.wrench
             return self._sign * np.array(

@@ -15,18 +15,18 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.interruption import delayed_signals
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE
-from drake_teleop.robots.compensate import compensate_command
+from drake_teleop.robots.compensate import run_compensate_command
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.ros2 import parse_address, shared_node
+from drake_teleop.robots.ros2 import parse_ros2_address, shared_node
 from drake_teleop.robots.ros2_messages import SOURCE_PARAMETERS, domain_of_address
 
-_SCALES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
+_SCALE_NAMES = ("sigma", "gamma", "sigma_weight", "sigma_inertia")
 _CALIBRATION_END_S = 3.0  # longest time for the last evaluation of a calibration [s]
-_CALIBRATE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
+_CALIBRATE_CODE = "import sys; from drake_teleop.cli.main import main; main(sys.argv[1:])"
 
 
 class ServedCompensator:
-    """Compensator that the services and parameters of a node replace and change.
+    """Compensator whose load and scales the services and parameters of a node change.
 
     `make` maps a load to a compensator; `calibrate` maps tolerance and seconds to the arguments of
     the command `calibrate`, whose results are written to `out`.
@@ -48,7 +48,7 @@ class ServedCompensator:
         self._current = make(Identification.load(load))
         self._pool = ThreadPoolExecutor(1)
         self._process: subprocess.Popen[str] | None = None
-        for name in _SCALES:
+        for name in _SCALE_NAMES:
             node.declare_parameter(name, float(scales[name]))
         node.declare_parameter("load", str(load))
         node.declare_parameter("until", DEFAULT_TOLERANCE)
@@ -79,7 +79,7 @@ class ServedCompensator:
         return self._node.get_parameter(name).value
 
     def _set_scales(self) -> None:
-        sigma, gamma, *others = (self._parameter_value(name) for name in _SCALES)
+        sigma, gamma, *others = (self._parameter_value(name) for name in _SCALE_NAMES)
         weight, inertia = (None if value < 0.0 else value for value in others)
         self._current.set_scales(sigma, gamma, weight, inertia)
 
@@ -87,8 +87,8 @@ class ServedCompensator:
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
-            separate = each.name in _SCALES[2:]
-            if each.name in _SCALES and not (
+            separate = each.name in _SCALE_NAMES[2:]
+            if each.name in _SCALE_NAMES and not (
                 math.isfinite(each.value) and (separate or each.value >= 0.0)
             ):
                 reason = f"{each.name}: {each.value} is not a finite number of at least 0"
@@ -119,7 +119,7 @@ class ServedCompensator:
         if self._process is not None:
             response.message = "refused: a calibration runs already"
             return response
-        words = [sys.executable, "-c", _CALIBRATE]
+        words = [sys.executable, "-c", _CALIBRATE_CODE]
         words += self._calibrate(self._parameter_value("until"), self._parameter_value("seconds"))
         process = self._process = subprocess.Popen(
             words,
@@ -146,7 +146,7 @@ class ServedCompensator:
         return response
 
 
-def ros2_command(
+def run_ros2_command(
     source: str,
     load: Path,
     sink: str,
@@ -161,8 +161,8 @@ def ros2_command(
             raise DrakeTeleopError(
                 "is not an address of a ROS topic", where=address, remedy="give ros2://TOPIC"
             )
-    node = shared_node(domain_of_address(parse_address(source, SOURCE_PARAMETERS)))
-    scales = {name: -1.0 if options.get(name) is None else options[name] for name in _SCALES}
+    node = shared_node(domain_of_address(parse_ros2_address(source, SOURCE_PARAMETERS)))
+    scales = {name: -1.0 if options.get(name) is None else options[name] for name in _SCALE_NAMES}
     served: list[ServedCompensator] = []
 
     def serve_compensator(make: Callable[[Identification], Compensator]) -> Any:
@@ -170,7 +170,7 @@ def ros2_command(
         return served[0]
 
     try:
-        compensate_command(source, load, sink, attach=serve_compensator, **options)
+        run_compensate_command(source, load, sink, attach=serve_compensator, **options)
     finally:
         for each in served:
             each.close()

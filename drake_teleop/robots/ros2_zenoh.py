@@ -15,7 +15,7 @@ from drake_teleop.common.errors import require_library
 from drake_teleop.common.numeric import Array
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.ros2_messages import (
-    KINDS,
+    MESSAGE_TYPES,
     SOURCE_PARAMETERS,
     WRENCH_STAMPED,
     MessageConverter,
@@ -27,11 +27,11 @@ from drake_teleop.robots.ros2_messages import (
 from drake_teleop.robots.streams import Compensated, Part
 
 PORT = 7447
-_NUMBER = struct.Struct("<qq")
-_ATTACHMENT = struct.Struct("<qqB16s")
+_NUMBER_FORMAT = struct.Struct("<qq")
+_ATTACHMENT_FORMAT = struct.Struct("<qqB16s")
 _OLD_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
-_MAX_QUEUED = 4096  # queued messages; newer ones are dropped
-_NODE = "drake_teleop"
+_MAX_QUEUED_MESSAGES = 4096  # queued messages; newer ones are dropped
+_NODE_NAME = "drake_teleop"
 
 
 def require_libraries(where: str) -> None:
@@ -81,13 +81,13 @@ def liveliness_tokens(
 
 
 def make_attachment(number: int, ns: int, sender: bytes) -> bytes:
-    """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
-    return _ATTACHMENT.pack(number, ns, len(sender), sender)
+    """Return number, time [ns] and sender of a message as bytes (rmw_zenoh since 0.2.4)."""
+    return _ATTACHMENT_FORMAT.pack(number, ns, len(sender), sender)
 
 
 def message_number(attached: bytes) -> int | None:
-    if len(attached) == _ATTACHMENT.size:
-        return int(_NUMBER.unpack_from(attached)[0])
+    if len(attached) == _ATTACHMENT_FORMAT.size:
+        return int(_NUMBER_FORMAT.unpack_from(attached)[0])
     if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
         return int(struct.unpack_from("<q", attached, len(_OLD_PREFIX))[0])
     return None
@@ -108,18 +108,18 @@ class CdrConverter(MessageConverter):
 
         super().__init__(sign, frames, joints)
         self._types, self._damaged = message_types(), SerdeError
-        self._counts = dict.fromkeys(KINDS, 0)
-        for name in KINDS:  # creates the deserializers before the first message
-            self.parts(name, b"", b"")
-        self._counts = dict.fromkeys(KINDS, 0)
+        self._counts = dict.fromkeys(MESSAGE_TYPES, 0)
+        for name in MESSAGE_TYPES:  # creates the deserializers before the first message
+            self.parts_of_cdr(name, b"", b"")
+        self._counts = dict.fromkeys(MESSAGE_TYPES, 0)
 
-    def parts(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
+    def parts_of_cdr(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
         self._counts[name] += 1
         number = message_number(attachment)
         if number is None:
             number = self._counts[name]
         try:
-            data = self._types.deserialize_cdr(message, KINDS[name])
+            data = self._types.deserialize_cdr(message, MESSAGE_TYPES[name])
         except self._damaged:
             return [damaged_part(name)]
         return self.parts_of_message(name, data, number)
@@ -141,15 +141,15 @@ class ZenohSource:
         self._session = open_session(parsed)
         for stream, topic in topics.items():
             self._session.declare_subscriber(
-                topic_key(domain, topic, KINDS[stream]), self._callback(stream)
+                topic_key(domain, topic, MESSAGE_TYPES[stream]), self._make_callback(stream)
             )
 
     def read(self, timeout_s: float) -> list[Part] | None:
         found: list[Part] = []
         try:
-            found += self.messages.parts(*self._queue.get(timeout=timeout_s))
-            while len(found) < _MAX_QUEUED:
-                found += self.messages.parts(*self._queue.get_nowait())
+            found += self.messages.parts_of_cdr(*self._queue.get(timeout=timeout_s))
+            while len(found) < _MAX_QUEUED_MESSAGES:
+                found += self.messages.parts_of_cdr(*self._queue.get_nowait())
         except queue.Empty:
             pass
         return found
@@ -157,9 +157,9 @@ class ZenohSource:
     def close(self) -> None:
         self._session.close()
 
-    def _callback(self, stream: str) -> Callable[[Any], None]:
+    def _make_callback(self, stream: str) -> Callable[[Any], None]:
         def enqueue(sample: Any) -> None:
-            if self._queue.qsize() < _MAX_QUEUED:
+            if self._queue.qsize() < _MAX_QUEUED_MESSAGES:
                 attachment = sample.attachment
                 attachment = b"" if attachment is None else attachment.to_bytes()
                 self._queue.put((stream, sample.payload.to_bytes(), attachment))
@@ -176,17 +176,17 @@ class ZenohSink:
     def __init__(self, address: str) -> None:
         parsed = Address(address, PORT, allowed=("frame", "wrench", "domain"))
         domain, topic = domain_of_address(parsed), topic_of_address(parsed, parsed.path)
-        which = parsed.choose_word("wrench", ("contact", "scaled"))
+        which = parsed.read_word("wrench", ("contact", "scaled"))
         require_libraries(address)
         self._types, self._which = message_types(), which
-        self._frame = parsed.required_parameter("frame") or ""
+        self._frame = parsed.optional_parameter("frame") or ""
         hashed = self._types.hash_rihs01(WRENCH_STAMPED)
         self._session = open_session(parsed)
-        session = str(self._session.info.zid())
-        self._sender, self._number = bytes.fromhex(session.rjust(32, "0"))[:16], 0
+        zid = str(self._session.info.zid())
+        self._sender, self._number = bytes.fromhex(zid.rjust(32, "0"))[:16], 0
         self._tokens = [
             self._session.liveliness().declare_token(token)
-            for token in liveliness_tokens(domain, session, _NODE, topic, WRENCH_STAMPED, hashed)
+            for token in liveliness_tokens(domain, zid, _NODE_NAME, topic, WRENCH_STAMPED, hashed)
         ]
         self._publisher = self._session.declare_publisher(
             topic_key(domain, topic, WRENCH_STAMPED, hashed), express=True

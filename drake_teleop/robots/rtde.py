@@ -14,14 +14,14 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.vectors import quaternion_exponential
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.rtde_reader import SAMPLE
+from drake_teleop.robots.rtde_reader import SAMPLE_FORMAT
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
 PORT = 30004
 _START_TIMEOUT_S = 10.0  # wait for the robot at the start
 _RESTART_PERIOD_S = 0.2  # between two starts of the child
 _RATE_SAMPLES = 5  # samples for the rate
-_BLOCK_BYTES = 65536
+_READ_BLOCK_BYTES = 65536
 
 
 class RtdeSource:
@@ -36,12 +36,8 @@ class RtdeSource:
                 "RTDE always uses port 30004", where=address, remedy="remove the port"
             )
         require_library("rtde_receive", "ur_rtde", "robots", address)
-        self._host, self._sign, self._partial, self._started = (
-            parsed.host,
-            parsed.wrench_sign(),
-            b"",
-            0.0,
-        )
+        self._host, self._sign = parsed.host, parsed.wrench_sign()
+        self._partial, self._started = b"", 0.0
         self._start_process()
         quaternion_exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
@@ -65,7 +61,7 @@ class RtdeSource:
     def _read_samples(self, timeout_s: float) -> list[tuple[float, ...]]:
         if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
             return []
-        block = os.read(self._pipe, _BLOCK_BYTES)
+        block = os.read(self._pipe, _READ_BLOCK_BYTES)
         if not block:
             if time.monotonic() - self._started > _RESTART_PERIOD_S:
                 self._stop_process()
@@ -74,9 +70,9 @@ class RtdeSource:
                 time.sleep(min(timeout_s, _RESTART_PERIOD_S))
             return []
         block = self._partial + block
-        complete = len(block) - len(block) % SAMPLE.size
+        complete = len(block) - len(block) % SAMPLE_FORMAT.size
         self._partial = block[complete:]
-        return list(SAMPLE.iter_unpack(block[:complete]))
+        return list(SAMPLE_FORMAT.iter_unpack(block[:complete]))
 
     def _start_process(self) -> None:
         code = "from drake_teleop.robots.rtde_reader import main; main()"

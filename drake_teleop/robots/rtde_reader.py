@@ -10,16 +10,16 @@ import struct
 import sys
 import time
 
-SAMPLE = struct.Struct("<16d")
+SAMPLE_FORMAT = struct.Struct("<16d")
 """Time of the controller [s], raw wrench (6), TCP pose (6), tool acceleration (3)."""
-VARIABLES = ("timestamp", "ft_raw_wrench", "actual_TCP_pose", "actual_tool_accelerometer")
+RTDE_VARIABLES = ("timestamp", "ft_raw_wrench", "actual_TCP_pose", "actual_tool_accelerometer")
 _POLL_S, _MAX_SILENCE_S = 0.0002, 1.0
 
 
 def write_samples_to_pipe(host: str, pipe: int) -> None:
     import rtde_receive
 
-    robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(VARIABLES))
+    robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(RTDE_VARIABLES))
     last, new = -1.0, time.monotonic()
     while robot.isConnected() and time.monotonic() - new < _MAX_SILENCE_S:
         t = robot.getTimestamp()
@@ -29,7 +29,7 @@ def write_samples_to_pipe(host: str, pipe: int) -> None:
             time.sleep(_POLL_S)
             continue
         last, new = t, time.monotonic()
-        os.write(pipe, SAMPLE.pack(t, *wrench, *pose, *acceleration))
+        os.write(pipe, SAMPLE_FORMAT.pack(t, *wrench, *pose, *acceleration))
 
 
 def main() -> None:

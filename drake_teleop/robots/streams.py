@@ -13,12 +13,12 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 
 _T = TypeVar("_T")
-VALUES = 15
+NUM_VALUES = 15
 """Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
 
 class ReadingFlag(IntFlag):
-    """Reason of a zero wrench, or further information; the bits of the packets."""
+    """Flag of a wrench: reason why it is zero, or information; bits as in the packets."""
 
     SATURATED = 1  #: reported by the sensor, or a channel at its range
     DAMAGED = 2  #: invalid packet
@@ -83,7 +83,7 @@ class Compensated(NamedTuple):
     flags: int
 
 
-DAMAGED = Reading(-1, np.nan, np.full(VALUES, np.nan), int(ReadingFlag.DAMAGED))
+DAMAGED_READING = Reading(-1, np.nan, np.full(NUM_VALUES, np.nan), int(ReadingFlag.DAMAGED))
 """Reading for invalid packets."""
 DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(ReadingFlag.DAMAGED))
 """Part for invalid packets."""

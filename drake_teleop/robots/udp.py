@@ -14,7 +14,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import (
-    DAMAGED,
+    DAMAGED_READING,
     DAMAGED_WRENCH,
     Compensated,
     Part,
@@ -23,56 +23,57 @@ from drake_teleop.robots.streams import (
 )
 
 LOCALHOST = "127.0.0.1"
-READING = struct.Struct("<4sIQd15d")
-POSED = struct.Struct("<4sIQd13d")
-WRENCH = struct.Struct("<4sIQd12d")
+READING_FORMAT = struct.Struct("<4sIQd15d")
+POSED_FORMAT = struct.Struct("<4sIQd13d")
+WRENCH_FORMAT = struct.Struct("<4sIQd12d")
 _READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
-_HEAD = struct.Struct("<4sIQd")
+_HEADER_FORMAT = struct.Struct("<4sIQd")
 _MAX_PACKETS = 256  # packets per call
 _BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
-_SATURATED = int(ReadingFlag.SATURATED)
+_SATURATED_FLAG = int(ReadingFlag.SATURATED)
 
 
 def pack_reading(reading: Reading) -> bytes:
-    return READING.pack(_READING_TAG, reading.flags, reading.number, reading.t, *reading.values)
+    head = _READING_TAG, reading.flags, reading.number, reading.t
+    return READING_FORMAT.pack(*head, *reading.values)
 
 
 def unpack_reading(packet: bytes) -> Reading:
     """Return the reading in a packet, flagged as damaged if it is invalid."""
-    if len(packet) != READING.size or packet[:4] != _READING_TAG:
-        return DAMAGED
-    _, flags, number, t = _HEAD.unpack_from(packet)
-    values = np.frombuffer(packet, "<f8", 15, _HEAD.size).astype(np.float64)
-    return Reading(number, t, values, flags & _SATURATED)
+    if len(packet) != READING_FORMAT.size or packet[:4] != _READING_TAG:
+        return DAMAGED_READING
+    _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
+    values = np.frombuffer(packet, "<f8", 15, _HEADER_FORMAT.size).astype(np.float64)
+    return Reading(number, t, values, flags & _SATURATED_FLAG)
 
 
 def pack_parts(wrench: Part, pose: Part) -> bytes:
     head = _POSED_TAG, wrench.flags, wrench.number, wrench.t
-    return POSED.pack(*head, *wrench.values, *pose.values)
+    return POSED_FORMAT.pack(*head, *wrench.values, *pose.values)
 
 
 def unpack_parts(packet: bytes) -> list[Part]:
-    if len(packet) != POSED.size or packet[:4] != _POSED_TAG:
+    if len(packet) != POSED_FORMAT.size or packet[:4] != _POSED_TAG:
         return [DAMAGED_WRENCH]
-    _, flags, number, t = _HEAD.unpack_from(packet)
-    values = np.frombuffer(packet, "<f8", 13, _HEAD.size).astype(np.float64)
-    wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED)
+    _, flags, number, t = _HEADER_FORMAT.unpack_from(packet)
+    values = np.frombuffer(packet, "<f8", 13, _HEADER_FORMAT.size).astype(np.float64)
+    wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED_FLAG)
     return [wrench, Part(streams.POSE, number, t, values[6:])]
 
 
 def pack_wrench(out: Compensated) -> bytes:
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
-    return _HEAD.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
+    return _HEADER_FORMAT.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
 def unpack_wrench(packet: bytes) -> Compensated:
-    if len(packet) != WRENCH.size or packet[:4] != _WRENCH_TAG:
+    if len(packet) != WRENCH_FORMAT.size or packet[:4] != _WRENCH_TAG:
         raise DrakeTeleopError(
             f"its {len(packet)} bytes are not a compensated wrench",
             where="packet",
-            remedy=f"send {WRENCH.size} bytes that begin with {_WRENCH_TAG!r}",
+            remedy=f"send {WRENCH_FORMAT.size} bytes that begin with {_WRENCH_TAG!r}",
         )
-    _, flags, number, t, *values = WRENCH.unpack(packet)
+    _, flags, number, t, *values = WRENCH_FORMAT.unpack(packet)
     return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
 
@@ -116,7 +117,7 @@ class _PacketReceiver:
         if self._poll.poll(1e3 * timeout_s):
             with suppress(BlockingIOError):
                 while len(found) < _MAX_PACKETS:
-                    found.append(self._socket.recv(READING.size + 1))
+                    found.append(self._socket.recv(READING_FORMAT.size + 1))
         return found
 
     def close(self) -> None:
@@ -150,7 +151,7 @@ class PosedSource(_PacketReceiver):
 
 
 class UdpSink:
-    """Sink that sends wrenches to HOST:PORT, with or without a receiver."""
+    """Sink that sends wrenches to udp://HOST:PORT, with or without a receiver."""
 
     def __init__(self, address: str) -> None:
         self._to = host_and_port(address)

@@ -33,19 +33,19 @@ from drake_teleop.robots.compensation_step import low_pass_into
 from drake_teleop.robots.replay_log import ReplayLogSource
 from drake_teleop.robots.streams import ReadingFlag
 
-MODEL_ERROR = 0.02
+MODEL_ERROR_FRACTION = 0.02
 """Relative error of the load's wrench due to errors of gains and clocks."""
-MIN_NOISE = np.repeat([0.05, 0.0025], 3)
+MIN_NOISE_1_KHZ = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
-_NEVER_REPLACED = 1e-12  # accuracy at which another load would replace the present one
+_NEVER_REPLACED_BOUND = 1e-12  # accuracy at which another load would replace the present one
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
 _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def unfiltered_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return a reading's white noise (6,) [N, N m] that explains the residual of `load`."""
+    """Return the white noise of a reading (6,) [N, N m] from the filtered residual of `load`."""
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
-    return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
+    return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE_1_KHZ * math.sqrt(1e-3 / dt))
 
 
 class ContactAndLoadMonitor:
@@ -55,7 +55,7 @@ class ContactAndLoadMonitor:
         noise = unfiltered_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
         self._parameters = change_detector_parameters(
-            noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER_REPLACED
+            noise, np.zeros(9), dt, model_error=MODEL_ERROR_FRACTION, bound=_NEVER_REPLACED_BOUND
         )
         self._phi = usable_phi(load)[0]
         self._covariance = limit_covariance(self._phi, load.covariance)
@@ -65,7 +65,7 @@ class ContactAndLoadMonitor:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Reset all but the identified load."""
+        """Restart with other sensor offsets (6,)."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = initial_monitor_memory(self._out, self._covariance)
 
@@ -78,7 +78,7 @@ class ContactAndLoadMonitor:
         return int(ReadingFlag.IN_CONTACT) if state == STATE_DISTURBED else 0
 
 
-MEAN_TIME_S = 3.0
+CONTACT_MEAN_S = 3.0
 """Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_CUTOFF_HZ = 0.5
 _STATISTIC = "level"
@@ -101,7 +101,7 @@ class StreamContactDetector:
         source = ReplayLogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
         if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
             raise DrakeTeleopError(
-                f"has {1.0 / source.dt:.4g} Hz, and the stream {1.0 / dt:.4g} Hz",
+                f"has readings at {1.0 / source.dt:.4g} Hz, but the stream at {1.0 / dt:.4g} Hz",
                 where=str(free),
                 remedy="use the log that `calibrate` wrote from this stream",
             )
@@ -123,7 +123,7 @@ class StreamContactDetector:
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
         threshold = max(MAX_NOISE_LEVEL, floor.threshold(_STATISTIC))
         self._settings = ContactDetector(
-            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
+            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / CONTACT_MEAN_S
         ).settings
         self.restart()
         self.contact_flag(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
@@ -144,7 +144,7 @@ class StreamContactDetector:
 
     def contact_flag(self, values: Array, contact: Array) -> int:
         """Return `ReadingFlag.IN_CONTACT` or 0 for a reading (15,) and its contact wrench (6,)."""
-        touched = _detect(
+        touched = _detect_contact(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
         return int(ReadingFlag.IN_CONTACT) if touched else 0
@@ -161,7 +161,7 @@ def _filter_motion_into(values, fast, slow, filters, out):
 
 
 @njit(cache=True)
-def _detect(memory, values, contact, fast, slow, filters, settings):
+def _detect_contact(memory, values, contact, fast, slow, filters, settings):
     filtered = np.empty(12)
     _filter_motion_into(values, fast, slow, filters, filtered)
     s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]

@@ -11,7 +11,11 @@ from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
-from drake_teleop.live.experiment.guided import HAND, GuidedExperiment, parse_study
+from drake_teleop.live.experiment.guided import (
+    HAND_INPUTS,
+    GuidedExperiment,
+    parse_experiment_message,
+)
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.session import read_drive
@@ -111,7 +115,7 @@ def test_trial_restarts_after_the_page_is_closed(tmp_path):
     person.send(client=2, go=True)  # has left
     person.guided.join(3, person.now)
     person.send(client=3, go=True)
-    assert person.procedure.phase == "interval" and person.store.participants() == []
+    assert person.procedure.phase == "interval" and person.store.participant_numbers() == []
 
 
 def test_10000_random_messages_change_only_permitted_inputs():
@@ -132,10 +136,13 @@ def test_10000_random_messages_change_only_permitted_inputs():
         "NaN",
     ]
     pieces += ['{"x":1e999}', '{"sigma":5}', '[[[["', "\u0000", '"drive"', "é", "-1e308", "[" * 200]
-    heard = [parse_study("".join(rng.choice(pieces, rng.integers(1, 9)))) for _ in range(10_000)]
+    heard = [
+        parse_experiment_message("".join(rng.choice(pieces, rng.integers(1, 9))))
+        for _ in range(10_000)
+    ]
     for found in filter(None, heard):
         assert set(found) <= {"set", "drive", "go", "answer"}
-        assert found.get("answer", 1) in (1, 2) and set(found.get("set", {})) <= set(HAND)
+        assert found.get("answer", 1) in (1, 2) and set(found.get("set", {})) <= set(HAND_INPUTS)
     for bad in (
         b"{}",
         None,
@@ -145,6 +152,6 @@ def test_10000_random_messages_change_only_permitted_inputs():
         '{"answer": 3}',
         '{"go": 1}',
     ):
-        assert parse_study(bad) is None
-    assert parse_study('{"set": {"sigma": 5, "x": 3}}') == {"set": {"x": 3}}
-    assert parse_study('{"answer": 2}') == {"answer": 2}
+        assert parse_experiment_message(bad) is None
+    assert parse_experiment_message('{"set": {"sigma": 5, "x": 3}}') == {"set": {"x": 3}}
+    assert parse_experiment_message('{"answer": 2}') == {"answer": 2}

@@ -21,7 +21,7 @@ from drake_teleop.live.experiment.design import (
 )
 from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, plan_trials
 from drake_teleop.live.experiment.psychometrics import Psi, correct_probability
-from drake_teleop.live.experiment.store import Store, open_results
+from drake_teleop.live.experiment.store import Store, open_trial_store
 
 SMALL = Experiment(
     tasks=[ContactDetection(trials=6, practice=2), ApparentMass(trials=5), PegInSlot(trials=2)],
@@ -84,7 +84,7 @@ def test_participant_continues_with_the_same_levels(tmp_path):
 
 def goes_through(folder: str) -> None:
     """Run a participant with answers by trial number, and print each trial."""
-    with open_results(Path(folder), SHORT) as store:
+    with open_trial_store(Path(folder), SHORT) as store:
         procedure = Procedure(SHORT, 1, store)
         while procedure.phase != "end":
             if procedure.phase == "answer":
@@ -156,9 +156,9 @@ def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
 
 
 def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
-    with open_results(tmp_path, SMALL) as store:
+    with open_trial_store(tmp_path, SMALL) as store:
         with pytest.raises(DrakeTeleopError, match="another process"):
-            open_results(tmp_path, SMALL).__enter__()
+            open_trial_store(tmp_path, SMALL).__enter__()
         go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0, most=3)
         assert store.results_table().shape == (3, 12)
         text = store.participant_file(1).read_text()
@@ -167,7 +167,7 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
             with pytest.raises(DrakeTeleopError, match=r"01\.csv"):
                 store.read_rows(1)
     with pytest.raises(DrakeTeleopError, match="another study"):
-        open_results(tmp_path, dataclasses.replace(SMALL, seed=1)).__enter__()
+        open_trial_store(tmp_path, dataclasses.replace(SMALL, seed=1)).__enter__()
 
 
 @pytest.mark.parametrize(
@@ -178,9 +178,12 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
         ("tasks: [!Juggling {}]\nconditions: [{name: a}]", "Juggling"),
         (
             "tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]",
-            "too small a range",
+            "0.1 is less than twice low, 0.1: the range is too small",
         ),
-        ("tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]", "not unique"),
+        (
+            "tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]",
+            "'a' is empty, or the name of an earlier",
+        ),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, sigma: 1, eta: 0.5}]", "eta"),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, network: moon}]", "moon"),
     ],

@@ -45,7 +45,7 @@ def test_intervals_contain_the_true_thresholds():
         for _ in range(40):
             level = psi.next_level()
             psi.update(level, rng.random() < correct_probability(level, truth, 1.5, 0.02))
-        found, d = psi.threshold(), psi.d_prime(truth)
+        found, d = psi.threshold(), psi.estimate_d_prime(truth)
         held.append(found.low <= truth <= found.high and d.low <= 1.0 <= d.high)
         off.append(abs(np.log(found.value / truth)))
     assert sum(held) >= 28
@@ -64,4 +64,4 @@ def test_a_single_node_of_the_grid_is_the_median(low, high, node, slope, lapse):
     np.testing.assert_allclose(psi.threshold(), cell, rtol=1e-12)
     for level in (low, high):
         expected = (level / threshold) ** np.geomspace(0.7, 3.0, 7)[slope]
-        assert psi.d_prime(level).value == pytest.approx(expected)
+        assert psi.estimate_d_prime(level).value == pytest.approx(expected)

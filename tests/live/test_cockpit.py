@@ -8,7 +8,7 @@ import pytest
 from drake_teleop.common.blocks import FAULT_MEANINGS, Fault
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.cockpit import Cockpit
-from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.session import Session
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
@@ -58,7 +58,7 @@ def test_limits_faults_and_silence_are_reported_in_words(scenario, rows):
         found = {key: values.copy() for key, values in rows.items()}
         found.setdefault(name, np.zeros((len(rows["t"]), np.size(change))))[1] = change
         assert words(scenario, found) == [said]
-    edge = Inputs(y=RANGES["y"][0])
+    edge = Inputs(y=INPUT_RANGES["y"][0])
     assert words(scenario, rows, edge) == ["the hand is at the edge of its box, 0.3 m wide"]
 
 

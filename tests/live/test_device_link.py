@@ -27,8 +27,8 @@ from drake_teleop.live.device_packets import (
     unpack_force,
     unpack_state,
 )
-from drake_teleop.live.haply import HaplyDevice, force_message, read_message
-from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.haply import HaplyDevice, make_force_message, read_message
+from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.scenarios import with_task_space_device
 from drake_teleop.live.session import Session, read_drive
@@ -123,7 +123,7 @@ def test_invalid_packets_only_change_a_counter(link):
 
 
 def test_force_and_position_of_haply_use_the_same_axes():
-    said = json.loads(force_message("a", (1.0, 2.0, 3.0)))
+    said = json.loads(make_force_message("a", (1.0, 2.0, 3.0)))
     device = {"device_id": "a", "state": {"cursor_position": {"x": 2, "y": -1, "z": 3}}}
     assert said["inverse3"][0]["commands"]["set_cursor_force"]["values"] == {
         "x": 2.0, "y": -1.0, "z": 3.0,
@@ -279,11 +279,11 @@ class RestingDevice:
     def read(self):
         return DevicePose((0.0, 0.0, 0.0))
 
-    def set(self, wrench):
+    def set_wrench(self, wrench):
         self.was_set.append(wrench)
 
     def close(self):
-        self.set((0.0,) * 6)
+        self.set_wrench((0.0,) * 6)
 
 
 def test_client_displays_the_stations_force_and_none_after_silence(link):
@@ -321,7 +321,7 @@ def test_inverse3_answers_every_message_of_its_service():
         places = []
         for k in range(3):
             places.append(device.read())
-            device.set((float(k), 0.0, 0.0, 0.0, 0.0, 0.0))
+            device.set_wrench((float(k), 0.0, 0.0, 0.0, 0.0, 0.0))
         with pytest.raises(DrakeTeleopError, match="has closed the connection"):
             device.read()
         device.close()
@@ -378,4 +378,4 @@ def test_drive_by_a_device_repeats_to_the_same_bytes(scenario, load, tmp_path):
     assert rendered[127] == 0.0  # 54 ms after the release
     steps = np.diff(log["pose_command"][:, 6])
     assert np.abs(steps).max() < 1.2e-4 * setup.kinematic_scaling.translation_scale
-    assert set(RANGES) == set(vars(drive.changes[0][1]))
+    assert set(INPUT_RANGES) == set(vars(drive.changes[0][1]))

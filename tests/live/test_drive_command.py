@@ -152,7 +152,7 @@ def test_stopped_drive_ends_with_the_reason_and_status_2(page, capsys, monkeypat
     monkeypatch.setattr(Session, "advance", fail)
     assert drive() == 2
     message = capsys.readouterr().err
-    assert message.endswith("error: drive: the session has ended: joint 2 leaves its range\n")
+    assert message.endswith("error: drive: the simulation has stopped: joint 2 leaves its range\n")
 
 
 @pytest.mark.long

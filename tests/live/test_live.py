@@ -45,7 +45,7 @@ def pass_time(live: Live, clock: Clock, seconds: float) -> list[dict]:
         frame = live.tick(clock)
         if frame is not None:
             frames.append(json.loads(json.dumps(frame, allow_nan=False)))
-        clock.now += max(live.wait(clock.now), 1e-4)
+        clock.now += max(live.time_to_next_tick(clock.now), 1e-4)
     return frames
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, pack_state
-from drake_teleop.live.inputs import RANGES, Inputs
+from drake_teleop.live.inputs import INPUT_RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.scenarios import with_task_space_device
@@ -84,7 +84,7 @@ def test_keys_move_the_hand_equally_per_simulated_second(scenario, load, slow, r
     live.join(1, now)
     live.handle_message(1, json.dumps({"slow": slow, "rates": rates}), now)
     while live.ms < 300:
-        now += max(live.wait(now), 1e-3)
+        now += max(live.time_to_next_tick(now), 1e-3)
         live.tick(lambda now=now: now)
         live.handle_message(1, json.dumps({"rates": rates}), now)
     live.handle_message(1, json.dumps({"rates": {}}), now)
@@ -103,7 +103,7 @@ def test_rate_ends_one_second_after_its_last_repetition():
         assert inputs.sigma == 0
     assert inputs.x == pytest.approx(1000, abs=6)
     inputs = steering.set_rates({"x": 1e9}, inputs, 0.0)
-    assert steering.advance_inputs(inputs, 5e-3, 0.1).x == RANGES["x"][1]
+    assert steering.advance_inputs(inputs, 5e-3, 0.1).x == INPUT_RANGES["x"][1]
 
 
 def test_a_target_that_is_set_ends_a_rate(scenario, load):
@@ -137,7 +137,7 @@ def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow,
         live.handle_message(1, json.dumps({"set": {"x": target, "z": 0.5 * target}}), now)
         frame = live.tick(lambda now=now: now)
         rendered += [frame["f"][2][1]] if frame and "f" in frame else []
-        now += max(live.wait(now), 1e-3)
+        now += max(live.time_to_next_tick(now), 1e-3)
     assert len(rendered) > 20 and max(rendered) < 0.5
 
 

@@ -15,7 +15,14 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.common.progress import show_no_progress
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import LEAD_TIME_S
-from drake_teleop.live.inputs import INPUTS_FILE, RANGES, Inputs, csv_header, csv_row, read_inputs
+from drake_teleop.live.inputs import (
+    INPUT_RANGES,
+    INPUTS_FILE,
+    Inputs,
+    csv_header,
+    csv_row,
+    read_inputs,
+)
 from drake_teleop.live.session import Drive, Session, read_drive
 from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
@@ -131,11 +138,11 @@ def test_rendered_wrench_cross_fades_at_a_constant_wrench():
     cross_fade.get_input_port().FixValue(context, wrench)
     rendered = cross_fade.get_output_port()
     np.testing.assert_array_equal(rendered.Eval(context), wrench)
-    cross_fade.Begin(context, 0.1, 0.2, np.ones(6))
+    cross_fade.StartFade(context, 0.1, 0.2, np.ones(6))
     np.testing.assert_array_equal(rendered.Eval(context), np.ones(6))
     simulator.AdvanceTo(0.1995)
     np.testing.assert_allclose(rendered.Eval(context), (1.0 + wrench) / 2, atol=0.05)
-    cross_fade.Limit(context, 2.5)
+    cross_fade.LimitForce(context, 2.5)
     simulator.AdvanceTo(0.4)
     np.testing.assert_allclose(rendered.Eval(context), wrench / 2, rtol=1e-12)
     cross_fade.get_input_port().FixValue(context, wrench / 2)
@@ -306,7 +313,7 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not a record of a drive"),
+        ("", "does not contain the inputs of a recorded live session"),
         (HEADER, "has a duration of 0 s"),
         (HEADER + csv_row(0, Inputs()), "has a duration of 0 s"),
         (HEADER + csv_row(5, Inputs()), "5 ms is not a valid time"),
@@ -322,19 +329,22 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
         ),
         (
             HEADER + csv_row(0, Inputs()).replace("none", "share"),
-            "has an unknown method, 'share'; it ca",
+            "has the unknown method 'share'; it ca",
         ),
         (
             HEADER + csv_row(0, Inputs()).replace("none", "0"),
-            "has an unknown method, '0'; it cannot be",
+            "has the unknown method '0'; it cannot be",
         ),
-        (HEADER + csv_row(0, Inputs()).replace("medium", "iron"), "has an unknown grip, 'iron'"),
+        (
+            HEADER + csv_row(0, Inputs()).replace("medium", "iron"),
+            "has the unknown grip 'iron'",
+        ),
         (
             HEADER.replace("1.2", "1.1"),
             "recorded with drake_teleop 1.1, and this is 1.2; it cannot",
         ),
         (HEADER.replace(", drake 3.4", ""), "recorded with drake unknown, and this is 3.4"),
-        (HEADER.partition("\n")[2] + "0,0\n", "has choices as numbers and no version"),
+        (HEADER.partition("\n")[2] + "0,0\n", "contain the version of drake_teleop that wrote it"),
         ("# \n" + HEADER.partition("\n")[2], "recorded with drake_teleop unknown"),
     ],
 )
@@ -362,7 +372,7 @@ def test_incomplete_last_line_is_ignored(tmp_path):
         HEADER + csv_row(0, Inputs()) + csv_row(5, Inputs(x=3)) + csv_row(10, Inputs())[:9]
     )
     assert read_inputs(path, MADE_BY) == [(0, Inputs()), (5, Inputs(x=3))]
-    assert len(RANGES) == 22
+    assert len(INPUT_RANGES) == 22
 
 
 def test_weight_has_its_own_share_and_follows_the_inertia_at_minus_one(scenario, load):

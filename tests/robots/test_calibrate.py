@@ -27,10 +27,10 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.assembly import Parts
-from drake_teleop.robots.calibration import Evaluation, best_motion, calibrate, evaluate_record
+from drake_teleop.robots.assembly import PartStreams
+from drake_teleop.robots.calibration import Evaluation, advise_motion, calibrate, evaluate_record
 from drake_teleop.robots.recording import PartRecorder, ReadingRecorder
-from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Part, Reading, ReadingFlag
+from drake_teleop.robots.streams import DAMAGED_READING, POSE, WRENCH, Part, Reading, ReadingFlag
 
 DT = 0.005
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -182,10 +182,10 @@ def test_advice_is_the_missing_motion(axis: int) -> None:
     others = [k for k in range(3) if k != axis]
     t = DT * np.arange(1600)
     errors = derivatives_over_tolerances(read_tolerance("inertia 1 %"), PHI)
-    words = best_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
+    words = advise_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
     assert f"swing the wrist about {'xyz'[axis]}" in words
     rest = np.tile(9.81 * np.eye(3)[axis], (400, 1)), np.zeros((400, 3)), np.zeros((400, 3))
-    words = best_motion(
+    words = advise_motion(
         rest, DT, 30.0, derivatives_over_tolerances(read_tolerance("mass 1 %"), PHI), NOISE
     )
     assert f"about {'xyz'[axis]}" not in words and "turn" in words
@@ -195,7 +195,7 @@ def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: P
     rows, recorder = recorded(1.0, [0]), ReadingRecorder(np.full(6, 80.0))
     broken = rows[3].copy()
     broken[1], rows[5, 0] = np.nan, 80.0
-    for reading in (Reading(0, 0.0, rows[0]), DAMAGED, Reading(1, DT, broken),
+    for reading in (Reading(0, 0.0, rows[0]), DAMAGED_READING, Reading(1, DT, broken),
                     Reading(2, 2 * DT, rows[5]), Reading(3, 3 * DT, rows[7]),
                     Reading(2, 2 * DT, rows[6])):  # fmt: skip
         recorder.add(reading)
@@ -237,7 +237,7 @@ def test_longest_part_is_written_after_a_clock_change(
 
 
 def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
-    recorder = PartRecorder(Parts(StreamStub(WRENCH), StreamStub(POSE)), None, X_FS)
+    recorder = PartRecorder(PartStreams(StreamStub(WRENCH), StreamStub(POSE)), None, X_FS)
     pose, wrench = np.eye(7)[0], np.ones(6)
     for k in range(1000):
         recorder.add((Part(WRENCH, k, 1e7 if k == 400 else DT * k, wrench), DT * k))
@@ -277,7 +277,9 @@ def posed(seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Path) -> None:
     """The stamps of the motion are 4 ms late and from another clock."""
-    recorder = PartRecorder(Parts(StreamStub(WRENCH), StreamStub(POSE)), np.full(6, 80.0), X_FS)
+    recorder = PartRecorder(
+        PartStreams(StreamStub(WRENCH), StreamStub(POSE)), np.full(6, 80.0), X_FS
+    )
     late, clock = 0.004, 1e4
     for k, (t, wrench, pose) in enumerate(zip(*posed(2.0), strict=True)):
         recorder.add((Part(WRENCH, k, t, wrench), t + 0.001))

@@ -16,7 +16,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots import changes
 from drake_teleop.robots.changes import ChangeMonitor
-from drake_teleop.robots.compensate import compensate_command, compensate_stream
+from drake_teleop.robots.compensate import compensate_stream, run_compensate_command
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Compensated, Reading, ReadingFlag
 from drake_teleop.robots.watch import ContactAndLoadMonitor
@@ -222,7 +222,7 @@ def test_the_command_reports_the_time_of_a_tare(
     write_log(log, tmp_path / "log.parquet")
     LOAD.save(tmp_path / "load.json")
     source, sink = f"replay:{tmp_path}/log.parquet", f"{tmp_path}/out.csv"
-    compensate_command(source, tmp_path / "load.json", sink, watch=True, delay=0.0)
+    run_compensate_command(source, tmp_path / "load.json", sink, watch=True, delay=0.0)
     messages = capfd.readouterr().err
     assert messages.count("the sensor has another zero") == 1
     assert "t = 6.00 s: the sensor has another zero" in messages

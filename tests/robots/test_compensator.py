@@ -19,9 +19,9 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.processing import eliminate_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensate import compensate_stream
-from drake_teleop.robots.compensator import JUMP_S, STALE_S, TARE_S, Compensator
+from drake_teleop.robots.compensator import CLOCK_JUMP_S, STALE_AGE_S, TARE_REST_S, Compensator
 from drake_teleop.robots.replay_log import ReplayLogSource
-from drake_teleop.robots.streams import DAMAGED, Compensated, Reading, ReadingFlag
+from drake_teleop.robots.streams import DAMAGED_READING, Compensated, Reading, ReadingFlag
 
 DT, DELAY = 0.002, 0.0051
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -132,7 +132,7 @@ def test_separate_scales_need_gravity_in_the_readings() -> None:
 def bad(reading: Reading, name: str) -> Reading:
     values = reading.values.copy()
     if name == "damaged":
-        return DAMAGED
+        return DAMAGED_READING
     if name == "not finite":
         values[7] = math.nan
     if name == "out of range":
@@ -176,10 +176,10 @@ def test_wrench_is_zero_during_silence_and_the_filter_restarts() -> None:
     for reading in readings(20, touched=5.0):
         compensator.step(reading, reading.t)
     last = 19 * DT
-    assert compensator.stale_output(last + 0.9 * STALE_S) is None
-    assert compensator.time_to_stale(last + 0.9 * STALE_S) == pytest.approx(0.1 * STALE_S)
-    assert compensator.time_to_stale(last + 1.1 * STALE_S) == 0.0
-    stale = compensator.stale_output(last + 1.1 * STALE_S)
+    assert compensator.stale_output(last + 0.9 * STALE_AGE_S) is None
+    assert compensator.time_to_stale(last + 0.9 * STALE_AGE_S) == pytest.approx(0.1 * STALE_AGE_S)
+    assert compensator.time_to_stale(last + 1.1 * STALE_AGE_S) == 0.0
+    stale = compensator.stale_output(last + 1.1 * STALE_AGE_S)
     assert stale is not None and stale.flags == ReadingFlag.STALE and not stale.contact.any()
     again = readings(1200, touched=-4.0)[1000]  # two seconds later, another contact
     out = compensator.step(again, again.t)
@@ -196,7 +196,7 @@ def test_late_readings_are_stale_until_the_clock_is_accepted() -> None:
     at = round(0.2 / DT) + 1
     assert not any(flags[:at]) and flags[at] == ReadingFlag.STALE
     here = flags.index(ReadingFlag.CLOCK_JUMP)
-    assert here * DT == pytest.approx(0.2 + JUMP_S, abs=delay + 5 * DT)
+    assert here * DT == pytest.approx(0.2 + CLOCK_JUMP_S, abs=delay + 5 * DT)
     assert not any(flags[here + 1 :])
 
 
@@ -233,7 +233,7 @@ def test_small_backward_clock_step_is_accepted_after_a_silence(
         for k, reading in enumerate(readings(50))
     ]
     at = flags.index(flag)
-    assert at * DT == pytest.approx(STALE_S, abs=2 * DT)
+    assert at * DT == pytest.approx(STALE_AGE_S, abs=2 * DT)
     assert flags == [ReadingFlag.REORDERED] * at + [flag] + [0] * (49 - at)
 
 
@@ -266,7 +266,7 @@ def test_delayed_wrenches_are_clipped() -> None:
      ("wavers", "the wrench varies")],
 )  # fmt: skip
 def test_tare_is_refused_with_a_reason(name: str, reason: str) -> None:
-    compensator, count = Compensator(load(), DT), round(TARE_S / DT)
+    compensator, count = Compensator(load(), DT), round(TARE_REST_S / DT)
     drift = np.array([0.5, -0.3, 0.2, 0.01, 0.0, 0.02])
     stream = resting(count, OFFSETS + drift)
     if name == "short":

@@ -18,7 +18,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensation_step import TOO_FAR, VARIES
 from drake_teleop.robots.controller.c99 import CFLAGS, kernel_files
-from drake_teleop.robots.controller.translator import HELPERS, Translator
+from drake_teleop.robots.controller.translator import C_HELPER_FUNCTIONS, Translator
 from drake_teleop.robots.streams import Reading, ReadingFlag
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -178,7 +178,7 @@ def test_each_supported_operation_has_the_result_of_python(tmp_path):
     c = Translator()
     c.translate_function(every_operation, x=(4,), n="int", y=("size",))
     text = c.text.replace("static int every", "int every")
-    (tmp_path / "every.c").write_text(HELPERS.replace("static", "static inline") + text)
+    (tmp_path / "every.c").write_text(C_HELPER_FUNCTIONS.replace("static", "static inline") + text)
     library = tmp_path / "every.so"
     subprocess.run([CC, "-shared", "-fPIC", str(tmp_path / "every.c"), "-o", library], check=True)
     compiled = ctypes.CDLL(str(library)).every_operation
@@ -205,7 +205,7 @@ def test_syntax_that_is_not_supported_is_named(function):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ((), "rate: is required by c99"),
+        ((), "rate: missing, but required by c99"),
         (("--rate", "500", "--sensor-pose", *"000000"), "takes its values in the sensor's frame"),
     ],
 )

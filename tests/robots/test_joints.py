@@ -21,7 +21,7 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, required_values, tolerances_in_units
-from drake_teleop.robots.assembly import Assembly, Parts, PosedByJoints
+from drake_teleop.robots.assembly import Assembly, PartStreams, PosedByJoints
 from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2_zenoh import CdrConverter
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
@@ -93,11 +93,11 @@ def test_pose_equals_drake(model: Path) -> None:
 def test_joint_order_is_arbitrary_and_gripper_joints_are_ignored() -> None:
     messages = CdrConverter(1.0, joints=NAMES)
     sent = joint_state(5_250_000_000, [*NAMES[::-1], "finger"], [4.0, 3.0, 2.0, 1.0, 9.0])
-    (part,) = messages.parts(JOINTS, sent, b"")
+    (part,) = messages.parts_of_cdr(JOINTS, sent, b"")
     assert part.stream == JOINTS and part.t == 5.25
     np.testing.assert_array_equal(part.values, [1.0, 2.0, 3.0, 4.0])
-    assert messages.parts(JOINTS, joint_state(0, ["finger"], [9.0]), b"") == []
-    assert messages.parts(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
+    assert messages.parts_of_cdr(JOINTS, joint_state(0, ["finger"], [9.0]), b"") == []
+    assert messages.parts_of_cdr(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
 
 
 class Joints(StreamStub):
@@ -121,7 +121,7 @@ def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     assert source.streams == (WRENCH, POSE)
     sent = source.read(0.0)
     assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
-    assembly, found = Assembly(Parts(source)), []
+    assembly, found = Assembly(PartStreams(source)), []
     for k, part in enumerate(sent[1:]):
         found += assembly.complete_readings(part, part.t) + assembly.complete_readings(
             Part(WRENCH, k, part.t, np.zeros(6)), part.t

@@ -156,8 +156,8 @@ def test_wrong_addresses_are_one_error_line() -> None:
     from drake_teleop.robots.connections import open_source
 
     for address, words in (
-        ("ros2://", "'' is not a topic"),
-        ("ros2://ft wrench", "is not a topic"),
+        ("ros2://", "'' is not the name of a ROS topic"),
+        ("ros2://ft wrench", "is not the name of a ROS topic"),
         ("ros2://ft/wrench?colour=1", "unknown parameter 'colour'"),
         (
             "ros2://ft/wrench?domain=300",

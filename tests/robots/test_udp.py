@@ -26,12 +26,16 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.interruption import INTERRUPTED_EVENT, delayed_signals, install_handlers
 from drake_teleop.robots import lines
-from drake_teleop.robots.compensate import TareRequestPort, compensate_command, compensate_stream
+from drake_teleop.robots.compensate import (
+    TareRequestPort,
+    compensate_stream,
+    run_compensate_command,
+)
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.connections import open_sink, open_source
-from drake_teleop.robots.lines import LineSource, read_line, wrench_line
+from drake_teleop.robots.lines import LineSource, parse_reading, wrench_line
 from drake_teleop.robots.streams import (
-    DAMAGED,
+    DAMAGED_READING,
     POSE,
     WRENCH,
     Compensated,
@@ -54,7 +58,7 @@ def test_packets_and_lines_are_read_back() -> None:
     back = udp.unpack_reading(udp.pack_reading(reading._replace(flags=int(ReadingFlag.SATURATED))))
     assert back[:2] == reading[:2] and back.flags == ReadingFlag.SATURATED
     np.testing.assert_array_equal(back.values, reading.values)
-    back = read_line(line_of(reading), 7)
+    back = parse_reading(line_of(reading), 7)
     assert back.number == 7
     np.testing.assert_array_equal(back.values, reading.values)
     out = Compensated(5, 0.5, np.arange(6.0), -np.arange(6.0), 34)
@@ -74,7 +78,7 @@ def test_c_header_has_the_same_layout_and_flags() -> None:
             sum(int((re.findall(r"\d+", x) or [1])[0]) for x in n.split(",")) for _, n in fields
         ]
         lengths.append(sum(sizes[kind] * n for (kind, _), n in zip(fields, counts, strict=True)))
-    assert lengths == [udp.READING.size, udp.POSED.size, udp.WRENCH.size]
+    assert lengths == [udp.READING_FORMAT.size, udp.POSED_FORMAT.size, udp.WRENCH_FORMAT.size]
     bits = {name: int(value) for name, value in re.findall(r"DT_(\w+) = (\d+)", HEADER)}
     assert bits == {str(flag.name): flag.value for flag in ReadingFlag}
 
@@ -91,7 +95,9 @@ def test_damaged_input_raises_no_error_and_gives_finite_numbers(kind: str) -> No
             data[rng.randrange(len(data))] = rng.randrange(256)
         if rng.random() < 0.1:
             data = data[: rng.randrange(len(data))]
-        reading = udp.unpack_reading(bytes(data)) if kind == "packet" else read_line(bytes(data), k)
+        reading = (
+            udp.unpack_reading(bytes(data)) if kind == "packet" else parse_reading(bytes(data), k)
+        )
         out = compensator.step(reading, k * DT)
         assert np.isfinite([out.t, *out.contact, *out.scaled]).all()
         flags |= out.flags
@@ -106,14 +112,14 @@ def test_damaged_input_raises_no_error_and_gives_finite_numbers(kind: str) -> No
     "line", [b"", b"[]", b"3", b"{}", b"\xff", b"[" * 4000, b"{" * 9000, b'{"t":1,"wrench":"x"}']
 )
 def test_invalid_line_is_damaged(line: bytes) -> None:
-    assert read_line(line, 0) is DAMAGED
+    assert parse_reading(line, 0) is DAMAGED_READING
 
 
 @pytest.mark.parametrize("number", [2**64, 10**20, -1, 1e300, 10**400, None, "x", [1]])
 def test_number_outside_64_bits_is_damaged(number) -> None:
     line = json.loads(line_of(readings(1)[0]))
-    assert read_line(json.dumps(line | {"number": number}).encode(), 0) is DAMAGED
-    largest = read_line(json.dumps(line | {"number": 2**64 - 1}).encode(), 0)
+    assert parse_reading(json.dumps(line | {"number": number}).encode(), 0) is DAMAGED_READING
+    largest = parse_reading(json.dumps(line | {"number": 2**64 - 1}).encode(), 0)
     out = Compensator(load(), DT).step(largest, 0.0)
     assert udp.unpack_wrench(udp.pack_wrench(out)).number == 2**64 - 1
 
@@ -146,7 +152,7 @@ def test_wrench_and_pose_in_a_packet() -> None:
     pose = Part(POSE, 4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]))
     source = udp.PosedSource("posed://:0", DT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for packet in (udp.pack_parts(wrench, pose), b"x" * udp.POSED.size, b"DTP1"):
+        for packet in (udp.pack_parts(wrench, pose), b"x" * udp.POSED_FORMAT.size, b"DTP1"):
             sender.sendto(packet, ("127.0.0.1", source.port))
     assert source._socket.getsockname()[0] == "127.0.0.1"
     found = source.read(5.0)
@@ -193,7 +199,7 @@ import numpy as np
 from pathlib import Path
 from drake_teleop.robots import lines
 from drake_teleop.robots.streams import Compensated
-lines.PERIOD_S = dict.fromkeys(lines.PERIOD_S, 0.02)
+lines.WRITE_PERIOD_S = dict.fromkeys(lines.WRITE_PERIOD_S, 0.02)
 sink = lines.TableSink(Path(sys.argv[1]))
 for k in range(10**6):
     sink.write(Compensated(k, 0.1 * k, np.full(6, k), np.zeros(6), 0))
@@ -237,7 +243,7 @@ class Failing:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) -> None:
-    monkeypatch.setattr(lines, "PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
+    monkeypatch.setattr(lines, "WRITE_PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
     with small_disk(tmp_path, 100_000):
         failing = Failing(lines.TableSink(tmp_path / name))
         failing.write_until(CannotWrite)
@@ -272,7 +278,7 @@ def test_live_source_keeps_earlier_files(tmp_path, name, monkeypatch) -> None:
         os.write(into, b"\n".join(map(line_of, readings(30))))
         os.close(into)
         monkeypatch.setattr("sys.stdin", os.fdopen(out))
-        compensate_command("-", tmp_path / "load.json", str(tmp_path / name), rate_hz=1 / DT)
+        run_compensate_command("-", tmp_path / "load.json", str(tmp_path / name), rate_hz=1 / DT)
     earlier = sorted(path.parent.name for path in tmp_path.glob(f"*/{name}"))
     assert earlier == ["earlier-1", "earlier-2"]
     if name != "x.mcap":

@@ -1,4 +1,4 @@
-"""Station and stimulus of an experiment's task under a condition."""
+"""Station and stimulus for a task of an experiment under a condition."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drake_teleop.live.experiment.design import (
     Task,
 )
 from drake_teleop.live.experiment.procedure import IntervalResult
-from drake_teleop.live.inputs import AS_IN_SCENARIO, RANGES, Inputs
+from drake_teleop.live.inputs import AS_IN_SCENARIO, INPUT_RANGES, Inputs
 from drake_teleop.live.scenarios import adapt_estimate, chosen_scenario, live_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
@@ -27,21 +27,21 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
-_MAX_SCALE = RANGES["gamma"][1]  # %
+_MAX_SCALE_PERCENT = INPUT_RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].
 _AVERAGING_S, _TOUCH_FORCE_N = 0.02, 0.5
 # The tip is on the floor of the slot within this distance [m] for this time [s].
 _FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
-def identified_load_of(scenario: Scenario) -> IdentifiedLoad | None:
+def load_of_scenario(scenario: Scenario) -> IdentifiedLoad | None:
     """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """Station of a task under a condition; `mass` is that of the load at the hand's scale [kg]."""
+    """Station of a task under a condition; `mass`: fully rendered load at the hand [kg]."""
 
     task: Task
     condition: Condition
@@ -50,9 +50,9 @@ class Apparatus:
     mass: float
 
     def stimulus_inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return a stimulus's scales [%]: sigma and sigma_object of the load, gamma of contact.
+        """Return the scales [%] of a stimulus: sigma, sigma_object (load) and gamma (contact).
 
-        `level` is a force [N] or mass [kg], `pressed` the expected contact force [N].
+        `level` is the rendered force [N] or mass [kg], `pressed` the expected contact force [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -64,12 +64,12 @@ class Apparatus:
         if condition.eta is None:
             sigma = share
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
-        return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
+        return {name: min(round(value), _MAX_SCALE_PERCENT) for name, value in values.items()}
 
     def interval_result(
         self, shown: float, inputs: dict[str, int], rows: IntervalLog
     ) -> IntervalResult:
-        """Return the result of an interval; `shown` is the intended level, 0 without stimulus."""
+        """Return the result of an interval; `shown`: intended level (0: no stimulus)."""
         force = rows.largest_force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
@@ -114,10 +114,10 @@ def make_apparatus(
 
 
 class IntervalLog:
-    """Measures of an interval, from the log's rows.
+    """Forces and insertion time of an interval, from the log.
 
     Attributes:
-        done_at: time at which the tool was at the slot's floor [s]; 0 before.
+        done_at: time at which the tool reached the slot's floor [s]; 0 before.
     """
 
     def __init__(self, scenario: Scenario, insert: Insert | None) -> None:
@@ -136,9 +136,9 @@ class IntervalLog:
         self._forces.append(np.linalg.norm(contact[:, :3], axis=1))
         self._rendered.append(rows["force_to_master"][:, :3])
         if self._insert is not None and not self.done_at:
-            self._detect_floor(self._insert, rows)
+            self._detect_slot_floor(self._insert, rows)
 
-    def _detect_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
+    def _detect_slot_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip

@@ -1,4 +1,4 @@
-"""Design of an experiment, from its YAML file."""
+"""Tasks and conditions of an experiment, from its YAML file."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from drake_teleop.station.scenario import (
     shipped_file,
 )
 
-_FOLDER = Path(__file__).parent
+_EXPERIMENTS_FOLDER = Path(__file__).parent
 
 
 @settings
@@ -48,7 +48,7 @@ class Condition:
 
 
 @dataclass
-class _Task:
+class _TaskFields:
     scenario: str = plain("touch", "shipped name, or a YAML file with a path relative to this file")
     trials: int = quantity(40, "1", 1, 1000, "number of trials of each condition")
     practice: int = quantity(
@@ -58,8 +58,8 @@ class _Task:
 
 @settings
 @dataclass
-class ContactDetection(_Task):
-    """Task to find the interval of two with rendered contact. The tool touches in both."""
+class ContactDetection(_TaskFields):
+    """Task to name the one of two intervals with rendered contact; both have contact."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -71,8 +71,8 @@ class ContactDetection(_Task):
 
 @settings
 @dataclass
-class ApparentMass(_Task):
-    """Task to find the interval of two with a heavier tool. It moves back and forth in both."""
+class ApparentMass(_TaskFields):
+    """Task to name the one of two intervals with a heavier tool; it moves in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest additional mass, also for practice")
@@ -81,7 +81,7 @@ class ApparentMass(_Task):
 
 @settings
 @dataclass
-class PegInSlot(_Task):
+class PegInSlot(_TaskFields):
     """Insertion of the tool into a slot, with completion time and largest contact force."""
 
     scenario: str = plain("insert", "as for other tasks, with an operator's task !Insert")
@@ -133,41 +133,42 @@ class Experiment:
                     "is empty", where=f"{where}:{name}", remedy="add at least one"
                 )
         kinds = [type(task).__name__ for task in self.tasks]
-        if len(set(kinds)) < len(kinds):
-            raise DrakeTeleopError(
-                "a task is listed twice", where=f"{where}:tasks", remedy="remove one"
-            )
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                raise DrakeTeleopError(
+                    f"the task !{kind} is listed twice", where=f"{where}:tasks", remedy="remove one"
+                )
         for index, task in enumerate(self.tasks):
             if not isinstance(task, PegInSlot) and not 2.0 * task.low <= task.high:
                 raise DrakeTeleopError(
-                    f"{task.low:g} to {task.high:g} is too small a range for a threshold",
+                    f"{task.high:g} is less than twice low, {task.low:g}: the range is too small",
                     where=f"{where}:tasks[{index}].high",
-                    remedy="set it to at least twice low",
+                    remedy="increase high, so that the range contains the threshold",
                 )
         names = [condition.name for condition in self.conditions]
         for index, condition in enumerate(self.conditions):
             place = f"{where}:conditions[{index}]"
             if not condition.name or condition.name in names[:index]:
                 raise DrakeTeleopError(
-                    "is empty or not unique",
+                    f"{condition.name!r} is empty, or the name of an earlier condition",
                     where=f"{place}.name",
-                    remedy="give each condition a name",
+                    remedy="give each condition its own name",
                 )
             if condition.eta is not None and condition.sigma != 0.0:
                 raise DrakeTeleopError(
-                    "cannot be combined with sigma", where=f"{place}.eta", remedy="set sigma: 0"
+                    "cannot be combined with sigma > 0", where=f"{place}.eta", remedy="set sigma: 0"
                 )
             if condition.delay is not None and condition.network != AS_IN_SCENARIO:
                 raise DrakeTeleopError(
-                    "cannot be combined with network",
+                    f"cannot be combined with network {condition.network!r}",
                     where=f"{place}.delay",
-                    remedy="remove one of them",
+                    remedy="remove delay or network",
                 )
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios."""
-    path = shipped_file("experiment", path, _FOLDER)
+    path = shipped_file("experiment", path, _EXPERIMENTS_FOLDER)
     experiment = settings_from_data(Experiment, read_yaml(path, tagged=True), str(path))
     experiment.check(str(path))
     return experiment, [
@@ -181,10 +182,10 @@ def _load_task_scenario(task: Task, path: Path, index: int) -> Scenario:
     place = f"{path}:tasks[{index}].scenario"
     if isinstance(task, PegInSlot) and not isinstance(scenario.operator.task, Insert):
         raise DrakeTeleopError(
-            "has no slot", where=place, remedy="give its operator a task !Insert"
+            f"{task.scenario} has no slot", where=place, remedy="give its operator a task !Insert"
         )
     if isinstance(task, ContactDetection) and scenario.surroundings is None:
         raise DrakeTeleopError(
-            "has no object to touch", where=place, remedy="use a scenario such as touch"
+            f"{task.scenario} has no object to touch", where=place, remedy="use one such as touch"
         )
     return scenario

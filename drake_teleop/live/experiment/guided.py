@@ -1,4 +1,4 @@
-"""Event handler for an experiment of one participant, in place of `Live`."""
+"""Event handler that replaces `Live` for the experiment of one participant."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from drake_teleop.live.experiment.design import PegInSlot
 from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
 from drake_teleop.live.experiment.simulated import with_interval_seed
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.live import FRAME_PERIOD_S, Live, ShowScene, parse_message
+from drake_teleop.live.inputs import INPUT_RANGES, Inputs
+from drake_teleop.live.live import FRAME_PERIOD_S, Live, SceneFunction, parse_message
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
 #: Pause between the intervals of a trial [s].
-_GAP_S = 0.8
-_SHOWN_KEYS = (
+_INTERVAL_PAUSE_S = 0.8
+_SHOWN_FRAME_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_HIDDEN_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
+_BLANK_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
 
 #: Names of the inputs that move the hand.
-HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
+HAND_INPUTS = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
-def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def with_zero_wrenches(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return a log's rows with zero wrenches."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
@@ -52,7 +52,7 @@ class GuidedExperiment:
         stations: dict[tuple[int, int], Apparatus],
         scenarios: list[Scenario],
         store: Store,
-        shows: Sequence[ShowScene],
+        shows: Sequence[SceneFunction],
         now: float,
         link: DeviceLink | None = None,
     ) -> None:
@@ -92,7 +92,7 @@ class GuidedExperiment:
 
     def _add_rows(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add(rows)
-        return self._show(without_forces(rows))
+        return self._show(with_zero_wrenches(rows))
 
     def hello(self) -> dict[str, Any]:
         procedure = self._procedure
@@ -123,20 +123,20 @@ class GuidedExperiment:
         self._prepare_if_changed(now)
 
     def _prepare_if_changed(self, now: float) -> None:
-        with self._store_write_error():
+        with self._catch_write_error():
             if self._procedure.prepared_intervals != self._prepared:
-                self._live.end()
+                self._live.end_session()
                 self._prepare_interval(now)
 
     @contextmanager
-    def _store_write_error(self) -> Iterator[None]:
+    def _catch_write_error(self) -> Iterator[None]:
         try:
             yield
         except CannotWrite as error:
             self._write_error = str(error)
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        message = parse_study(text)
+        message = parse_experiment_message(text)
         if message is None:
             self.refused += 1
             return
@@ -150,7 +150,7 @@ class GuidedExperiment:
             self._live.handle_message(client, json.dumps(moves), now)
         before = procedure.phase, procedure.trial_number
         if "answer" in message:
-            with self._store_write_error():
+            with self._catch_write_error():
                 procedure.store_answer(message["answer"], now - self._since)
         elif "go" in message:
             procedure.advance_phase()
@@ -161,9 +161,11 @@ class GuidedExperiment:
         if procedure.phase == INTERVAL:
             self._live.pace.restart(now)
 
-    def wait(self, now: float) -> float:
+    def time_to_next_tick(self, now: float) -> float:
         return (
-            self._live.wait(now) if self._is_interval_running else max(0.0, self._frame_due - now)
+            self._live.time_to_next_tick(now)
+            if self._is_interval_running
+            else max(0.0, self._frame_due - now)
         )
 
     @property
@@ -184,7 +186,7 @@ class GuidedExperiment:
         if self._write_error:
             raise CannotWrite(self._write_error)
         now = clock()
-        if self._procedure.phase == GAP and now - self._since >= _GAP_S:
+        if self._procedure.phase == GAP and now - self._since >= _INTERVAL_PAUSE_S:
             self._procedure.start_second_interval()
             self._live.pace.restart(now)
         if self._is_interval_running:
@@ -218,12 +220,12 @@ class GuidedExperiment:
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._is_interval_running else 0.0
         plain = Inputs()
-        inputs = {name: getattr(plain, name) for name in RANGES}
-        inputs |= {name: inner["inputs"][name] for name in HAND}
+        inputs = {name: getattr(plain, name) for name in INPUT_RANGES}
+        inputs |= {name: inner["inputs"][name] for name in HAND_INPUTS}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
-            **{name: inner[name] for name in _SHOWN_KEYS if name in inner},
-            **_HIDDEN_VALUES,
+            **{name: inner[name] for name in _SHOWN_FRAME_KEYS if name in inner},
+            **_BLANK_VALUES,
             "f": [rendered] * 3,
             "state": "stopped" if inner["stopped"] else "running",
             "driver": self._driver,
@@ -239,12 +241,12 @@ class GuidedExperiment:
             self._link.close()
 
 
-def parse_study(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests in a page's message, or None."""
+def parse_experiment_message(text: Any) -> dict[str, Any] | None:
+    """Return the valid requests of the experiment's page, or None."""
     message = parse_message(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:
-        found[kind] = {name: value for name, value in message[kind].items() if name in HAND}
+        found[kind] = {name: value for name, value in message[kind].items() if name in HAND_INPUTS}
     if "drive" in message:
         found["drive"] = True
     try:

@@ -33,11 +33,11 @@ class IntervalResult:
     """Result of an interval.
 
     Attributes:
-        level: level of the stimulus; 0 without one.
-        valid: False without contact.
+        level: measured stimulus [N or kg]; 0 without one.
+        valid: False if contact is missing.
         done: whether the tool reached the floor of the slot.
         time_s: time until the floor.
-        lost_s: simulation time behind the clock.
+        lost_s: delay of the simulation behind real time.
     """
 
     level: float = 0.0
@@ -70,7 +70,7 @@ class Procedure:
 
     Attributes:
         level: intended level of the trial's stimulus [N or kg].
-        prepared_intervals: number of intervals so far.
+        prepared_intervals: number of intervals, also repeated ones.
         said: whether the last answer was right.
         again: whether the trial is repeated because the tool made no contact.
     """
@@ -90,7 +90,7 @@ class Procedure:
             self._update_estimates(trial, row)
         self.phase, self.said, self.again = CONSENT, False, False
         self.prepared_intervals = 0
-        self._new_trial()
+        self._prepare_trial()
 
     @property
     def trial_number(self) -> int:
@@ -117,7 +117,7 @@ class Procedure:
             return float(np.median(self._pressed))
         return task.pressed if isinstance(task, ContactDetection) else 0.0
 
-    def _new_trial(self) -> None:
+    def _prepare_trial(self) -> None:
         self.interval, self._results, self.level = 1, [IntervalResult(), IntervalResult()], 0.0
         self.prepared_intervals += 1
         task, trial = self.task, self.trial
@@ -133,13 +133,13 @@ class Procedure:
         elif self.phase == READY:
             self.phase, self.again = INTERVAL, False
         elif self.phase == FEEDBACK:
-            self._next_trial()
+            self._start_next_trial()
 
     def finish_interval(self, result: IntervalResult) -> None:
-        """End the present interval with a result; without contact the trial is repeated."""
+        """End the present interval; repeat the trial if the result has no contact."""
         self._results[self.interval - 1] = result
         if not result.valid:
-            self._new_trial()
+            self._prepare_trial()
             self.phase, self.again = READY, True
         elif self.trial.signal == 0:
             self._finish_trial(0, result.done, result.time_s)
@@ -154,7 +154,7 @@ class Procedure:
 
     def restart_trial(self) -> None:
         if self.phase in (INTERVAL, GAP, ANSWER):
-            self._new_trial()
+            self._prepare_trial()
             self.phase = READY
 
     def store_answer(self, interval: int, time_s: float) -> None:
@@ -184,7 +184,7 @@ class Procedure:
         if trial.practice:
             self.phase = FEEDBACK
         else:
-            self._next_trial()
+            self._start_next_trial()
 
     def _update_estimates(self, trial: Trial, row: TrialRow) -> None:
         if (trial.task, trial.condition) not in self._psi:
@@ -194,12 +194,12 @@ class Procedure:
         if not trial.practice:
             self._psi[trial.task, trial.condition].update(row.level, bool(row.correct))
 
-    def _next_trial(self) -> None:
+    def _start_next_trial(self) -> None:
         before = self.trials[self.trial_number - 1]
         if self.trial_number == len(self.trials):
             self.phase = END
             return
-        self._new_trial()
+        self._prepare_trial()
         practised = before.practice and not self.trial.practice
         if self.trial.task != before.task:
             self.phase = TASK

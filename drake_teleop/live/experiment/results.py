@@ -1,4 +1,4 @@
-"""Thresholds, d', times and forces of an experiment with 95 % intervals."""
+"""Thresholds, sensitivities, times and forces of an experiment with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _PICTURED_QUANTITIES = (
     "time to the floor [s]",
     "largest contact force [N]",
 )
-_DONE_SHARE = "share of trials done"
+_DONE_SHARE_NAME = "share of trials done"
 
 
 class Result(NamedTuple):
-    """Row of the result table: a quantity with its 95 % interval; participant 0: all."""
+    """Row of the result table: a quantity with its 95 % interval. Participant 0 is the mean."""
 
     task: str
     condition: str
@@ -44,9 +44,8 @@ class Result(NamedTuple):
 
 def compute_results(experiment: Experiment, store: Store) -> list[Result]:
     found = []
-    known = {
-        n: [row for row in store.read_rows(n) if not row.practice] for n in store.participants()
-    }
+    numbers = store.participant_numbers()
+    known = {n: [row for row in store.read_rows(n) if not row.practice] for n in numbers}
     for task in experiment.tasks:
         kind = type(task).__name__
         for condition in experiment.conditions:
@@ -60,7 +59,7 @@ def compute_results(experiment: Experiment, store: Store) -> list[Result]:
                 found += one
                 if len(one) > 1:
                     over = _mean_with_interval(
-                        [r.value for r in one], share=quantity == _DONE_SHARE
+                        [r.value for r in one], share=quantity == _DONE_SHARE_NAME
                     )
                     trials = sum(r.trials for r in one)
                     found.append(Result(kind, condition.name, 0, trials, quantity, *over))
@@ -72,7 +71,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
-        found = {_DONE_SHARE: _wilson_interval(len(done), len(rows))}
+        found = {_DONE_SHARE_NAME: _wilson_interval(len(done), len(rows))}
         if done:
             found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
             found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
@@ -84,7 +83,7 @@ def _participant_estimates(task: Task, rows: Sequence[TrialRow]) -> dict[str, Es
     mass = isinstance(task, ApparentMass)
     unit = "kg" if mass else "N"
     name = "threshold of mass [kg at the hand]" if mass else "threshold of contact [N at the tool]"
-    return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.d_prime(middle)}
+    return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.estimate_d_prime(middle)}
 
 
 def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Estimate:

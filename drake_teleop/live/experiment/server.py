@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """Live session of an experiment with one participant."""
+    """Live session of one participant's experiment, with its server."""
 
     def __init__(
         self,
@@ -39,14 +39,14 @@ class ExperimentDrive(LiveDrive):
         self._scenarios, self._store = scenarios, store
         super().__init__(scenarios[0], None, port, device)
 
-    def _prepare(self, scenario: Scenario, device: bool) -> None:
+    def _prepare_scenes(self, scenario: Scenario, device: bool) -> None:
         for task in map(str, range(len(self._scenarios))):
             seen = self._stations[int(task), 0].scenario
             self._views[task] = PageScene(task, seen, forces=False)
         first = self._stations[0, 0]
         warm_up(first.scenario, first.load, device)
 
-    def _make(self, scenario: Scenario, record: Path | None) -> Any:
+    def _make_live(self, scenario: Scenario, record: Path | None) -> Any:
         link = None if self._device is None else self._device.link
         shows = [view.show for view in self._views.values()]
         setup = (self._procedure, self._stations, self._scenarios, self._store, shows)
@@ -56,11 +56,11 @@ class ExperimentDrive(LiveDrive):
         """Return the numbers of finished trials and of all trials."""
         return self._procedure.trial_number, len(self._procedure.trials)
 
-    def _page(self) -> str:
+    def _page_html(self) -> str:
         panel = (
             resources.files("drake_teleop.live.experiment").joinpath("page.html").read_text("utf-8")
         )
-        return super()._page().replace("</body>", panel + "</body>")
+        return super()._page_html().replace("</body>", panel + "</body>")
 
 
 def serve_experiment(
@@ -85,7 +85,7 @@ def serve_experiment(
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:
         raise DrakeTeleopError(
-            f"the session has ended: {live.ended}; {what}",
+            f"the simulation has stopped: {live.ended}; {what}",
             where="drive",
             remedy="run the same command again to continue",
         )

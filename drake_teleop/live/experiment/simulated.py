@@ -10,7 +10,7 @@ import numpy as np
 from drake_teleop.live.experiment.apparatus import (
     Apparatus,
     IntervalLog,
-    identified_load_of,
+    load_of_scenario,
     make_apparatus,
 )
 from drake_teleop.live.experiment.design import (
@@ -38,7 +38,7 @@ from drake_teleop.station.task_measures import contact_force, task_measures
 
 # Start of the hand's motion [s].
 _MOTION_START_S = 0.4
-_ROWS_PERIOD_MS = 200
+_LOG_READ_PERIOD_MS = 200
 
 
 def make_all_apparatus(
@@ -46,14 +46,14 @@ def make_all_apparatus(
 ) -> dict[tuple[int, int], Apparatus]:
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = identified_load_of(scenario)
+        load = load_of_scenario(scenario)
         for c, condition in enumerate(experiment.conditions):
             stations[t, c] = make_apparatus(task, condition, scenario, load)
     return stations
 
 
 def with_interval_seed(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """Return the scenario with a seed for the present interval."""
+    """Return the scenario with the random seed of the present interval."""
     number = 2 * procedure.trial_number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -67,7 +67,7 @@ def simulate_participant(
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run a participant's remaining trials; `progress` receives the finished and all trials."""
+    """Run the remaining trials; `progress` receives the numbers of finished and all trials."""
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
     while procedure.phase != END:
@@ -92,7 +92,7 @@ def simulate_participant(
 def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """Return the interval, 1 or 2, with the larger response [N] after adding noise."""
+    """Return the interval, 1 or 2, with the larger noisy response [N], or a guess (lapse)."""
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
     noisy = [
@@ -120,7 +120,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
         hand = {name: value / LENGTH_UNIT_M for name, value in displacement.items()}
         session.apply_inputs(session.inputs.with_changes(stimulus | hand))
         session.advance(SLICE_MS)
-        if session.ms % _ROWS_PERIOD_MS == 0:
+        if session.ms % _LOG_READ_PERIOD_MS == 0:
             rows.add(session.new_rows())
     rows.add(session.new_rows())
     session.close()

@@ -1,4 +1,4 @@
-"""Trials on disk: `participants/03.csv`, complete after each trial."""
+"""Trials on disk: one file per participant, such as `participants/03.csv`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TrialRow:
         signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
         correct: 1 if the answer is right, or if the tool reached the floor.
         time_s: time until the answer or the floor.
-        lost_s: simulation time behind the clock.
+        lost_s: delay of the simulation behind real time.
     """
 
     trial: int
@@ -46,7 +46,7 @@ class TrialRow:
     lost_s: float
 
 
-_SCHEMA: dict[str, type[pl.DataType]] = {
+_TRIAL_SCHEMA: dict[str, type[pl.DataType]] = {
     field.name: {"int": pl.Int64, "float": pl.Float64, "str": pl.String}[str(field.type)]
     for field in dataclasses.fields(TrialRow)
 }
@@ -61,8 +61,7 @@ class Store:
     def participant_file(self, participant: int) -> Path:
         return self.folder / "participants" / f"{participant:02}.csv"
 
-    def participants(self) -> list[int]:
-        """Return the numbers of participants with a trial."""
+    def participant_numbers(self) -> list[int]:
         stems = (path.stem for path in self.folder.glob("participants/*.csv"))
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
@@ -72,31 +71,31 @@ class Store:
             return []
         remedy = "remove it; the participant then starts again"
         with wrap_read_errors(path, remedy):
-            table = pl.read_csv(path, schema=_SCHEMA)
+            table = pl.read_csv(path, schema=_TRIAL_SCHEMA)
         rows = [TrialRow(**row) for row in table.iter_rows(named=True)]
         if (
             any(row.trial != index for index, row in enumerate(rows))
             or table.null_count().sum_horizontal()[0]
         ):
-            raise DrakeTeleopError("lacks trials", where=str(path), remedy=remedy)
+            raise DrakeTeleopError("lacks trials or values", where=str(path), remedy=remedy)
         return rows
 
     def write_rows(self, participant: int, rows: list[TrialRow]) -> None:
         make_folder(self.participant_file(participant).parent)
-        table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_SCHEMA)
+        table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_TRIAL_SCHEMA)
         write_table(self.participant_file(participant), table)
 
     def results_table(self) -> pl.DataFrame:
         rows = [
             {"participant": n} | dataclasses.asdict(row)
-            for n in self.participants()
+            for n in self.participant_numbers()
             for row in self.read_rows(n)
         ]
-        return pl.DataFrame(rows, schema={"participant": pl.Int64, **_SCHEMA})
+        return pl.DataFrame(rows, schema={"participant": pl.Int64, **_TRIAL_SCHEMA})
 
 
 @contextmanager
-def open_results(folder: Path, experiment: Experiment) -> Iterator[Store]:
+def open_trial_store(folder: Path, experiment: Experiment) -> Iterator[Store]:
     """Yield the results in a folder, locked for this process."""
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}

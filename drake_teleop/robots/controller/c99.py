@@ -1,4 +1,4 @@
-"""C99 kernel for an identified load, with a test vector from Python."""
+"""C99 code of the compensation of a load, with a test vector from Python."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import design_low_pass
 from drake_teleop.robots import compensation_step as step
-from drake_teleop.robots.compensator import STALE_S, Compensator
-from drake_teleop.robots.controller.translator import HELPERS, Translator
-from drake_teleop.robots.streams import VALUES, Reading
+from drake_teleop.robots.compensator import STALE_AGE_S, Compensator
+from drake_teleop.robots.controller.translator import C_HELPER_FUNCTIONS, Translator
+from drake_teleop.robots.streams import NUM_VALUES, Reading
 
-PACKAGE = "drake_teleop.robots.controller"
+TEMPLATE_PACKAGE = "drake_teleop.robots.controller"
 CFLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 """Options of a C compiler for the bits of Python."""
-KERNEL = ("wrench_compensator.h", "wrench_compensator.c")
-_VECTOR_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
-_VECTOR_READINGS = 1000
-_VECTOR_AMPLITUDES = np.repeat([1.0, 0.05], 3)
-_SETTINGS = (
+KERNEL_FILES = ("wrench_compensator.h", "wrench_compensator.c", "load.h")
+_TEST_SCALES = {"sigma_weight": 0.25, "sigma_inertia": 1.5, "gamma": 0.75}
+_NUM_TEST_READINGS = 1000
+_TEST_AMPLITUDES = np.repeat([1.0, 0.05], 3)
+_SETTING_NAMES = (
     *("phi", "offsets", "sigma_weight", "sigma_inertia", "gamma", "low_pass", "low_pass_count"),
     *("range", "largest", "noise_limits", "stale_steps", "tare_steps"),
 )  # in the order of the C structure
@@ -39,18 +39,18 @@ Files = Mapping[str, str | bytes]
 @cache
 def c_kernel_text() -> str:
     c = Translator()
-    row, out = (VALUES + 6,), (12,)
-    c.translate_function(step.value_problem, values=(VALUES,), largest=(VALUES,), limits=(6,))
+    values, row, out = (NUM_VALUES,), (NUM_VALUES + 6,), (12,)
+    c.translate_function(step.value_problem, values=values, largest=values, limits=(6,))
     c.translate_function(
         step.scales_into, sigma_weight="double", sigma_inertia="double", gamma="double", scales=(4,)
     )
     c.translate_function(
         step.eliminate_into,
-        values=(VALUES,),
+        values=values,
         gravity=(3,),
         offsets=(6,),
         phi=(10,),
-        nothing=(10,),
+        no_load=(10,),
         scales=(4,),
         low_pass=("low_pass_count",),
         memory=(2, *out),
@@ -58,7 +58,7 @@ def c_kernel_text() -> str:
         at="int",
         out=out,
     )
-    c.translate_function(step.clip, wrenches=out, limits=(6,))
+    c.translate_function(step.clip_wrenches, wrenches=out, limits=(6,))
     c.translate_function(step.add_to_statistics, row=row, count="double", mean=row, squares=row)
     c.translate_function(
         step.tare_into, count="double", mean=row, squares=row, noise_limits=(6,), offsets=(6,)
@@ -66,7 +66,7 @@ def c_kernel_text() -> str:
     c.translate_function(
         design_low_pass, dt="double", tangent="double", ahead_s="double", low_pass=(7,)
     )
-    return render_template("wrench_compensator.c", kernel=c.text, helpers=HELPERS)
+    return render_template("wrench_compensator.c", kernel=c.text, helpers=C_HELPER_FUNCTIONS)
 
 
 def c_header_text() -> str:
@@ -74,7 +74,7 @@ def c_header_text() -> str:
 
 
 class Target(NamedTuple):
-    """Load and loop of an export.
+    """Load, rate, low-pass and sensor of an export.
 
     Attributes:
         dt: period of the readings [s].
@@ -90,7 +90,7 @@ class Target(NamedTuple):
     notes: list[str]
 
     def settings_initializer(self, largest: Array | None = None, **scales: Any) -> str:
-        """Return a C initializer of `wrench_compensator_settings`."""
+        """Return the C initializer of a `wrench_compensator_settings`."""
         loop = self.make_compensator(largest, **scales)
         values = {
             "sigma_weight": 0.0,
@@ -99,7 +99,7 @@ class Target(NamedTuple):
             **scales,
             **loop.settings,
         }
-        return "".join(f"    {_literal(values[name])}, /* {name} */\n" for name in _SETTINGS)
+        return "".join(f"    {_c_literal(values[name])}, /* {name} */\n" for name in _SETTING_NAMES)
 
     def make_compensator(self, largest: Array | None = None, **scales: Any) -> Compensator:
         largest = self.largest if largest is None else largest
@@ -109,7 +109,7 @@ class Target(NamedTuple):
 def c99_files(target: Target) -> Files:
     return {
         **kernel_files(target),
-        "test_vector.h": _test_vector(target),
+        "test_vector.h": _test_vector_header(target),
         "test_wrench_compensator.c": read_template("test_wrench_compensator.c"),
         "CMakeLists.txt": read_template("CMakeLists.txt"),
         "README.md": render_template(
@@ -117,7 +117,7 @@ def c99_files(target: Target) -> Files:
             rate=f"{1.0 / target.dt:g}",
             period=f"{target.dt:g}",
             notes=target.notes,
-            count=_VECTOR_READINGS,
+            count=_NUM_TEST_READINGS,
         ),
     }
 
@@ -126,15 +126,15 @@ def kernel_files(target: Target) -> Files:
     load = render_template(
         "load.h", dt=repr(target.dt), settings=target.settings_initializer(), notes=target.notes
     )
-    return dict(zip((*KERNEL, "load.h"), (c_header_text(), c_kernel_text(), load), strict=True))
+    return dict(zip(KERNEL_FILES, (c_header_text(), c_kernel_text(), load), strict=True))
 
 
 def read_template(name: str) -> str:
-    return resources.files(PACKAGE).joinpath(f"templates/{name}").read_text(encoding="utf-8")
+    return resources.files(TEMPLATE_PACKAGE).joinpath(f"templates/{name}").read_text("utf-8")
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Return a shipped template with its values; nothing is escaped."""
+    """Return a shipped template with inserted values; nothing is escaped."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, str):
@@ -142,43 +142,43 @@ def render_template(name: str, **values: Any) -> str:
         return [plain(each) for each in value] if isinstance(value, (list, tuple)) else value
 
     values = {key: plain(value) for key, value in ({"version": __version__} | values).items()}
-    return render_page(PACKAGE, f"templates/{name}.j2", **values) + "\n"
+    return render_page(TEMPLATE_PACKAGE, f"templates/{name}.j2", **values) + "\n"
 
 
-def _test_vector(target: Target) -> str:
+def _test_vector_header(target: Target) -> str:
     inputs, largest = _simulated_readings(target)
-    python = target.make_compensator(largest, **_VECTOR_SCALES)
+    python = target.make_compensator(largest, **_TEST_SCALES)
     outputs = [
-        python.step(Reading(k, t, row[:VALUES], gravity=row[VALUES:]), t)
+        python.step(Reading(k, t, row[:NUM_VALUES], gravity=row[NUM_VALUES:]), t)
         for k, (t, row) in enumerate(zip(target.dt * np.arange(len(inputs)), inputs, strict=True))
     ]
     return render_template(
         "test_vector.h",
-        settings=target.settings_initializer(largest, **_VECTOR_SCALES),
-        inputs=[_literal(row) for row in inputs],
-        outputs=[_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
+        settings=target.settings_initializer(largest, **_TEST_SCALES),
+        inputs=[_c_literal(row) for row in inputs],
+        outputs=[_c_literal(np.concatenate([out.contact, out.scaled])) for out in outputs],
         flags="{" + ", ".join(str(out.flags) for out in outputs) + "}",
     )
 
 
 def _simulated_readings(target: Target) -> tuple[Array, Array]:
-    """Return rows [wrench, s, omega, alpha, gravity] (N, 18) in S and a sensor range (6,)."""
-    phase = 2.0 * np.pi * np.arange(_VECTOR_READINGS)[:, None] / _VECTOR_READINGS
+    """Return rows [wrench, s, omega, alpha, gravity] (N, 18) and a sensor range (6,)."""
+    phase = 2.0 * np.pi * np.arange(_NUM_TEST_READINGS)[:, None] / _NUM_TEST_READINGS
     omega = np.sin(3.0 * phase + [0.0, 1.0, 2.0])
     alpha = 6.0 * np.cos(5.0 * phase + [2.0, 1.0, 0.0])
     down = np.array([3.0, -4.0, -8.0]) + omega
     motion = 5.0 * alpha - down, omega, alpha
-    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _VECTOR_AMPLITUDES
+    contact = 40.0 * np.maximum(np.sin(4.0 * phase + np.arange(6.0)), 0.0) * _TEST_AMPLITUDES
     wrench = non_contact_wrench(*motion, target.found.phi) + target.found.offsets + contact
     readings = np.round(np.hstack([wrench, *motion, down]), 6)
     largest = 0.95 * np.abs(readings[:, :6]).max(axis=0)
     readings[100:103, 7], readings[200, 0], readings[201, 12] = np.nan, np.inf, 1e7
-    first = _VECTOR_READINGS // 2
-    readings[first : first + round(2.0 * STALE_S / target.dt) + 2, 5] = np.nan
+    first = _NUM_TEST_READINGS // 2
+    readings[first : first + round(2.0 * STALE_AGE_S / target.dt) + 2, 5] = np.nan
     return readings, largest
 
 
-def _literal(value: Any) -> str:
+def _c_literal(value: Any) -> str:
     if isinstance(value, np.ndarray):
         text = ", ".join(repr(float(x)) for x in value)
         return "{" + text.replace("nan", "NAN").replace("inf", "INFINITY") + "}"

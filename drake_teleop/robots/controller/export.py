@@ -1,4 +1,4 @@
-"""Export of an identified load with the compensation."""
+"""Export of an identified load with code that compensates it."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def export_controller(
     sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> list[str]:
-    """Write the files of the format `to`; return warnings.
+    """Write the files of the format `to` into the folder `out`; return warnings.
 
     `sign` is -1 if the sensor reports the wrench of load on sensor (usual), else 1.
     """
     if rate_hz is None:
         raise DrakeTeleopError(
-            f"is required by {to}", where="rate", remedy="give the rate of the readings in Hz"
+            f"missing, but required by {to}", where="rate", remedy="give the readings' rate in Hz"
         )
     if sensor_pose is not None:
         raise sensor_frame_error(to)

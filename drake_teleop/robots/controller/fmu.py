@@ -1,4 +1,4 @@
-"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of the kernel with a load."""
+"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) that compensate a load."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 from drake_teleop.common.version import __version__
 from drake_teleop.robots.controller.c99 import CFLAGS, Files, Target, kernel_files, read_template
 
-_NAME = "wrench_compensator"
-_WRENCH = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
-_UNITS = {
+_MODEL_NAME = "wrench_compensator"
+_WRENCH_NAMES = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
+_UNIT_EXPONENTS = {
     "N": {"kg": "1", "m": "1", "s": "-2"},
     "N.m": {"kg": "1", "m": "2", "s": "-2"},
     "m/s2": {"m": "1", "s": "-2"},
@@ -42,26 +42,26 @@ def fmu_files(target: Target) -> Files:
     kernel["token.h"] = f'#define TOKEN "{token}"\n'
     kernel["fmu.h"] = read_template("fmu.h")
     return {
-        f"{_NAME}_fmi{version[0]}.fmu": _fmu(target, kernel, version, token, compiler)
+        f"{_MODEL_NAME}_fmi{version[0]}.fmu": _fmu_archive(target, kernel, version, token, compiler)
         for version in ("2.0", "3.0")
     }
 
 
-def _fmu(target: Target, kernel: Files, version: str, token: str, compiler: str | None) -> bytes:
+def _fmu_archive(target: Target, kernel: Files, version: str, token: str, cc: str | None) -> bytes:
     sources = {**kernel, f"fmi{version[0]}.c": read_template(f"fmi{version[0]}.c")}
     files: dict[str, str | bytes] = {f"sources/{name}": text for name, text in sources.items()}
     compiled = [name for name in sources if name.endswith(".c")]
     files["modelDescription.xml"] = _model_description(target, version, token, compiled)
     if version == "3.0":
         build = Element("fmiBuildDescription", fmiVersion="3.0")
-        configuration = SubElement(build, "BuildConfiguration", modelIdentifier=_NAME)
+        configuration = SubElement(build, "BuildConfiguration", modelIdentifier=_MODEL_NAME)
         group = SubElement(configuration, "SourceFileSet", language="C99")
         for name in compiled:
             SubElement(group, "SourceFile", name=name)
         files["sources/buildDescription.xml"] = _xml_text(build)
-    if compiler is not None:
-        binary = f"binaries/{_PLATFORMS[version]}/{_NAME}.so"
-        files[binary] = _shared_library(compiler, sources, compiled)
+    if cc is not None:
+        binary = f"binaries/{_PLATFORMS[version]}/{_MODEL_NAME}.so"
+        files[binary] = _compile_library(cc, sources, compiled)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files.items():
@@ -69,7 +69,7 @@ def _fmu(target: Target, kernel: Files, version: str, token: str, compiler: str 
     return content.getvalue()
 
 
-def _shared_library(compiler: str, sources: Files, compiled: list[str]) -> bytes:
+def _compile_library(compiler: str, sources: Files, compiled: list[str]) -> bytes:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in sources.items():
@@ -86,13 +86,13 @@ def _model_description(target: Target, version: str, token: str, compiled: list[
         "fmiModelDescription",
         {
             "fmiVersion": version,
-            "modelName": _NAME,
+            "modelName": _MODEL_NAME,
             "instantiationToken" if new else "guid": token,
             "description": "Wrist wrench without weight and inertia of the load",
             "generationTool": f"drake_teleop {__version__}",
         },
     )
-    simulation = SubElement(root, "CoSimulation", modelIdentifier=_NAME)
+    simulation = SubElement(root, "CoSimulation", modelIdentifier=_MODEL_NAME)
     if new:
         simulation.set("fixedInternalStepSize", repr(target.dt))
     else:
@@ -100,7 +100,7 @@ def _model_description(target: Target, version: str, token: str, compiled: list[
         for name in compiled:
             SubElement(files, "File", name=name)
     units = SubElement(root, "UnitDefinitions")
-    for unit, base in _UNITS.items():
+    for unit, base in _UNIT_EXPONENTS.items():
         SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", base)
     SubElement(root, "DefaultExperiment", stepSize=repr(target.dt))
     variables = SubElement(root, "ModelVariables")
@@ -120,11 +120,11 @@ def _model_description(target: Target, version: str, token: str, compiled: list[
         SubElement(variables, "Float64", time | {"variability": "continuous"})
     outputs = [k for k, variable in enumerate(listed) if variable[1] == "output"]
     structure = SubElement(root, "ModelStructure")
-    _list_unknowns(structure, outputs, new)
+    _add_unknowns(structure, outputs, new)
     return _xml_text(root)
 
 
-def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
+def _add_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
     for tag in ("Output", "InitialUnknown"):
         group = structure if new else SubElement(structure, f"{tag}s")
         for k in outputs:
@@ -135,7 +135,7 @@ def _list_unknowns(structure: Element, outputs: list[int], new: bool) -> None:
 
 
 def _model_variables(target: Target) -> list[tuple[str, str, str, float | None]]:
-    wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH]
+    wrench = [(name, "N" if name.startswith("f") else "N.m") for name in _WRENCH_NAMES]
     vectors = (("s", "m/s2"), ("omega", "rad/s"), ("alpha", "rad/s2"), ("gravity", "m/s2"))
     motion = [(f"{name}_{axis}", unit) for name, unit in vectors for axis in "xyz"]
     found = target.make_compensator().settings

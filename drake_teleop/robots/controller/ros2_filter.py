@@ -1,4 +1,4 @@
-"""ROS 2 package with the kernel as a filter of wrenches."""
+"""ROS 2 package of a filter that compensates wrenches."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from drake_teleop.robots.controller.c99 import (
     render_template,
 )
 
-_NAME = "wrench_compensator_filter"
-_FOLDER = "ros2_filter"
+_FILTER_NAME = "wrench_compensator_filter"
+_TEMPLATE_FOLDER = "ros2_filter"
 
 
 def ros2_filter_files(target: Target) -> Files:
     shipped = {
-        f"{_NAME}.xml": f"{_NAME}.xml",
+        f"{_FILTER_NAME}.xml": f"{_FILTER_NAME}.xml",
         "package.xml": "package.xml",
         "CMakeLists.txt": "CMakeLists.txt",
-        f"src/{_NAME}.cpp": f"{_NAME}.cpp",
+        f"src/{_FILTER_NAME}.cpp": f"{_FILTER_NAME}.cpp",
     }
     kernel = dict(kernel_files(target))
     sign = f"#define WRENCH_COMPENSATOR_SIGN {target.sign}.0\n\n#endif"
     kernel["load.h"] = sign.join(str(kernel["load.h"]).rsplit("#endif", 1))
     values = {"rate": f"{1.0 / target.dt:g}", "sign": str(target.sign), "notes": target.notes}
     return {
-        **{name: read_template(f"{_FOLDER}/{file}") for name, file in shipped.items()},
+        **{name: read_template(f"{_TEMPLATE_FOLDER}/{file}") for name, file in shipped.items()},
         **{f"src/{name}": text for name, text in kernel.items()},
-        "README.md": render_template(f"{_FOLDER}/README.md", **values),
+        "README.md": render_template(f"{_TEMPLATE_FOLDER}/README.md", **values),
     }

@@ -14,7 +14,7 @@ import textwrap
 from collections.abc import Callable
 from typing import Any
 
-HELPERS = """\
+C_HELPER_FUNCTIONS = """\
 static int isfinite_(double x) { return x - x == 0.0; }
 static int isnan_(double x) { return x != x; }
 static double abs_(double x) { return x <= 0.0 ? 0.0 - x : x; }
@@ -24,13 +24,13 @@ static double copysign_(double x, double sign) {
 }
 """
 """C functions that translated code calls; their results are those of Python, except for NaN."""
-_HELPERS = {
+_HELPER_OF_FUNCTION = {
     math.isfinite: ("isfinite_", "int"),
     math.isnan: ("isnan_", "int"),
     math.copysign: ("copysign_", "double"),
     abs: ("abs_", "double"),
 }
-_OPERATORS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
+_C_OPERATORS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
     ast.Add: ("+", operator.add),
     ast.Sub: ("-", operator.sub),
     ast.Mult: ("*", operator.mul),
@@ -45,22 +45,22 @@ _OPERATORS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
 }
 
 
-class _Scalar:
-    """C expression; `array`: of which parameter it is an element; `constant`: no later write."""
+class _CScalar:
+    """C expression of a number, element of parameter `array`; `constant` if never reassigned."""
 
     def __init__(self, text: str, kind: str, array: str = "", constant: bool = False) -> None:
         self.text, self.kind, self.array, self.constant = text, kind, array, constant
 
 
-class _Array:
-    """C pointer to doubles, part of an array parameter; a size may be the name of a parameter."""
+class _CArray:
+    """C pointer into parameter `array`; a size may be the name of a C parameter."""
 
     def __init__(self, text: str, shape: tuple[int | str, ...], array: str) -> None:
         self.text, self.shape, self.array = text, shape, array
 
 
 class Translator:
-    """C functions, each after the functions that it calls."""
+    """Translator of numba functions to C; called functions come first."""
 
     def __init__(self) -> None:
         self._functions: dict[tuple[Any, ...], _Function] = {}
@@ -72,10 +72,10 @@ class Translator:
     def translate_function(
         self, function: Any, **parameters: str | tuple[int | str, ...]
     ) -> _Function:
-        """Translate a function of `njit`.
+        """Translate a numba function to C.
 
-        `parameters` are, in order, "double", "int" or the shape of an array, which may begin with
-        a name.
+        `parameters` are its types in order: "double", "int" or the shape of an array, whose first
+        size may be a name.
         """
         key = (function, *parameters.items())
         if key not in self._functions:
@@ -98,15 +98,15 @@ class _Function:
         tree, self._globals = _parse_source(function)
         names = [argument.arg for argument in tree.args.args]
         if names != list(parameters):
-            raise TypeError(f"{name}: give the types of {names}, not of {list(parameters)}")
+            raise TypeError(f"{name}: the parameters are {names}, not {list(parameters)}")
         self._values: dict[str, Any] = {
-            each: _Scalar(each, kind, constant=True)
+            each: _CScalar(each, kind, constant=True)
             if isinstance(kind, str)
-            else _Array(each, kind, each)
+            else _CArray(each, kind, each)
             for each, kind in parameters.items()
         }
         self._translate_block(tree.body)
-        head = f"static {self.kind} {name}({', '.join(self._parameters(parameters))}) {{"
+        head = f"static {self.kind} {name}({', '.join(self._declare_parameters(parameters))}) {{"
         comment = (ast.get_docstring(tree) or "").split("\n")[0].replace("`", "")
         body, self._lines = self._lines, [f"/* {comment} */"]
         self._write_line(head, 0)
@@ -118,7 +118,7 @@ class _Function:
                 self._write_line(f"(void){kind[0]};")  # it may be unused
         self.text = "\n".join([*self._lines, *body, "}\n"])
 
-    def _parameters(self, parameters: dict[str, Any]) -> list[str]:
+    def _declare_parameters(self, parameters: dict[str, Any]) -> list[str]:
         listed = []
         for name, kind in parameters.items():
             if isinstance(kind, str):
@@ -150,7 +150,7 @@ class _Function:
     def _translate_statement(self, node: ast.stmt) -> None:
         if isinstance(node, ast.Expr):
             called = self._translate_expression(node.value)
-            if isinstance(called, _Scalar):  # neither a docstring nor expanded
+            if isinstance(called, _CScalar):  # neither a docstring nor expanded
                 self._write_line(f"{called.text};")
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
             self._translate_assignment(node.targets[0], self._translate_expression(node.value))
@@ -159,14 +159,14 @@ class _Function:
                 node.target, self._translate_operation(node, node.op, node.target, node.value)
             )
         elif self._expanding:
-            raise self._unsupported_error(node, "in a function that is expanded at its call")
+            raise self._unsupported_error(node, "only assignments are expanded at a call")
         elif isinstance(node, ast.Return) and node.value is not None:
             value = self._translate_expression(node.value)
             self.kind = _c_type(value)
             self._write_line(f"return {_remove_outer_parentheses(_c_expression(value))};")
         elif isinstance(node, ast.If):
             test = self._translate_expression(node.test)
-            if isinstance(test, _Scalar):
+            if isinstance(test, _CScalar):
                 self._translate_block(node.body, f"if ({_remove_outer_parentheses(test.text)})")
                 if node.orelse:
                     self._translate_block(node.orelse, "else")
@@ -183,12 +183,12 @@ class _Function:
             not (isinstance(call, ast.Call) and self._translate_expression(call.func) is range)
             or call.args[2:]
         ):
-            raise self._unsupported_error(call, "as the range of a loop")
+            raise self._unsupported_error(call, "a loop needs range(stop) or range(start, stop)")
         *start, stop = [
             _c_expression(self._translate_expression(argument)) for argument in call.args
         ]
         self._locals[name] = "int"
-        self._values[name] = _Scalar(name, "int")
+        self._values[name] = _CScalar(name, "int")
         first = start[0] if start else "0"
         self._translate_block(node.body, f"for ({name} = {first}; {name} < {stop}; ++{name})")
 
@@ -205,38 +205,38 @@ class _Function:
             raise self._unsupported_error(target)
         elif self._expanding:
             self._values[target.id] = self._store_in_variables(value)
-        elif isinstance(value, (tuple, _Array)):
+        elif isinstance(value, (tuple, _CArray)):
             if self._indent > 1:
-                raise self._unsupported_error(target, "in a branch or loop as a tuple or array")
+                raise self._unsupported_error(target, "a branch or loop assigns only numbers")
             self._values[target.id] = self._store_in_variables(value)
         else:
-            if isinstance(self._values.get(target.id), _Scalar) and target.id not in self._locals:
-                raise self._unsupported_error(target, "as a parameter with a new value")
+            if isinstance(self._values.get(target.id), _CScalar) and target.id not in self._locals:
+                raise self._unsupported_error(target, "a parameter keeps its value")
             if self._locals.setdefault(target.id, _c_type(value)) != _c_type(value):
-                raise self._unsupported_error(target, "with two types")
-            self._values[target.id] = _Scalar(target.id, _c_type(value))
+                raise self._unsupported_error(target, "a variable keeps its type")
+            self._values[target.id] = _CScalar(target.id, _c_type(value))
             self._write_line(f"{target.id} = {_remove_outer_parentheses(_c_expression(value))};")
 
     def _write_element(self, place: Any, value: Any) -> None:
         self.written.add(place.array)
-        if isinstance(place, _Scalar):
+        if isinstance(place, _CScalar):
             self._write_line(f"{place.text} = {_remove_outer_parentheses(_c_expression(value))};")
             return
         k = self._new_local("int")
-        source = f"{value.text}[{k}]" if isinstance(value, _Array) else _c_expression(value)
+        source = f"{value.text}[{k}]" if isinstance(value, _CArray) else _c_expression(value)
         self._write_line(
             f"for ({k} = 0; {k} < {place.shape[0]}; ++{k}) {place.text}[{k}] = {source};"
         )
 
     def _store_in_variables(self, value: Any) -> Any:
-        """Return a value that no later write changes: its expressions are stored in variables."""
+        """Store the value's expressions in new C variables, which no later write changes."""
         if isinstance(value, tuple):
             return tuple(map(self._store_in_variables, value))
-        if not isinstance(value, _Scalar) or value.constant:
+        if not isinstance(value, _CScalar) or value.constant:
             return value
         name = self._new_local(value.kind)
         self._write_line(f"{name} = {_remove_outer_parentheses(value.text)};")
-        return _Scalar(name, value.kind, constant=True)
+        return _CScalar(name, value.kind, constant=True)
 
     def _new_local(self, kind: str) -> str:
         name = f"{kind[0]}{self._temporaries}_"
@@ -265,10 +265,10 @@ class _Function:
                 self._translate_expression(node.operand),
                 isinstance(node.op, ast.USub),
             )
-            if not isinstance(value, _Scalar):
+            if not isinstance(value, _CScalar):
                 return -value if negative else not value
             kind = value.kind if negative else "int"
-            return _Scalar(f"({'-' if negative else '!'}{value.text})", kind)
+            return _CScalar(f"({'-' if negative else '!'}{value.text})", kind)
         if isinstance(node, ast.BinOp):
             return self._translate_operation(node, node.op, node.left, node.right)
         if isinstance(node, ast.Compare) and len(node.ops) == 1:
@@ -276,24 +276,24 @@ class _Function:
         if isinstance(node, ast.BoolOp):
             sign = " && " if isinstance(node.op, ast.And) else " || "
             parts = [_c_expression(self._translate_expression(each)) for each in node.values]
-            return _Scalar(f"({sign.join(parts)})", "int")
+            return _CScalar(f"({sign.join(parts)})", "int")
         raise self._unsupported_error(node)
 
     def _translate_operation(
         self, node: ast.AST, op: ast.AST, left: ast.expr, right: ast.expr
     ) -> Any:
         a, b = self._translate_expression(left), self._translate_expression(right)
-        if type(op) not in _OPERATORS:
+        if type(op) not in _C_OPERATORS:
             raise self._unsupported_error(node)
-        sign, calculate = _OPERATORS[type(op)]
-        if not isinstance(a, _Scalar) and not isinstance(b, _Scalar):
+        sign, calculate = _C_OPERATORS[type(op)]
+        if not isinstance(a, _CScalar) and not isinstance(b, _CScalar):
             return calculate(a, b)
         kinds = {_c_type(a), _c_type(b)}
         needed = {"%": {"int"}, "/": {"double"}}.get(sign, kinds)
         if kinds != needed:
-            raise self._unsupported_error(node, f"with {' and '.join(sorted(kinds))}")
+            raise self._unsupported_error(node, f"{sign} is allowed only for {' '.join(needed)}")
         kind = "int" if isinstance(op, ast.cmpop) or kinds == {"int"} else "double"
-        return _Scalar(f"({_c_expression(a)} {sign} {_c_expression(b)})", kind)
+        return _CScalar(f"({_c_expression(a)} {sign} {_c_expression(b)})", kind)
 
     def _translate_subscript(self, value: Any, node: ast.expr) -> Any:
         if isinstance(node, ast.Tuple):
@@ -306,51 +306,51 @@ class _Function:
             if node.step is not None or not isinstance(start, int) or not isinstance(stop, int):
                 raise self._unsupported_error(node)
             text = f"({value.text} + {start})" if start else value.text
-            return _Array(text, (stop - start, *value.shape[1:]), value.array)
+            return _CArray(text, (stop - start, *value.shape[1:]), value.array)
         index = self._translate_expression(node)
-        if not isinstance(value, _Array):
+        if not isinstance(value, _CArray):
             return value[index]
         text = f"{value.text}[{_remove_outer_parentheses(_c_expression(index))}]"
         if value.shape[1:]:
-            return _Array(text, value.shape[1:], value.array)
-        return _Scalar(text, "double", value.array)
+            return _CArray(text, value.shape[1:], value.array)
+        return _CScalar(text, "double", value.array)
 
     def _translate_call(self, function: Any, values: list[Any]) -> Any:
-        if function is len and isinstance(values[0], _Array):
+        if function is len and isinstance(values[0], _CArray):
             size = values[0].shape[0]
-            return size if isinstance(size, int) else _Scalar(size, "int", constant=True)
-        if function in _HELPERS:
-            name, kind = _HELPERS[function]
-            return _Scalar(f"{name}({', '.join(map(_c_expression, values))})", kind)
+            return size if isinstance(size, int) else _CScalar(size, "int", constant=True)
+        if function in _HELPER_OF_FUNCTION:
+            name, kind = _HELPER_OF_FUNCTION[function]
+            return _CScalar(f"{name}({', '.join(map(_c_expression, values))})", kind)
         if hasattr(function, "py_func"):
             return self._translate_c_call(function, values)
         if inspect.isfunction(function):
             return self._expand_call(function, values)
         raise ValueError(f"{self.name}: a call of {function!r} cannot be translated to C")
 
-    def _translate_c_call(self, function: Any, values: list[Any]) -> _Scalar:
+    def _translate_c_call(self, function: Any, values: list[Any]) -> _CScalar:
         given = dict(zip(inspect.signature(function.py_func).parameters, values, strict=True))
         kinds = {
-            name: value.shape if isinstance(value, _Array) else _c_type(value)
+            name: value.shape if isinstance(value, _CArray) else _c_type(value)
             for name, value in given.items()
         }
         called = self._translator.translate_function(function, **kinds)
         passed = []
         for name, value in given.items():
             passed.append(_remove_outer_parentheses(_c_expression(value)))
-            if isinstance(value, _Array):
+            if isinstance(value, _CArray):
                 passed += [size for size in value.shape if isinstance(size, str)]
                 if name in called.written:
                     self.written.add(value.array)
-        return _Scalar(f"{called.name}({', '.join(passed)})", called.kind)
+        return _CScalar(f"{called.name}({', '.join(passed)})", called.kind)
 
     def _expand_call(self, function: Any, values: list[Any]) -> Any:
         tree, scope = _parse_source(function)
         outer = self._values, self._globals, self._expanding
         # An element may be read later, because the expanded function writes only at its end.
         values = [
-            value if isinstance(value, _Scalar) and value.array else self._store_in_variables(value)
-            for value in values
+            each if isinstance(each, _CScalar) and each.array else self._store_in_variables(each)
+            for each in values
         ]
         names = [argument.arg for argument in tree.args.args]
         self._values, self._globals = dict(zip(names, values, strict=True)), scope
@@ -365,8 +365,8 @@ class _Function:
         return result
 
     def _unsupported_error(self, node: ast.AST, why: str = "") -> ValueError:
-        what = f"{self.name}: {ast.unparse(node)!r} {why}".rstrip()
-        return ValueError(f"{what} cannot be translated to C")
+        what = f"{self.name}: {ast.unparse(node)!r} cannot be translated to C"
+        return ValueError(f"{what} ({why})" if why else what)
 
 
 def _parse_source(function: Any) -> tuple[ast.FunctionDef, dict[str, Any]]:
@@ -376,13 +376,13 @@ def _parse_source(function: Any) -> tuple[ast.FunctionDef, dict[str, Any]]:
 
 
 def _c_type(value: Any) -> str:
-    if isinstance(value, _Scalar):
+    if isinstance(value, _CScalar):
         return value.kind
     return "double" if isinstance(value, float) else "int"
 
 
 def _c_expression(value: Any) -> str:
-    if isinstance(value, (_Scalar, _Array)):
+    if isinstance(value, (_CScalar, _CArray)):
         return value.text
     text = repr(float(value)) if isinstance(value, float) else str(int(value))
     return f"({text})" if value < 0 else text
