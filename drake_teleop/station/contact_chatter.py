@@ -35,9 +35,9 @@ class Chatter(NamedTuple):
 
 
 def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
-    """Return each series of touches that no reversal of the command explains.
+    """Return each long series of touches, without touches explained by reversals of the command.
 
-    It has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
+    A series has 8 or more touches, at most 0.2 s apart, and lasts 0.3 s or longer.
 
     Args:
         t: (N,) evenly spaced times [s].

@@ -49,23 +49,23 @@ _TITLE_TAG = (
 
 
 class Canvas(Protocol):
-    """Receiver of poses and properties: Meshcat or an object with the same methods."""
+    """Interface for 3D objects with poses and properties: Meshcat or a substitute."""
 
     def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
-        """Set the pose of the object at `path`, at a time of the recording [s]."""
+        """Set the pose of the object at scene `path`, for a time of the recording [s]."""
 
     def SetProperty(self, path: str, property: str, value: Any, time: float) -> None:
-        """Set a property, such as "scale", at a time of the recording [s]."""
+        """Set a property of an object, such as "scale", for a time of the recording [s]."""
 
 
 @dataclass(frozen=True)
 class DisplayedNumber:
-    """Number displayed beside the replay.
+    """Number over time that the page of a replay displays.
 
     Args:
         values: (F,) one value per frame; NaN where the number does not exist.
-        colour: colour of the curve, "#rrggbb"; "" for no curve. All curves share one scale.
-        arrow: True if arrows of this colour represent the number.
+        colour: colour of its curve, "#rrggbb"; "" for no curve. All curves share one scale.
+        arrow: True if the scene shows arrows of this colour for it.
     """
 
     name: str
@@ -88,14 +88,14 @@ class DisplayedNumber:
 
 @dataclass(frozen=True)
 class ReplayFile:
-    """Contents of a 3D replay, except the scene.
+    """Contents of the page of a 3D replay, without the 3D scene.
 
     Args:
         times: (F,) times of the frames, evenly spaced, at least two [s].
-        slow_motion: initial speed: seconds of replay per second of `times`.
-        readings: numbers beside the replay.
-        shaded: intervals of `times` that the curves mark.
-        clock, curves: labels; in that of the curves "{top}" is replaced by the largest value.
+        slow_motion: initial factor: seconds of replay per second of `times`.
+        readings: numbers that the page displays.
+        shaded: time spans (start, stop) that are shaded behind the curves.
+        clock, curves: labels; "{top}" in `curves` is replaced by the largest value.
     """
 
     title: str
@@ -165,9 +165,9 @@ class ReplayFile:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times (F,) of a replay's frames [s], and its slow motion (replay per real second).
+    """Return times (F,) of a replay's frames [s], and the seconds of replay per real second.
 
-    By default the replay lasts at least 6 s.
+    By default this factor makes the replay last at least 6 s.
     """
     span = stop - start
     if slow_motion is None:
@@ -193,7 +193,7 @@ def add_shapes(
     shapes: Iterable[GeometryId],
     colour: Rgba = _DEFAULT_COLOUR,
 ) -> None:
-    """Add a body's shapes to Meshcat below `path`, in the model's colours or else in `colour`."""
+    """Add a body's shapes to Meshcat below `path`; `colour` is for shapes without their own."""
     for shape in shapes:
         seen = inspector.GetIllustrationProperties(shape)
         own = colour if seen is None else seen.GetPropertyOrDefault("phong", "diffuse", colour)

@@ -74,7 +74,7 @@ _OPTIONAL_SIGNALS = ("master_state", "contact_wrench_S", "force_to_master", "she
 def replay_command(
     run: Path, out: Path, *, scenario: str | Path | None = None, quiet: bool = False
 ) -> dict[str, Any]:
-    """Write the replays of logged runs, and summary.json with their paths; return the summary.
+    """Write a 3D replay for each log, and summary.json with their paths; return the summary.
 
     Args:
         run: folder written by `run` or `reproduce`, or a log in it.
@@ -110,7 +110,7 @@ def write_replay(
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
         raise DrakeTeleopError(
-            f"cannot be shown: it contains no {', '.join(missing) or 'samples'}",
+            f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}",
             where="replay",
             remedy="give the log of a station with a simulated slave",
         )
@@ -169,7 +169,7 @@ def _row_norms(vectors: Array) -> Array:
 def _find_logs(run: Path) -> list[Path]:
     if not os.path.exists(run):
         raise DrakeTeleopError(
-            "there is no such folder", where=str(run), remedy="give the folder of a run"
+            "there is no such file or folder", where=str(run), remedy="give the folder of a run"
         )
     if run.suffix == ".parquet":
         return [run]
@@ -191,14 +191,14 @@ def _find_scenario(log: Path) -> Path:
         if path.exists():
             return path
     raise DrakeTeleopError(
-        "has no scenario beside it",
+        "this log has no scenario file beside it",
         where=str(log),
         remedy="give --scenario, a shipped one or a YAML file",
     )
 
 
 class ReplayScene:
-    """Meshcat scene of a replay, which shows one sample at a time.
+    """3D scene of a replay in Meshcat, which shows one sample of a log at a time.
 
     `plant` contains slave, surroundings and haptic device, for shapes and kinematics only.
     """
@@ -249,7 +249,7 @@ class ReplayScene:
                 yield path, body
 
     def show_sample(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
-        """Show row `sample` of the signals at a time of the recording [s]."""
+        """Record row `sample` of the signals as the scene at `film_time` [s] of the replay."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
@@ -304,7 +304,7 @@ class ReplayScene:
 class _ReplayDevice(NamedTuple):
     """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    `positions` converts joint positions to those of the plant.
+    `positions` is a function from logged joint positions to the plant's.
     """
 
     instance: ModelInstanceIndex

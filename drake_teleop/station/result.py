@@ -67,7 +67,7 @@ class Signal:
             expect(str, text, "signal")
         if len(units) != len(self.components):
             raise DrakeTeleopError(
-                f"{len(self.components)} components, but {len(units)} units",
+                f"the signal has {len(self.components)} components, but {len(units)} units",
                 where=self.name,
                 remedy="give one unit, or one per component",
             )
@@ -79,7 +79,7 @@ class Signal:
 
 
 class SimulationResult:
-    """Sampled signals of one simulation on one time base.
+    """Recorded signals of one simulation, sampled at common times.
 
     ``result["measured_wrench_S"]`` is an (N, k) array; ``result["measured_wrench_S.f_x"]`` and
     ``result["t"]`` are (N,) columns. ``len(result)`` and iteration refer to the signals' names.
@@ -88,7 +88,7 @@ class SimulationResult:
     Args:
         t: (N,) sample times [s].
         signals: arrays by name, (N, k), or (N,) for one component.
-        specs: descriptions; they define the order.
+        specs: description of each signal; they define the order.
 
     Raises:
         DrakeTeleopError: if names, lengths or numbers of components are inconsistent.
@@ -102,7 +102,7 @@ class SimulationResult:
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             raise DrakeTeleopError(
-                f"the names of signals and specs differ in {', '.join(odd)}",
+                f"only one of `signals` and `specs` contains {', '.join(odd)}",
                 where="signals",
                 remedy="give each signal one spec",
             )
@@ -119,7 +119,7 @@ class SimulationResult:
             array = array[:, np.newaxis]
         if array.shape != shape:
             raise DrakeTeleopError(
-                f"has shape {array.shape} instead of {shape}",
+                f"has shape {array.shape} instead of {shape} (times, components)",
                 where=name,
                 remedy="give a row per time and a column per component",
             )
@@ -166,7 +166,7 @@ class SimulationResult:
         except KeyError:
             names = self._ipython_key_completions_()
             near = difflib.get_close_matches(str(name), names, n=3) or self.signals
-            raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
+            raise KeyError(f"there is no signal {name!r}, but {', '.join(near)}") from None
 
     def _column(self, name: object) -> tuple[str, int] | None:
         signal = str(name).partition(".")[0]
@@ -197,7 +197,7 @@ class SimulationResult:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
             raise DrakeTeleopError(
-                f"{error.name or 'a library'} is not installed",
+                f"{error.name or 'a library'} is not installed (pandas frames require it)",
                 where="to_pandas",
                 remedy=remedy_to_install_extra("notebook"),
             ) from None
@@ -225,7 +225,7 @@ class SimulationResult:
         missing = [name for name in _CANONICAL_COLUMNS if name not in self]
         if missing:
             raise DrakeTeleopError(
-                f"the result contains no {', '.join(missing)}",
+                f"the result contains no {', '.join(missing)} (a sensor log needs these signals)",
                 where="sensor log",
                 remedy="record the wrist sensor's signals",
             )
@@ -251,7 +251,7 @@ class SimulationResult:
     def write_part(self, folder: Path, first_row: int) -> None:
         """Write this result as one part of a longer log, in the format of `write_parquet`.
 
-        The same rows written again replace the part.
+        A part with the same `first_row` is replaced.
 
         Args:
             folder: folder of the log, prepared by `remove_log`.
@@ -274,7 +274,7 @@ class SimulationResult:
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log larger than the memory: each access to a signal reads it from the disk.
+        """Open a log that may be larger than the memory: each access to a signal reads the disk.
 
         Args:
             path: file or folder of parts, from `write_parquet` or `simulate`.
@@ -415,7 +415,7 @@ def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
     refuse_fork()
     table = pl.read_parquet(_log_parts(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
-        raise ValueError(f"{', '.join(columns)} hold no numbers")
+        raise ValueError(f"columns {', '.join(columns)} do not contain numbers")
     return table.to_numpy()
 
 

@@ -1,4 +1,4 @@
-"""Warnings about a run from its recorded signals, and about overlaps of shapes at its start."""
+"""Warnings about a simulated run, from its recorded signals and overlapping shapes at its start."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _MAX_LISTED_TIMES = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """Return one sentence, with times, for each condition in docs/running.md that occurred.
+    """Return a warning, with times, for each condition listed in docs/running.md that occurred.
 
     Checks whose signals were not recorded are skipped. `arm` is the slave's arm, with limits.
     """
@@ -95,10 +95,10 @@ def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
 
 
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """Return (N,) distance of the actual motion from the range of recent commands.
+    """Return (N,) distances of the actual motion from the range of the last commands.
 
-    A delay, or a loop without overshoot, stays inside this range. `t` (N,) are evenly spaced times
-    [s], `command` and `actual` are (N, k); the range covers the time `window` [s].
+    The range covers the last `window` [s], so a pure delay gives 0. `t` (N,) are evenly spaced
+    times [s], `command` and `actual` are (N, k).
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _running_maximum(command, rows)
@@ -242,7 +242,7 @@ def _position_and_rotation_parts(
 
 
 def _packet_ages(t: Array, scenario: Scenario) -> Array:
-    """Return (N,) age of the newest packet at the slave's end [s], from the network model."""
+    """Return the age (N,) of the newest packet at the slave [s], from the network model."""
     period = 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     line, seed = scenario.channel.networks_of_directions()[0], scenario.simulation.seed

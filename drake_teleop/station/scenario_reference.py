@@ -1,4 +1,4 @@
-"""Reference page, JSON schema and commented YAML of a scenario, generated from the dataclasses."""
+"""Reference page, JSON schema and commented YAML of scenarios, generated from the dataclasses."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
             n for n in names if _all_texts(getattr(found, n)) != _all_texts(getattr(scenario, n))
         ]
         raise DrakeTeleopError(
-            f"YAML cannot represent the scenario's block {' and '.join(lost)}",
+            f"YAML cannot represent the content of the scenario's block {' and '.join(lost)}",
             where=where,
             remedy="use printable texts, numbers and lists",
         )
@@ -87,7 +87,7 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
 
 
 def reference_page() -> str:
-    """Return the reference in Markdown: a table per block with field, default, range, meaning."""
+    """Return the scenario reference in Markdown: a table of fields, ranges, meanings per block."""
     return _REFERENCE_HEAD + "".join(_sections_of_page(Scenario(), ""))
 
 

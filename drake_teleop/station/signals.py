@@ -130,7 +130,7 @@ SIGNALS = {
 
 
 def signal_of(name: str, size: int) -> Signal:
-    """Return the description of a signal for `size` components; SI units of revolute joints."""
+    """Return the description of a signal with `size` components, for any number of joints."""
     if name.startswith(POSE_SIGNAL_PREFIX):
         return _signal(
             name,

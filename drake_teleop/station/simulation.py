@@ -1,4 +1,4 @@
-"""Simulation of a station; the result contains the named signals."""
+"""Simulation of a station, which returns its recorded signals."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
             what = FAULT_MEANINGS[Fault(int(log.data()[column][0, k]))]
             raise DrakeTeleopError(
-                f"at {log.sample_times()[k] - start:.3f} s {what}",
+                f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}",
                 where="simulation.on_fault",
                 remedy="set it to continue, and the run goes on in its safe state",
             )
@@ -114,7 +114,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
 
 
 def log_columns(station: Diagram) -> dict[str, slice]:
-    """Return for each signal, by name, the slice of its rows in the station's log."""
+    """Return, by signal name, the slice of the signal's components in the station's log."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
     return {p.get_name(): slice(e - p.size(), e) for p, e in zip(ports, ends, strict=True)}
@@ -125,8 +125,8 @@ class LogOnDisk:
 
     Args:
         folder: folder of the log; an old log is replaced.
-        start: time that becomes t = 0 [s].
-        form: converts the rows to the common form of all parts.
+        start: simulation time that becomes t = 0 [s].
+        form: function that converts each part before it is written.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class LogOnDisk:
         return int(self._sink.num_samples())
 
     def write_and_clear(self) -> None:
-        """Write the rows in memory as the next part and clear them; repeatable if interrupted."""
+        """Write the rows in memory as the next part and clear them; safe to repeat."""
         part = self._read_rows()
         self._write_part(part)
         self._sink.Clear()

@@ -1,4 +1,4 @@
-"""Slave side of the station: arm with inverse kinematics, wrist sensor and load elimination."""
+"""Slave side of the station: arm, inverse kinematics, wrist sensor, elimination of the load."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def MakeSlaveSide(
     noise_floor: NoiseFloor | None = None,
     controller: System | None = None,
 ) -> Diagram:
-    """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, force scaling.
+    """Build the slave side: joint control, arm, wrist sensor, load estimator, force scaling.
 
     .. pydrake_system::
 
@@ -66,7 +66,7 @@ def MakeSlaveSide(
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
         - saturated: (1,) 1 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
-        - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
+        - the parts of a sample (`signals_of_sample`), slave_state, joint_torque, joint_command,
           ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is identified or estimated online): signals
         - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
@@ -173,7 +173,7 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
     ):
         if not has:
             remedy = "docs/station.md lists its ports"
-            raise DrakeTeleopError(f"there is no {port}", where="controller", remedy=remedy)
+            raise DrakeTeleopError(f"the block has no {port}", where="controller", remedy=remedy)
     scenario.master.check_pose_mode("a custom controller")
     return bool(torques)
 
@@ -201,8 +201,8 @@ def _add_inverse_kinematics(
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Build the slave side without master: its joints follow an excitation trajectory.
 
-    `trajectory` runs once after the settling time. Output ports are the signals of `MakeSlaveSide`
-    that need neither command nor elimination.
+    `trajectory` runs once after the settling time. Output ports are those of `MakeSlaveSide`
+    that need neither a pose command nor force scaling.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
@@ -322,7 +322,7 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Raise DrakeTeleopError for dry friction that stops a joint within one step [s]."""
+    """Raise DrakeTeleopError if dry friction is too fast for a stable `step` [s]."""
     if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
@@ -378,13 +378,13 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     needed = {*scales.as_array} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "sigma and gamma differ, but there is no load estimate",
+            "sigma and gamma differ, which requires a load estimate, but there is none",
             where="load_estimate",
             remedy="pass the estimate of identify_load, or set load_estimator.enabled",
         )
     if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "contact detection needs a load estimate",
+            "contact detection requires a load estimate, but there is none",
             where="load_estimate",
             remedy="pass the estimate of identify_load as load_estimate",
         )

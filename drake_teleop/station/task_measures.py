@@ -45,7 +45,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     task = scenario.operator.task
     if task is None:
         raise DrakeTeleopError(
-            "there is no task to measure",
+            "the scenario has no operator's task to measure",
             where="operator.task",
             remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
         )

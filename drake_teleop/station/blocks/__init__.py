@@ -1,4 +1,4 @@
-"""Blocks of Fig. 4 with a named port for each signal, for a Diagram of a Drake user."""
+"""Drake blocks of the paper's Fig. 4, with one port per signal, for use in your own Diagram."""
 
 from drake_teleop.station.blocks.ends import PassivityAtMaster, PassivityAtSlave
 from drake_teleop.station.blocks.force_display import ForceDisplay

@@ -1,4 +1,4 @@
-"""The two ends of a passivity method, for any network between them."""
+"""Blocks for the two ends of a passivity method; any network may connect them."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         period: time between packets [s].
         start: (7,) pose X_WS of the slave at the start.
         R_WB: (3, 3) alignment of the master's base with the world.
-        scales: (2,) scale of translation and rotation, slave over master.
-        force_scale: scale of force, slave to master.
-        timeout: silence that starts the safe state [s].
+        scales: (2,) motion of the slave over motion of the master: translation, rotation.
+        force_scale: force at the master over force at the slave.
+        timeout: time without packets after which the safe state begins [s].
     """
 
     __slots__ = ()
@@ -107,7 +107,7 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
 
 
 class PassivityAtMaster(_PassivityEndBlock):
-    """Master's end of a passivity method: renders a wrench, sends pose and energy.
+    """Block for the master's end of a passivity method: renders a wrench, sends pose and energy.
 
     .. pydrake_system::
 
@@ -143,7 +143,7 @@ class PassivityAtMaster(_PassivityEndBlock):
 
 
 class PassivityAtSlave(_PassivityEndBlock):
-    """Slave's end of a passivity method: commands a pose, sends wrench and energy.
+    """Block for the slave's end of a passivity method: commands a pose, sends wrench and energy.
 
     .. pydrake_system::
 
@@ -151,7 +151,7 @@ class PassivityAtSlave(_PassivityEndBlock):
         input_ports:
         - received: (39,) newest packet of the master, and 1 if it is new
         - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
-        - load_wrench_B: (6,) part of wrench_B from the load, for `ledger`; 0 if unconnected
+        - load_wrench_B: (6,) part of wrench_B from the load, for method "ledger"; 0 if unconnected
         - pose_slave: (7,) actual X_WS of the slave
         - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
         - contact: (1,) flag of a contact detector; 0 if unconnected

@@ -1,4 +1,4 @@
-"""Wrench of a load and scaling of a measured wrench, for double, AutoDiffXd and Expression."""
+"""Blocks for the wrench of a load and wrench scaling, for double, AutoDiffXd and Expression."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _basic_vector_of_type(T: Any, size: int) -> Any:
 @TemplateSystem.define("NonContactWrench_")
 def NonContactWrench_(T: Any) -> Any:
     class Impl(LeafSystem_[T]):
-        """Wrench V phi of a load's weight and inertia, Eq. (12).
+        """Block that outputs the wrench V phi of a load's weight and inertia, Eq. (12).
 
         .. pydrake_system::
 
@@ -46,12 +46,12 @@ def NonContactWrench_(T: Any) -> Any:
             - specific_force_S: (3,) a - g of the sensor's origin [m/s^2]
             - angular_velocity_S: (3,) [rad/s]
             - angular_acceleration_S: (3,) [rad/s^2]
-            - load: (10,) phi; unconnected: the parameter phi
+            - load: (10,) inertial parameters phi; the argument phi if unconnected
             output_ports:
             - non_contact_wrench_S: (6,) wrench on the load [N, N m]
 
         Args:
-            phi: (10,) load about So in S; a numeric parameter of the context.
+            phi: (10,) inertial parameters of the load about So, in S; a parameter of the context.
         """
 
         __slots__ = ONE_DICT
@@ -88,7 +88,7 @@ NonContactWrench = NonContactWrench_[float]
 @TemplateSystem.define("WrenchScaling_")
 def WrenchScaling_(T: Any) -> Any:
     class Impl(LeafSystem_[T]):
-        """Contact wrench and scaled wrench of a measured wrench, Eqs. (13) and (T7).
+        """Block that outputs contact wrench F_c (Eq. 13) and scaled wrench F' (Eq. T7).
 
         .. pydrake_system::
 
@@ -99,14 +99,14 @@ def WrenchScaling_(T: Any) -> Any:
             - angular_velocity_S: (3,) [rad/s]
             - angular_acceleration_S: (3,) [rad/s^2]
             - load_estimate: (16,) [offsets; phi]
-            - R_WS: (9,) orientation of S, by rows; for wrench_to_master and separate sigmas only
+            - R_WS: (9,) orientation of S by rows, only for wrench_to_master and separate sigmas
             output_ports:
             - contact_wrench_S: (6,) F_c [N, N m]
             - scaled_wrench_S: (6,) F' [N, N m]
             - wrench_to_master: (6,) F_E_B = -force_scale F', in the master's base B [N, N m]
 
         Args:
-            config: scales; default: contact and load as measured.
+            config: scales; default: contact and load are not scaled.
             R_WB: (3, 3) alignment of the master's base with the world.
             gravity_W: (3,) [m/s^2].
         """
@@ -176,9 +176,9 @@ def WrenchScaling_(T: Any) -> Any:
         def _calc_to_master(self, context: Any, output: Any) -> None:
             if not self._orientation.HasValue(context):
                 raise DrakeTeleopError(
-                    "R_WS is not connected",
+                    "the input port R_WS, the orientation of the sensor, is not connected",
                     where="WrenchScaling.wrench_to_master",
-                    remedy="connect the orientation of S",
+                    remedy="connect a rotation matrix, by rows",
                 )
             wrench, k = _basic_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)

@@ -35,7 +35,7 @@ _BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 @settings
 @dataclass
 class Slot(Environment):
-    """Pose and shape of the slot, and its contact with the balls of the peg."""
+    """Settings of the slot: pose, shape, and contact with the balls of the peg."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of the slot's mouth, in W"
@@ -112,7 +112,7 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
-            """Return a box from `inner` outwards and from the height `top` down to the floor."""
+            """Return a box on one side of the slot, from y `inner` outwards and z `top` down."""
             across, height = edge + c + _SIDE_WIDTH - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(SLOT_LENGTH, across, height)

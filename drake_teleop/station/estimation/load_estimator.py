@@ -30,7 +30,7 @@ _SAMPLES_PER_CHECK = 16
 @settings
 @dataclass
 class LoadEstimatorConfig:
-    """Recursive estimation of load and offsets, Eqs. (7)-(8)."""
+    """Settings of the recursive estimation of load and offsets, Eqs. (7)-(8)."""
 
     enabled: bool = plain(
         False,
@@ -61,14 +61,14 @@ class LoadEstimatorConfig:
     def check(self, where: str) -> None:
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
-                f"the covariance of '{self.method}' is too small to detect a change of load",
+                f"the covariance of method '{self.method}' is too small to detect a change of load",
                 where=f"{where}.method",
                 remedy="set method: rtls, or watch: false",
             )
 
 
 class LoadEstimator(LeafSystem):
-    """Estimator of load and offsets: constant, updated with every sample, or monitored (`watch`).
+    """Block with the estimate of load and offsets: constant, updated in every period or monitored.
 
     .. pydrake_system::
 

@@ -1,4 +1,4 @@
-"""Conversion of a finalized MultibodyPlant to an `ArmModel`, and defaults for its limits."""
+"""Conversion of a finalized MultibodyPlant to an `ArmModel`, and defaults for joint limits."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def ArmModelFromPlant(
     model_instance: ModelInstanceIndex,
     sensor_frame_name: str = "sensor",
 ) -> ArmModel:
-    """Return the chain from the world to the sensor frame of a finalized plant.
+    """Return the arm between the world and the sensor frame of a finalized plant.
 
-    A DrakeTeleopError is raised unless it consists of welds, revolute and prismatic joints without
-    branches that move.
+    A DrakeTeleopError is raised unless all its joints are revolute, prismatic or welds, and no
+    other joint moves on it.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -144,14 +144,14 @@ def _joint_chain(
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
             raise DrakeTeleopError(
-                f"the chain to the sensor contains a {joint.type_name()} joint",
+                f"the arm up to the sensor contains an unsupported {joint.type_name()} joint",
                 where=joint.name(),
                 remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
             )
         body = joint.parent_body()
     if not joints:
         raise DrakeTeleopError(
-            f"no moving joint between the world and {frame_S.name()}",
+            f"there is no moving joint between the world and the frame {frame_S.name()}",
             where="sensor_frame",
             remedy="name a frame or link that the arm moves",
         )
@@ -179,7 +179,7 @@ def _table_row(
         body = joint.parent_body()
     if moving is not None:
         raise DrakeTeleopError(
-            f"link {body.name()} carries a moving part beside the chain to the sensor",
+            f"the joint moves on link {body.name()}, but is not between the world and the sensor",
             where=moving.name(),
             remedy="weld that joint",
         )
@@ -210,7 +210,7 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
 def with_all_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
-    """Return the arm with defaults for missing limits, and one text per assumption.
+    """Return the arm with defaults for missing joint limits, and one text per assumed default.
 
     `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is added to the text
     about accelerations.
@@ -244,7 +244,7 @@ def with_all_limits(
     if acceleration:
         if len(acceleration) not in (1, n):
             raise DrakeTeleopError(
-                f"{len(acceleration)} acceleration limits for {n} joints",
+                f"{len(acceleration)} acceleration limits are given for {n} joints",
                 where=where,
                 remedy="give one for all joints or one for each",
             )
@@ -284,7 +284,7 @@ def with_all_limits(
 
 
 def _is_specified(limits: Array) -> NDArray[np.bool_]:
-    """Return (n,) booleans: True for finite limits above 0; exporters write 0 for unknown ones."""
+    """Return (n,) flags: False for infinite limits and for 0, which exporters write if unknown."""
     return np.isfinite(limits) & (limits > 0)
 
 

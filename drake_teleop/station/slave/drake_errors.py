@@ -1,4 +1,4 @@
-"""Translation of Drake's errors about model files."""
+"""Conversion of Drake's errors about model files to DrakeTeleopErrors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def translate_drake_errors(
 ) -> Iterator[None]:
     """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
 
-    `folder` contains repaired copies of files; messages omit it.
+    Messages name the original files instead of repaired copies in `folder`.
     """
     try:
         yield
@@ -49,7 +49,7 @@ def translate_drake_errors(
 
 @contextmanager
 def raise_logged_errors() -> Iterator[None]:
-    """Raise RuntimeError for errors that Drake only logs, and for replaced inertias."""
+    """Raise RuntimeError if Drake logs an error, or a warning about an inertia."""
     errors: list[str] = []
 
     def keep_record(record: logging.LogRecord) -> bool:

@@ -41,12 +41,15 @@ _RANGE_TOLERANCE = 0.01
 
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
-    """Return the key in `IK_METHODS` for the scenario's setting, or raise DrakeTeleopError."""
+    """Return the key in `IK_METHODS` for a scenario's setting.
+
+    A DrakeTeleopError is raised if the closed form does not exist for the arm.
+    """
     if name == AUTOMATIC_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
         raise DrakeTeleopError(
-            "the closed form is that of an RX90 whose base stands at the world's origin",
+            "the closed form requires the geometry of an RX90 with its base at the world's origin",
             where="slave.inverse_kinematics",
             remedy=f"set it to {AUTOMATIC_METHOD} or numeric",
         )
@@ -91,7 +94,7 @@ class JointFollower(LeafSystem):
 
 
 class JointTrajectory(LeafSystem):
-    """Block that plays one period of an excitation trajectory from `start` [s], else rests."""
+    """Block that commands one period of an excitation trajectory from `start` [s], else rest."""
 
     __slots__ = ONE_DICT
 
@@ -106,7 +109,7 @@ class JointTrajectory(LeafSystem):
 
 
 class SlaveMonitor(LeafSystem):
-    """Block that raises DrakeTeleopError if a joint leaves its range by more than 1 % of it."""
+    """Block that raises DrakeTeleopError if a joint leaves its range by over 1 % of the range."""
 
     __slots__ = ONE_DICT
 

@@ -73,7 +73,7 @@ _MAX_COPLANAR_VOLUME = 0.1
 
 @njit(cache=True)
 def _jacobian_and_error(table, L, pose, q, x, J, e):
-    """Write Jacobian J (6, n) and pose error e (6,) at q, rotations times L; return |e|^2."""
+    """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
     a = normalized_quaternion((pose[0], pose[1], pose[2], pose[3]))
     R = np.empty((3, 3))
@@ -136,9 +136,9 @@ def _is_held_at_limit(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _damped_step(H, g, damping, q, lower, upper, trial):
-    """Write q plus a damped step within the limits to trial (n,); return the largest component.
+    """Write q plus a damped step to trial (n,); return the largest joint displacement.
 
-    Joints that would pass a limit are fixed there and the others solved again.
+    Joints that would pass a limit are fixed there, and the step of the others is solved again.
     """
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
@@ -196,11 +196,11 @@ def follow_pose(
         pose: (7,) X_WS.
         reference: (n,) joint positions, normally the last command.
         lower, upper: (n,) joint limits.
-        max_step: (n,) largest distance from the reference.
+        max_step: (n,) largest displacement from the reference.
         posture: (n,) joint positions that a redundant arm approaches.
-        pull: fraction of the distance to the posture.
-        singular: singular value below which the motion is damped [m].
-        steps: maximum number of steps.
+        pull: share of the distance to the posture that is covered by this call.
+        singular: singular value of the Jacobian below which the motion is damped [m].
+        steps: maximum number of Levenberg-Marquardt steps.
     """
     n = q.shape[0]
     low, high = np.empty(n), np.empty(n)
@@ -316,7 +316,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     """Return joint positions (n,) that meet the pose X_WS (7,), and the `IkStatus`.
 
     The search starts at the reference (n,). Without a solution, the positions nearest to the pose
-    are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
+    are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the status of a singularity.
     """
     n, lower, upper = arm.num_joints, arm.lower, arm.upper
     first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts
@@ -353,7 +353,7 @@ def _nearest_turns(arm: ArmModel, q: Array, reference: Array) -> Array:
 
 
 def orientation_length(arm: ArmModel) -> float:
-    """Return the length [m] that weights orientation against position error: reach / 5."""
+    """Return the length [m] that weights orientation against position error: arm length / 5."""
     return float(np.linalg.norm(arm.table[:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum()) / 5.0
 
 
@@ -361,10 +361,10 @@ def orientation_length(arm: ArmModel) -> float:
 def _follow_command(
     table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
 ):  # fmt: skip
-    """Write joint positions q (n,) from the last command towards the pose; return the `IkStatus`.
+    """Write the next command q (n,), from the last one towards the pose; return the `IkStatus`.
 
-    `speed` (n,) contains speed limits; `last` (n + 1,) is the last command and its time [s], which
-    is held if the encoder readings `position` (n,) are invalid.
+    `speed` (n,) contains speed limits, `last` (n + 1,) the last command and its time [s]. Invalid
+    encoder readings `position` (n,) hold the last command.
     """
     n = q.shape[0]
     copy_into(q, 0, last, 0, n)

@@ -1,4 +1,4 @@
-"""Plant of the slave: arm, tool and environment."""
+"""Plant of the slave: MultibodyPlant with arm, tool and environment."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ ARM_INSTANCE_NAME = "arm"
 
 @dataclass(frozen=True)
 class SlavePlant:
-    """Plant of the slave, and data for the blocks around it.
+    """Plant of the slave, with the data that other blocks need.
 
     Attributes:
         plant: continuous MultibodyPlant, finalized.
         instance: model instance of the arm's joints.
         tool: index of the tool's body on the sensor.
-        arm: chain up to S, with all bodies beyond S as its load.
+        arm: arm up to S, with all bodies beyond S as its load.
         start: (n,) joint positions at the start [rad].
         X_WS_start: (7,) pose at the start [qw qx qy qz px py pz].
         tip: (3,) p_STip, contact point of the tool [m].
-        assumptions: texts about data missing in the models.
+        assumptions: texts about data that the models do not have.
     """
 
     plant: MultibodyPlant
@@ -75,14 +75,15 @@ class SlavePlant:
 
     @property
     def contact_pairs(self) -> NDArray[np.float64]:
-        """Pairs (k, 28) of shapes for the compiled contact law."""
+        """Pairs of shapes (k, 28) that the compiled contact law covers, `ShapePairs.known`."""
         return self.contact.pairs
 
     @cached_property
     def physics_of_plant(self) -> tuple[NDArray[np.float64], ...]:
-        """Argument of `plant_rates`: arm table, view of its load, pairs, leaf, joints, wrenches.
+        """Argument `physics` of `plant_rates`.
 
-        The table is a copy with dry friction, and with the load that a grasp may change.
+        It contains the arm's table with dry friction, a view of its load (for grasps), pairs of
+        shapes, leaf, joints of moving bodies, and no given wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION_COLUMN] = self.joint_friction
@@ -95,7 +96,7 @@ class SlavePlant:
 
     @property
     def sheet_instance(self) -> ModelInstanceIndex | None:
-        """Model instance of the leaf, or of another `moving_part`; None without one."""
+        """Model instance of the sheet spring's leaf or another `moving_part`, or None."""
         return self.contact.sheet
 
     @property
@@ -104,7 +105,7 @@ class SlavePlant:
 
     @property
     def sensed_sheet(self) -> ModelInstanceIndex | None:
-        """Model instance of the sheet if the compiled contact law moves it, else None."""
+        """`sheet_instance` if the compiled contact law computes its contact, else None."""
         return None if self.contact.beyond else self.sheet_instance
 
     @property
@@ -116,7 +117,7 @@ class SlavePlant:
 
 
 def start_pose(slave: Slave) -> NDArray[np.float64]:
-    """Return the pose X_WS (7,) [qw qx qy qz px py pz] at the start, from `home` or `position`."""
+    """Return X_WS [qw qx qy qz px py pz] at the start, from `slave.home` or `slave.position`."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
     return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
@@ -128,7 +129,7 @@ def NominalSlave(slave: Slave) -> SlavePlant:
 
 
 class HashableByValue:
-    """Hashable copy of settings, compared by all values."""
+    """Hashable copy of settings, equal to copies with equal values."""
 
     def __init__(self, value: Any) -> None:
         self.value, self._values = copy.deepcopy(value), repr(value)
@@ -151,7 +152,7 @@ def AddSlavePlant(
     environment: Environment | None,
     q_start: NDArray[np.float64] | None = None,
 ) -> SlavePlant:
-    """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the configured start.
+    """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the start of `slave`.
 
     A DrakeTeleopError is raised if the arm cannot reach the start or hold its load.
     """
@@ -203,7 +204,7 @@ def AddSlavePlant(
 
 @dataclass(frozen=True)
 class ParsedSlave:
-    """Arm and tool in a plant that is not finalized; attributes as of `SlavePlant`."""
+    """Arm and tool in a plant that is not finalized; attributes as in `SlavePlant`."""
 
     slave: Slave
     plant: MultibodyPlant
@@ -214,7 +215,7 @@ class ParsedSlave:
     folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
-        """Return the arm of the finalized plant, and the assumptions about its limits."""
+        """Return the arm, after the plant is finalized, and the assumptions about its limits."""
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
@@ -261,7 +262,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
 
 
 def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
-    """Return the bodies outboard of a body, the nearest first."""
+    """Return the bodies that a body carries through joints, the nearest first."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
     return near + [far for each in near for far in bodies_beyond(plant, each)]
@@ -295,7 +296,7 @@ def _remove_shapes(
 
 
 def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
-    """Return the corners (k, 3) in S [m] of the convex hull or box of each shape on the sensor."""
+    """Return corners (k, 3) in S [m] of the hull or bounding box of each shape on the sensor."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
@@ -317,7 +318,7 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
 
 
 def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the point p_S (3,) [m] in the middle of the shapes that reach farthest along z_S."""
+    """Return the end p_S (3,) [m], in the middle of the hulls that reach farthest along z_S."""
     reach = max(float(hull[:, 2].max()) for hull in hulls)
     farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SAME_REACH_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]

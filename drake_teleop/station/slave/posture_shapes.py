@@ -1,8 +1,8 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
-Collision shapes count; of a body without them, its visual shapes; of meshes, their convex hulls.
-Bodies that a joint or a telescope connects, or that overlap in nearly all random postures, may
-overlap, as in MoveIt's setup assistant; an assumption names the latter.
+Collision shapes count, or visual shapes of a body without them; meshes count as convex hulls.
+As in MoveIt's setup assistant, bodies may overlap that a joint or a telescope connects, or that
+overlap in nearly all random postures; an assumption lists the latter.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _NUM_POLYHEDRON_SIDES = 24  # points on a circumference of a round shape
 
 
 class Overlap(NamedTuple):
-    """Two bodies and the distance of their nearest shapes [m], negative if they overlap."""
+    """Two overlapping bodies and the distance of their shapes [m], negative by the depth."""
 
     first: RigidBody
     second: RigidBody
@@ -68,10 +68,13 @@ class Overlap(NamedTuple):
 
 
 class PostureShapes:
-    """Plant with the shapes of a slave and its surroundings; `sticks` replaces missing shapes.
+    """Shapes of a slave and its surroundings in a plant, for overlaps at any joint positions.
+
+    Args:
+        sticks: whether an arm without shapes gets sticks.
 
     Attributes:
-        assumptions: texts about data missing in the models.
+        assumptions: texts about data that the models do not have.
         tool_bodies: indices of the bodies beyond the sensor.
         surroundings: indices of the bodies of the environment.
     """
@@ -130,7 +133,7 @@ class PostureShapes:
         return self._parsed.tool
 
     def sensor_link(self) -> set[BodyIndex]:
-        """Return the indices of the bodies that are fixed to the sensor, with the tool."""
+        """Return the indices of the bodies that are welded to the sensor, also of the tool."""
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
@@ -148,7 +151,7 @@ class PostureShapes:
         )
 
     def hulls(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return points (k, 3) on the hulls of a body's collision, or visual, shapes, in W [m]."""
+        """Return, for each shape of a body, points (k, 3) on its convex hull in W [m]."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [surface_points(self._scene_graph.model_inspector(), each) for each in shapes]
@@ -222,7 +225,7 @@ class PostureShapes:
 
 
 def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
-    """Return lower and upper ends (n,) for random joint positions: limits, at most one rotation."""
+    """Return lower and upper ends (n,) of random joint positions: limits, at most one turn wide."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
@@ -233,7 +236,7 @@ def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
 def start_overlaps(
     slave: Slave, environment: Environment | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return sentences about pairs of bodies that overlap at the start, and the assumptions."""
+    """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
     written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
     return _start_overlaps(HashableByValue((slave, parts)), written)
@@ -250,7 +253,7 @@ def _start_overlaps(
 
 
 def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
-    """Return one sentence for each overlapping pair; `of_arm` leaves out the surroundings."""
+    """Return a warning for each pair of overlapping bodies, with `of_arm` only of slave bodies."""
     found = []
     for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
@@ -267,7 +270,7 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Give bodies without collision shapes their visual ones; drop unlimited shapes.
+    """Use visual shapes of bodies without collision shapes; remove unbounded collision shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     """
@@ -291,7 +294,7 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
 
 
 def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
-    """Return points (k, 3) on the convex hull of a shape, in the frame of its body [m]."""
+    """Return points (k, 3) on the convex hull of a shape, in its body's frame [m]."""
     shape = inspector.GetShape(geometry)
     if isinstance(shape, (Mesh, Convex)):
         hull = shape.GetConvexHull()

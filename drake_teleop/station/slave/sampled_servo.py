@@ -1,11 +1,10 @@
-"""Joint control that samples faster than the simulation's events.
+"""Joint control with a period T shorter than the interval h = m T of the simulation's events.
 
 Each event predicts the motion, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
-The plant receives the line a + b (t - h/2) over h = m T with the area and first moment of these
-steps."""
+The plant receives the torque a + b (t - h/2), with the area and first moment of these steps."""
 
 from __future__ import annotations
 
@@ -32,9 +31,9 @@ _EVENT_HZ = 2000.0
 
 
 def samples_per_event(control_hz: float, hand_hz: float) -> int:
-    """Return the largest number of servo samples per event with events at 2 kHz or more.
+    """Return how many servo samples an event may contain, with events at 2 kHz or more.
 
-    Each operator-side sample remains an event. Arguments are rates [Hz].
+    Each sample of the haptic device remains an event. Arguments are rates [Hz].
     """
     ratio = control_hz / hand_hz
     whole = round(ratio)
@@ -46,7 +45,7 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 @njit(cache=True)
 def torque_line_into(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
-    """Write the torque over the next `samples` as a line in time.
+    """Write the motor torque over the next `samples` of the servo as a linear function of time.
 
     Args:
         arm: `ArmModel.table` of the controller.
@@ -55,8 +54,8 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
         sheet: (2,) deflection of the leaf and its rate.
         servo: gains and limits from `servo_gains_and_limits`.
         physics: `SlavePlant.physics_of_plant`.
-        period: of the servo [s].
-        line: (3 n,) output: torque [N m], its rate [N m/s], last sample [N m].
+        period: period of the servo [s].
+        line: (3 n,) output: torque now [N m], its rate [N m/s], torque of the last sample [N m].
     """
     n = command.shape[0]
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
@@ -92,17 +91,17 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
 
 @njit(cache=True)
 def _evaluate_line(state, time, torque):
-    """Write the torque (n,) at `time` [s]; `state` is the line, then its start time [s]."""
+    """Write the torque (n,) at `time` [s]; `state` is a `line`, then its start time [s]."""
     n = torque.shape[0]
     for i in range(n):
         torque[i] = state[i] + (time - state[-1]) * state[n + i]
 
 
 class SampledServo(LeafSystem):
-    """Computed torque with several servo samples per event, given to the plant as a line in time.
+    """Block that controls joints by computed torque, with several servo samples per event.
 
-    Outputs are the torque (n,) now [N m] and the slope (n,) of the line [N m/s]. `period` is the
-    servo's period [s], `q_start` the posture held before the first sample.
+    Outputs are the torque (n,) now [N m] and its rate (n,) [N m/s]. `period` is the servo's period
+    [s], `samples` their number per event, `q_start` the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT

@@ -32,7 +32,7 @@ _MESH_RESOLUTION_M = 0.005  # m, edge length of the mesh of the tool's ball
 @settings
 @dataclass
 class Scene(Environment):
-    """File of the surroundings, its pose, and point or hydroelastic contact."""
+    """Surroundings from a file, with pose, and point or hydroelastic contact."""
 
     file: str = plain(
         "door.sdf",
@@ -65,7 +65,7 @@ class Scene(Environment):
         return self.contact == "hydroelastic"
 
     def found_from(self, folder: Path) -> "Scene":
-        """Return a copy with `file` resolved from `folder`, if it exists there."""
+        """Return a copy with the absolute path of `file`, if it exists in `folder`."""
         path = (folder / self.file).resolve()
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
@@ -86,7 +86,7 @@ class Scene(Environment):
         for joint in joints:
             if not supports_pose(joint):
                 raise DrakeTeleopError(
-                    f"{joint.name()} has the unsupported type {joint.type_name()}",
+                    f"the joint {joint.name()} has the unsupported type {joint.type_name()}",
                     where=str(path),
                     remedy="use revolute, prismatic, fixed or free joints",
                 )
@@ -109,7 +109,7 @@ class Scene(Environment):
         others = set(inspector.GetAllGeometryIds(Role.kProximity)) - set(own)
         if not any(is_hydroelastic(inspector.GetProximityProperties(shape)) for shape in others):
             raise DrakeTeleopError(
-                "no shape in it is hydroelastic",
+                "contact is hydroelastic, but no shape in the file is",
                 where=str(self.path),
                 remedy="give one drake:compliant_hydroelastic or drake:rigid_hydroelastic in its"
                 " drake:proximity_properties, or set contact: point",

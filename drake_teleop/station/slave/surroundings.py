@@ -1,4 +1,4 @@
-"""Environment in the slave's plant: moving bodies, and the choice of the contact law."""
+"""Environment in the slave's plant: its moving bodies, and the choice of the contact law."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matr
 
 
 class AddedEnvironment(NamedTuple):
-    """Model instances of an added environment, and the leaf's model instance or None."""
+    """Model instances of an environment in a plant; `sheet` is that of the leaf, or None."""
 
     instances: Collection[ModelInstanceIndex]
     sheet: ModelInstanceIndex | None
@@ -55,13 +55,13 @@ class ToolContactModel(NamedTuple):
     Attributes:
         pairs: (k, 28) `ShapePairs.known`; empty if `beyond` is set.
         watched: (l, 40) `ShapePairs.watched`, pairs that Drake computes at close range.
-        joints: (m, 21) joints of `JointTable`, which move the boxes of `pairs`.
+        joints: (m, 21) `JointTable` of the boxes in `pairs`.
         plant_size: size of the plant's state, 0 without joints.
         beyond: reason for using Drake's contact results instead of the compiled law, or empty.
-        bodies, shapes: identifiers of the tool's bodies, and of their collision shapes.
+        bodies, shapes: indices of the tool's bodies, and identifiers of their collision shapes.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] and gravity [m/s^2] of the leaf.
         sheet: model instance of the leaf, or of another `moving_part`; None without one.
-        moving: other moving bodies, by name.
+        moving: indices of other moving bodies, by name.
     """
 
     pairs: NDArray[np.float64]
@@ -105,10 +105,10 @@ def ContactWith(
     environment: Environment,
     touched: AddedEnvironment,
 ) -> ToolContactModel:
-    """Return the contact of the tool with the environment, in a finalized plant.
+    """Return the contact model of tool and environment, in a finalized plant.
 
     `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
-    an impossible contact model, or a moving body without mass.
+    a hydroelastic model without such shapes, or a moving body without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
@@ -163,7 +163,7 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactM
         bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         raise DrakeTeleopError(
-            f"{' and '.join(names or bodies)} can move, and has no mass or no inertia",
+            f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia",
             where="environment",
             remedy="give it both, or fix it",
         )
@@ -178,7 +178,7 @@ def _unmodelled_contact(environment: Environment, contact: ToolContactModel) -> 
 
 
 def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, BodyIndex]:
-    """Return the moving bodies of a finalized plant, except the leaf, by unique name."""
+    """Return the moving bodies of the environment, except the leaf, by unique name."""
     bodies = [
         plant.get_body(index)
         for instance in touched.instances
@@ -200,7 +200,7 @@ def _unique_signal_name(name: str) -> str:
 
 
 def supports_pose(joint: Joint) -> bool:
-    """Return whether the joint's positions follow from the pose of its child frame."""
+    """Return whether `joint_positions_of_pose` supports the type of the joint."""
     kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 

@@ -31,7 +31,7 @@ _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 @settings
 @dataclass
 class Ball:
-    """Ball of the tool that can make contact."""
+    """Ball of the tool, with contact."""
 
     radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
@@ -48,7 +48,7 @@ class Ball:
 @settings
 @dataclass
 class Block:
-    """Box of the tool that can make contact."""
+    """Box of the tool, with contact."""
 
     edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
@@ -60,7 +60,7 @@ class Block:
 
     @property
     def half_height(self) -> float:
-        """Distance from the centre to the farthest corner along z_S [m]."""
+        """Distance along z_S from the centre to the farthest corner [m]."""
         return float(np.abs(self.pose.rotation().matrix()[2]) @ self.edges) / 2
 
     @property
@@ -71,7 +71,7 @@ class Block:
 @settings
 @dataclass
 class Tool:
-    """The tool, by default the paper's; a file or a mass replaces it."""
+    """Tool, by default the paper's; a model file or a mass replaces it."""
 
     model: str = plain("", "file of a tool: its root link is put on S")
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
@@ -92,7 +92,7 @@ class Tool:
     def check(self, where: str) -> None:
         if self.model and self.mass:
             raise DrakeTeleopError(
-                "both a file and a mass define the tool",
+                "a model file and a mass both define the tool",
                 where=f"{where}.mass",
                 remedy="leave one of them out",
             )
@@ -111,7 +111,7 @@ class Tool:
 
 
 def end_of_shapes(tool: Tool) -> list[float] | None:
-    """Return the end p_STip (3,) [m] of the shape that reaches farthest along z_S, or None."""
+    """Return the end p_STip [m] of the shape that reaches farthest along z_S, if there are any."""
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
         for each in tool.shapes

@@ -1,4 +1,4 @@
-"""Removal of unusable meshes of a robot model, and sticks in place of missing visuals."""
+"""Removal of unusable shapes from a robot model, and sticks in place of missing visuals."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def remove_unusable_shapes(
 ) -> dict[str, list[str]]:
     """Remove shapes that Drake cannot read; return the names of the affected links by fault.
 
-    Relative addresses start at the folder of the file `model` and become absolute. STL files become
-    convex hulls in `folder`, because Drake does not read STL. Without a folder all shapes are
-    removed, for a plant without geometry. A lost visual is reported only for links without shapes,
-    a lost collision shape only for links without a visual or with other collision shapes.
+    Addresses relative to the file `model` become absolute. STL meshes are converted to convex hulls
+    in `folder`, because Drake does not read STL. Without `folder` all shapes are removed. A lost
+    visual is reported only for links without shapes, a lost collision shape only for links without
+    a visual or with other collision shapes.
     """
     lost: dict[str, list[str]] = {}
     for link in root.iter("link"):
@@ -148,7 +148,7 @@ def _obj_of_stl(path: Path, _: int) -> str:
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
-    """Add sticks to links without visuals, each from its joint to the next, or to S."""
+    """Add a stick as visual shape to links without visuals, from joint to joint or to S."""
     joints = map(plant.get_joint, plant.GetJointIndices())
     inboard = {joint.child_body().index(): joint for joint in joints}
     end, body = sensor_frame, sensor_frame.body()
@@ -165,7 +165,7 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
 
 
 def _pose_in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
-    """Return the pose X_BodyFrame of a frame on the body, or on a body welded to it."""
+    """Return the pose X_BodyFrame of a frame that is on `body` or on a body welded to it."""
     pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
     while on.index() != body.index():
         weld = inboard[on.index()]

@@ -47,7 +47,7 @@ _Array = NDArray[np.float64]
 
 @dataclass(eq=False)
 class Joint:
-    """Joint of a body: `kind` hinge, slide, ball or free; `anchor` (3,) and `axis` (3,)."""
+    """Joint of kind hinge, slide, ball or free; `anchor`, `axis` (3,) are in the body's axes."""
 
     name: str
     kind: str
@@ -58,14 +58,14 @@ class Joint:
     ref: float
 
     def pose(self, q: float) -> RigidTransform:
-        """Return the motion of the body from the drawn pose to position `q` [rad, m]."""
+        """Return the displacement of the body from its pose in the file to position q [rad, m]."""
         if self.kind == "slide":
             return RigidTransform((q - self.ref) * self.axis)
         turn = RotationMatrix(AngleAxis(q - self.ref, self.axis))
         return RigidTransform(turn, self.anchor - turn @ self.anchor)
 
     def in_other_axes(self, X: RigidTransform) -> Joint:
-        """Return the joint with anchor and axis in other axes."""
+        """Return a copy whose anchor and axis are transformed by X."""
         anchor, axis = X @ self.anchor, X.rotation() @ self.axis
         limits, ref = self.limits, self.ref
         return Joint(self.name, self.kind, anchor, axis, self.attributes, limits, ref)
@@ -73,7 +73,7 @@ class Joint:
 
 @dataclass(eq=False)
 class Geom:
-    """Shape of a body; `mesh` is set for shapes of type mesh."""
+    """Shape of a body, with pose X_BG and, for type mesh, its `mesh`."""
 
     kind: str
     X_BG: RigidTransform
@@ -83,7 +83,6 @@ class Geom:
 
     @property
     def takes_part_in_contacts(self) -> bool:
-        """Whether the shape takes part in contacts."""
         return takes_part_in_contacts(self.attributes)
 
     @property
@@ -93,13 +92,12 @@ class Geom:
 
 
 def takes_part_in_contacts(shape: Attributes) -> bool:
-    """Return whether a shape takes part in contacts."""
     return any(shape.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
 
 
 @dataclass(eq=False)
 class Body:
-    """Body with its pose X_PB in the parent; `generators` are elements that cannot be read."""
+    """Body with pose X_PB in its parent; `generators` are tags that this package cannot read."""
 
     name: str
     X_PB: RigidTransform
@@ -112,11 +110,11 @@ class Body:
     is_auxiliary: bool = False  # a body that the file does not have
 
     def with_descendants(self) -> list[Body]:
-        """Return the body and all bodies on it."""
+        """Return the body and all bodies that it carries."""
         return [self, *(body for child in self.children for body in child.with_descendants())]
 
     def path_to(self, name: str) -> list[Body]:
-        """Return the bodies from this one to a body, or an empty list."""
+        """Return the bodies from this one to the carried body `name`, or an empty list."""
         if self.name == name:
             return [self]
         paths = (child.path_to(name) for child in self.children)
@@ -124,7 +122,7 @@ class Body:
 
 
 class BodyReader:
-    """Reader of bodies; joints and bodies without names get one."""
+    """Reader of the bodies in an MJCF file; joints and bodies without names get one."""
 
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf, self.meshes = mjcf, MeshLibrary(mjcf)
@@ -133,7 +131,7 @@ class BodyReader:
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
     def take_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
-        """Remove the bodies from the world; return them with `childclass` and pose of the frame."""
+        """Remove the bodies on the world; return each with `childclass` and pose of its frame."""
         found = []
 
         def collect_bodies(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
@@ -151,14 +149,14 @@ class BodyReader:
         return found
 
     def read_world(self) -> Body:
-        """Return the world with everything on it."""
+        """Return the world with its shapes and all bodies."""
         world = Body("world", RigidTransform())
         for element in self._mjcf.root.findall("worldbody"):
             self._read_content(world, element, element.get("childclass", ""), RigidTransform())
         return world
 
     def read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
-        """Return a body, in a frame of its parent, with all bodies on it."""
+        """Return the body in `element`, with all bodies on it; X_PF is its frame in the parent."""
         name = element.get("name") or self._invent_name("body")
         attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
         body = Body(name, X_PF @ self._mjcf.pose(attributes))
@@ -240,7 +238,7 @@ class BodyReader:
             try:
                 X_GM, size = fitted_shape(mesh, kind, by_box=by_box)
             except ValueError as error:
-                self.lost.setdefault(f"a mesh has {error}", []).append((body, given))
+                self.lost.setdefault(str(error), []).append((body, given))
                 return
             X_FG, mesh = X_FG @ X_GM, None
         if given.get("shellinertia") == "true":
@@ -259,7 +257,7 @@ class BodyReader:
         return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.pose(given))
 
     def mass(self, body: Body) -> MassProperties:
-        """Return the body's mass properties, by its `inertial` or its shapes."""
+        """Return the body's mass properties from its `inertial` element, or from its shapes."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
@@ -284,7 +282,7 @@ class BodyReader:
                 else primitive_properties(geom.kind, geom.size)
             )
         except ValueError as error:
-            self._mjcf.report.state_repair(f"no mass of a mesh ({error}) of", geom.attributes.label)
+            self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return NO_MASS
         mass = geom.attributes.number("mass", -1.0)
         density = geom.attributes.number("density", _DEFAULT_DENSITY)

@@ -1,4 +1,4 @@
-"""Chain of joints from the world to the sensor frame of an MJCF arm, and their effort limits."""
+"""Joints from the world to the sensor of an MJCF arm: held joints, couplings, effort limits."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DYNAMICS_WITH_STATE = (
 
 
 def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
-    """Return the world's shapes and the body that carries the sensor; state the other bodies."""
+    """Return the world with only the tree of bodies that carries the sensor; report the others."""
     tops = reader.take_top_bodies()
     kind = "body" if any(sensor in _names_of_elements(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names_of_elements(top[0], kind)]
@@ -57,16 +57,15 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
 
 
 def read_world_and_bodies(reader: BodyReader) -> Body:
-    """Return the world with everything on it."""
     return _separate_joints(reader.read_world())
 
 
 def hold_joints(
     world: Body, chain: list[Body], hold: dict[str, float], mjcf: Mjcf
 ) -> list[tuple[Body, Joint]]:
-    """Weld free bases and joints outside the chain; return the moving joints with their bodies.
+    """Weld free bodies and joints outside the chain; return the moving joints with their bodies.
 
-    The joints of `hold` remain, because they are welded after the parsing.
+    The joints of `hold` remain in the file, because they are welded after the parsing.
     """
     moving = list[tuple[Body, Joint]]()
     for body in world.with_descendants():
@@ -92,7 +91,7 @@ def hold_joints(
 
 
 def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
-    """Refuse couplings between joints of the chain; state the other ones that are left out."""
+    """Report couplings between `joints` as faults; report other couplings as left out."""
     report, moving = mjcf.report, {joint.name for joint in joints}
     carriers = _moving_body_of_each_body(arm, {id(body) for body in chain})
     for element in mjcf.children("equality"):
@@ -119,7 +118,7 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
 
 
 def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
-    """Report couplings and springs of a complete file, which Drake ignores."""
+    """Report all couplings and springs, which Drake does not read from MJCF."""
     for element in (*mjcf.children("equality"), *mjcf.children("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()
@@ -158,10 +157,10 @@ def _separate_joints(body: Body) -> Body:
 
 
 def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
-    """Add a massless body in place of a site.
+    """Add a massless body at the pose of a site, as sensor frame.
 
-    The sensor of a `force` or `torque` element measures the whole body with the site: the frame
-    then carries that body. Another site is carried by its body.
+    The new body carries the site's body if a `force` or `torque` sensor measures there
+    (`is_measured`). Otherwise the site's body carries it.
     """
     if site not in body.sites:
         body.children = [
@@ -198,9 +197,9 @@ def _is_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
 
 
 def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
-    """Return the limits [N m, N] of joints by name; joints without a limit have no entry.
+    """Return the effort limits [N m, N] of joints by name; joints without a limit have no entry.
 
-    Several actuators of a joint add up. The joint's own `actuatorfrcrange` limits their sum.
+    Limits of several actuators add up. The joint's own `actuatorfrcrange` limits their sum.
     """
     by_joint: dict[str, float] = {}
     for element in mjcf.children("actuator"):
@@ -233,7 +232,7 @@ def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
 
 
 def _force_per_control(given: Attributes, tag: str) -> float:
-    """Return force by control signal; 0 if the signal is no force (position servo)."""
+    """Return force per unit of the control signal; 0 for actuators such as position servos."""
     if tag == "motor":
         return 1.0
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):

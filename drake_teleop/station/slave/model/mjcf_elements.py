@@ -1,4 +1,4 @@
-"""Elements of an MJCF file after includes, compiler settings and class defaults are applied."""
+"""Elements of an MJCF file, with its includes, compiler settings and class defaults applied."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
 
 
 class Attributes(dict[str, str]):
-    """Attributes of one element, with `label` for messages; `report` takes their faults."""
+    """Attributes of one XML element; `label` names it in the faults that `report` receives."""
 
     def __init__(self, values: dict[str, str], label: str, report: RepairReport) -> None:
         super().__init__(values)
@@ -38,7 +38,7 @@ class Attributes(dict[str, str]):
     def numbers(
         self, name: str, default: tuple[float, ...], largest: float = math.inf
     ) -> list[float]:
-        """Return the numbers of an attribute; `default` completes a list that is too short."""
+        """Return the numbers in attribute `name`; the end of `default` completes a short list."""
         try:
             values = [float(word) for word in self.get(name, "").split()]
         except ValueError:
@@ -52,7 +52,7 @@ class Attributes(dict[str, str]):
         return [*values, *default[len(values) :]][: len(default)]
 
     def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
-        """Return the numbers of an attribute that has as many as `default`, each up to 1e6."""
+        """Return the numbers in attribute `name`, or `default`; their number must be equal."""
         count, values = len(default), self.numbers(name, default)
         if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > MAX_VALUE:
             what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_VALUE:g}"
@@ -61,11 +61,13 @@ class Attributes(dict[str, str]):
         return np.array(values)
 
     def number(self, name: str, default: float) -> float:
-        """Return the number of an attribute, or a default."""
         return self.numbers(name, (default,))[0]
 
     def limits(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
-        """Return the range `name`, or None if it does not apply (`flag`, autolimits)."""
+        """Return the range in attribute `name`, or None if it is off.
+
+        The attribute `flag` switches it on or off, or else `automatic` for a nonzero range.
+        """
         lower, upper = self.numbers(name, (0.0, 0.0))
         limited = self.get(flag, "auto")
         if limited == "false" or (limited == "auto" and not (automatic and lower != upper)):
@@ -76,7 +78,7 @@ class Attributes(dict[str, str]):
 
 
 class Mjcf:
-    """Content of an MJCF file, and the report of its repairs and faults."""
+    """Content of an MJCF file with its includes, and the report of repairs and faults."""
 
     def __init__(self, root: Element, path: Path, files: ModelFiles, report: RepairReport) -> None:
         self.root, self.path, self.files, self.report = root, path, files, report
@@ -96,7 +98,7 @@ class Mjcf:
             self._read_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
     def file(self, element: Element, name: str, folder: str) -> Path | None:
-        """Return a file beside the main file, or else beside the included one."""
+        """Return the file `name` in `folder`, beside the main or else the included MJCF file."""
         places = [self.path.resolve().parent, self._folders.get(element)]
         found = (self.files.find_file(name, place / folder) for place in places if place)
         return next((file for file in found if file is not None and not file.is_dir()), None)
@@ -107,12 +109,11 @@ class Mjcf:
             yield from element
 
     def angle_in_rad(self, value: float) -> float:
-        """Return an angle of the file in rad."""
         degrees = self.compiler.get("angle", "degree") == "degree"
         return math.radians(value) if degrees else value
 
     def attributes(self, element: Element, childclass: str, label: str) -> Attributes:
-        """Return the attributes of an element, with the defaults of its class."""
+        """Return the attributes of an element, with defaults of its class or else `childclass`."""
         name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
             self.report.add_fault(f"{label}: there is no class {name}")
@@ -211,7 +212,7 @@ def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> RotationMat
 
 
 def rotation_to(z: NDArray[np.float64]) -> RotationMatrix:
-    """Return the smallest rotation that turns the z axis to this direction (3,)."""
+    """Return the smallest rotation that turns the z axis to the direction `z` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))
     return _rotation_about_axis(

@@ -1,4 +1,4 @@
-"""Meshes of an MJCF file: triangles for masses, and .obj files for Drake."""
+"""Meshes of an MJCF file, as triangles for masses and as .obj files for Drake."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Mesh:
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
 
     def triangles(self) -> Triangles:
-        """Return the transformed triangles."""
+        """Return the triangles with scale and reference pose applied."""
         if self._triangles is None:
             if self.file is not None:
                 vertices, faces = read_triangles(self.file)
@@ -59,13 +59,13 @@ class Mesh:
         return self._triangles
 
     def write_obj(self, folder: Path) -> Path:
-        """Return an .obj file for Drake, converted into `folder` if necessary."""
+        """Return an .obj file for Drake, written to `folder` if conversion is necessary."""
         if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()
         return self._write_triangles(self.triangles(), folder)
 
     def write_hull(self, folder: Path) -> Path:
-        """Return an .obj file in `folder` with the convex hull (collision shape)."""
+        """Write the convex hull, for contact, to an .obj file in `folder`; return its path."""
         return self._write_triangles(convex_hull(self.triangles().vertices), folder)
 
     def _write_triangles(self, triangles: Triangles, folder: Path) -> Path:
@@ -76,7 +76,7 @@ class Mesh:
 
 
 class MeshLibrary:
-    """Meshes of a file by name; unused ones are never read."""
+    """Meshes of an MJCF file by name, read only if they are used."""
 
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf = mjcf
@@ -91,7 +91,7 @@ class MeshLibrary:
                 self._meshes[mesh.name] = fault or mesh
 
     def find(self, name: str) -> Mesh | str:
-        """Return a mesh, or its fault as text."""
+        """Return a mesh, or a text about its fault."""
         mesh = self._meshes.get(name, _NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:
             try:

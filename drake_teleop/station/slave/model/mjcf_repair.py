@@ -1,7 +1,7 @@
 """Repair of an MJCF text, so that Drake reads the arm in it as MuJoCo does.
 
 The text is written anew: poses as quaternions, angles in rad, masses as explicit inertias, one
-joint a body, and only the bodies that the arm carries.
+joint per body, and only the bodies that the arm carries.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _GRAVITY, _GRAVITY_TOLERANCE = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 def repair_mjcf(
     root: Element, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of an MJCF file that Drake reads, with meshes converted in `folder`.
+    """Return an MJCF text that Drake reads, with meshes converted in `folder`.
 
-    A scene, or a file that directives add, keeps all bodies and joints.
+    A scene, or a file that model directives add, keeps all bodies and joints.
     """
     report = RepairReport(strict=purpose.is_scene)
     mjcf = Mjcf(root, path, files, report)

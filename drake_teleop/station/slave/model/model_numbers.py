@@ -1,4 +1,4 @@
-"""Numbers in the text of URDF and SDF models: separators, and checks of joints."""
+"""Checks of numbers in the text of URDF and SDF models."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOVING_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 
 
 def parse_number(text: str | None) -> float:
-    """Return the number in a text, or NaN."""
+    """Return the number in a text, or NaN if there is none."""
     try:
         return float(text or "")
     except ValueError:
@@ -26,7 +26,6 @@ def parse_number(text: str | None) -> float:
 
 
 def separate_by_blanks(root: Element) -> None:
-    """Replace commas between the numbers of a list by blanks."""
     for element in root.iter():
         for name in _LIST_ATTRIBUTES:
             if "," in element.get(name, ""):
@@ -36,7 +35,7 @@ def separate_by_blanks(root: Element) -> None:
 
 
 def check_quantities(element: Element, where: str, report: RepairReport) -> None:
-    """Refuse lengths and rotor inertias that are no numbers, or too large, in an element."""
+    """Report lengths, inertias or rotor inertias in an element that are too large or no numbers."""
     for inner in element.iter():
         if inner.tag not in _QUANTITY_TAGS:
             continue
@@ -57,7 +56,7 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
 
 
 def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_chain: bool) -> None:
-    """Correct limits and damping of a joint; report other faults."""
+    """Correct limits, friction and damping of a joint; report changes and faults."""
     name = joint.get("name", "")
     where = f"joint {name}"
     for end in ("parent", "child"):

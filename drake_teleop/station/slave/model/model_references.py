@@ -1,6 +1,6 @@
-"""Files that a robot model references, and access rules for them.
+"""Files that a robot model references, and access rules, because models may be untrusted.
 
-Models may be untrusted. Only files inside the model's folder and its packages are read, after
+Only files inside the model's folder and its packages are read, after
 resolving symbolic links. Packages are `package_paths`, ROS packages (package.xml) around the model
 and the installed Python package around it. Include cycles are errors; number and size of files are
 limited.
@@ -52,7 +52,7 @@ _OBJ_REFERENCE_PATTERN = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.M)
 
 
 class ModelFiles:
-    """Access to the files that a model may read; `packages` contains folders by package name."""
+    """Access to the files that a model may read; `packages` are folders by package name."""
 
     def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
         self._model, self._folder = model, model.resolve().parent
@@ -79,7 +79,7 @@ class ModelFiles:
         self._bases = {""}
 
     def share_packages(self, known: PackageMap) -> None:
-        """Merge `packages` with Drake's map; remove the package that Drake downloads."""
+        """Merge `packages` with Drake's map `known`, without the package that Drake downloads."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
@@ -90,8 +90,8 @@ class ModelFiles:
     def find_file(self, address: str, folder: Path | None = None) -> Path | None:
         """Return the existing file or folder at an address, or None.
 
-        The address is package://, model://, file:// or a path relative to `folder`, by default the
-        model's.
+        The address begins with package://, model:// or file://, or is a path relative to `folder`,
+        by default the model's folder.
         """
         match = re.match(r"(?:package|model)://([^/]+)/?(.*)", address, re.S)
         if match:
@@ -107,7 +107,10 @@ class ModelFiles:
         return any(path.resolve().is_relative_to(root) for root in roots)
 
     def check(self, path: Path) -> None:
-        """Check a file and all files that it references, except meshes of the model's own links."""
+        """Check a file and the files that it references, except meshes of the model's own links.
+
+        A DrakeTeleopError is raised for forbidden, missing or too large files and cycles.
+        """
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
@@ -120,17 +123,19 @@ class ModelFiles:
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read(real):
             raise DrakeTeleopError(
-                f"names {real}, which is outside the model's folder and its packages",
+                f"references {real}, which is outside the model's folder and its packages",
                 where=where,
                 remedy="move it there, or name its folder: --package-path, slave.package_paths",
             )
         if real in including or len(including) > _MAX_DEPTH:
-            what = "names itself" if real in including else "is nested too deeply"
-            raise DrakeTeleopError(f"{what} by {path.name}", where=where, remedy="cut the circle")
+            what = "includes itself" if real in including else "is nested too deeply"
+            raise DrakeTeleopError(
+                f"{what} through {path.name}", where=where, remedy="remove this reference"
+            )
         if real not in self._sizes:
             if not (real.is_file() or real.is_dir()):
                 raise DrakeTeleopError(
-                    f"names {path}, which does not exist",
+                    f"references {path}, which does not exist",
                     where=where,
                     remedy="correct the path or add the file",
                 )
@@ -151,7 +156,7 @@ class ModelFiles:
         try:
             for address in self._addresses(path):
                 if len(address) > _MAX_NAME_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
-                    what = f"names a file by {len(address)} characters"  # Drake aborts on it
+                    what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
                 found = {file for each in named for file in _existing_paths(each)}
@@ -187,7 +192,7 @@ class ModelFiles:
 
 
 def _is_installed_package(folder: Path) -> bool:
-    """Return whether a folder is a Python package beside its `.dist-info`, and no home folder."""
+    """Return whether a folder is an installed Python package that does not contain the home."""
     return (
         os.path.isfile(folder / "__init__.py")
         and any(each.is_dir() for each in folder.parent.glob("*.dist-info"))
@@ -208,21 +213,21 @@ def _check_size(files: int, size: int, path: Path) -> None:
     if files > _MAX_FILES or size > most:
         what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
         raise DrakeTeleopError(
-            f"takes more than {what} to read", where=str(path), remedy="remove or simplify parts"
+            f"needs more than {what}, the limit", where=str(path), remedy="remove or simplify parts"
         )
 
 
 def read_xml(path: Path) -> Element:
-    """Return the root of an XML file, with `drake:` prefixes unchanged.
+    """Return the root element of an XML file, with `drake:` prefixes unchanged.
 
-    Drake also reads malformed XML, which these checks cannot; here malformed XML is an error.
+    A DrakeTeleopError is raised for malformed XML, which Drake reads but these checks cannot.
     """
     builder, parser = TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
 
     def reject_entity(name: str | None, *_: object) -> NoReturn:
-        raise ValueError(f"the entity {name} is not in this file")
+        raise ValueError(f"the XML entity {name} is not defined in this file")
 
     parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = reject_entity
     try:
@@ -230,7 +235,7 @@ def read_xml(path: Path) -> Element:
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: invalid encoding
         remedy = "give a URDF or SDF that other readers of XML take too"
-        raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
+        raise DrakeTeleopError(f"is not XML: {error}", where=str(path), remedy=remedy) from None
 
 
 def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
@@ -270,6 +275,6 @@ def _addresses_in_gltf(path: Path) -> list[str]:
         json.loads(data, object_pairs_hook=keep_addresses)
     except (ValueError, RecursionError) as error:
         raise DrakeTeleopError(
-            f"is not a glTF file ({error})", where=str(path), remedy="export it again"
+            f"is not a glTF file: {error}", where=str(path), remedy="export it again"
         ) from None
     return found

@@ -1,4 +1,4 @@
-"""Links and joints of a URDF robot or SDF model, and the chain of joints to the sensor frame."""
+"""Tree of links and joints of a URDF robot or SDF model, reduced to the arm with the sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BASE_JOINT_TYPES = ("floating", "planar")
 
 
 def joints_of(scope: Element) -> list[Element]:
-    """Return the joints of a robot or model, without those of nested models."""
+    """Return the joints of a robot or model element, without those of nested models."""
     return [child for child in scope if child.tag in JOINT_TAGS]
 
 
@@ -27,11 +27,11 @@ def joint_end(joint: Element, name: str) -> str:
 
 @dataclass(eq=False)
 class ModelTree:
-    """Joints up to the sensor from the base outwards, and all links by the nearest of them.
+    """Result of `reduce_to_chain`.
 
     Attributes:
         chain: joints from the root to the sensor's link, also fixed ones.
-        moved: number of the last moving joint of the chain below each link; 0 for links at rest.
+        moved: for each link the number of moving joints of the chain between root and link.
     """
 
     chain: list[Element]
@@ -39,7 +39,7 @@ class ModelTree:
 
 
 def link_of_frame(scope: Element, frame: str) -> str:
-    """Return the link that carries a frame, link or joint of this name, or an empty text."""
+    """Return the link that carries the frame, link or joint `frame`, or an empty text."""
     links = [link.get("name", "") for link in scope.findall("link")]
     carriers = {
         each.get("name", ""): each.get("link") or each.get("attached_to") or ""
@@ -56,10 +56,10 @@ def link_of_frame(scope: Element, frame: str) -> str:
 def reduce_to_chain(
     scope: Element, sensor_link: str, hold: set[str], report: RepairReport
 ) -> ModelTree | None:
-    """Keep the tree with the sensor, and fix its joints outside the chain at their default.
+    """Keep the tree of links with the sensor; fix joints that are not between root and sensor.
 
-    Other roots and joints that close a loop are removed. The joints `hold` count as fixed. Return
-    None, with the faults in `report`, if the chain is ambiguous.
+    Other trees and joints that close a loop are removed. The joints `hold` count as fixed. Return
+    None, with a fault in `report`, if the joints up to the sensor are ambiguous.
     """
     chain = _chain_to(scope, sensor_link, report)
     if chain is None:
@@ -76,7 +76,7 @@ def reduce_to_chain(
 
 
 def fix_joint(joint: Element, report: RepairReport) -> None:
-    """Make a joint that moves a fixed one, at its default position."""
+    """Change a moving joint to a fixed one, at its default position."""
     if joint.get("type") == "fixed":
         return
     report.state_assumption("held:", joint.get("name", ""))
@@ -94,7 +94,7 @@ def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] 
     chain, passed = list[Element](), set[str]()
     while link in parents:
         if link in passed:
-            report.add_fault(f"its joints form a circle through {link}; cut the loop")
+            report.add_fault(f"its joints form a loop through {link}; cut the loop")
             return None
         passed.add(link)
         if link == WORLD:

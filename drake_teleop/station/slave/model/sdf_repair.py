@@ -1,4 +1,4 @@
-"""Repair of SDF texts: the model with the sensor, without elements that Drake does not read."""
+"""Repair of SDF texts: only the model with the sensor, without elements that Drake ignores."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _READ_TAGS_OF = {
 def repair_sdf(
     root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of an SDF that Drake reads, with meshes and included files in `folder`."""
+    """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
         _keep_one_model(root, file, files, purpose.sensor, report)
@@ -61,7 +61,7 @@ def repair_sdf(
 def _repair_included(
     uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel | None:
-    """Replace an included file by its repaired text; leave a folder to Drake."""
+    """Let an include refer to a repaired copy of its file; return it, or None for a folder."""
     address = (uri.text or "").strip()
     included = _included_file(address, file, files)
     if included is None:  # Drake searches in more places, and crashes on a circle through them

@@ -1,6 +1,6 @@
 """Repair of URDF and SDF texts, so that Drake reads the arm in them.
 
-Links and joints that the arm does not need never stop the reading. Every repair is stated.
+Faults of links and joints that the arm does not need are repaired. Every repair is reported.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class ModelPurpose(NamedTuple):
     Attributes:
         sensor: frame, link or site of the sensor; empty for tools and surroundings.
         hold: angles or positions [rad, m] of joints that do not move.
-        is_tool: whether all joints are held.
-        is_scene: whether every element that the tool could touch must be readable.
-        in_directives: whether other files may attach to any link, and set positions.
-        has_geometry: whether the plant takes shapes.
+        is_tool: whether the model is a tool, whose joints are all fixed.
+        is_scene: whether the model is surroundings: all its shapes must be readable.
+        in_directives: whether model directives add the model, so that every link is kept.
+        has_geometry: whether the plant has shapes.
     """
 
     sensor: str = ""
@@ -60,7 +60,7 @@ class ModelPurpose(NamedTuple):
 def repair_urdf(
     root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of a URDF that Drake reads, with meshes converted in `folder`."""
+    """Return a URDF text that Drake reads, with meshes converted in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     root.set("name", root.get("name") or file.stem)
     if not purpose.is_scene:
@@ -108,7 +108,7 @@ def repair_scope(
 def finish_repair(
     root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path | None
 ) -> RepairedModel:
-    """Make the addresses of meshes absolute; return the text, or raise all faults at once.
+    """Convert meshes and return the text, or raise one DrakeTeleopError about all faults.
 
     Without a folder for converted meshes the text has no shapes.
     """
@@ -128,7 +128,7 @@ def finish_repair(
 
 
 def dependent_joints(root: Element) -> dict[str, str]:
-    """Return, by joint or link, the reason why it does not move independently."""
+    """Return the joints and links that do not move independently, with the reasons."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         parent = joint_end(joint, "parent")
@@ -173,7 +173,7 @@ def _name_joints(scope: Element, report: RepairReport) -> None:
 
 
 def _keep_one_material_per_name(root: Element) -> None:
-    """Define each named colour once, in the robot; visuals refer to it, or have a nameless one."""
+    """Define each named material once, in the robot; remove materials without a colour."""
     own = [each for each in root.iter("material") if _has_colour(each) and each.get("name")]
     defined = {each.get("name", ""): each for each in reversed([*root.findall("material"), *own])}
     defined = {name: each for name, each in defined.items() if _has_colour(each)}
