@@ -441,7 +441,7 @@ def test_elimination_without_load_estimate_is_rejected():
     MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0, load_estimator__enabled=True))
     MakeTeleopStation(Scenario())
     seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
-    with pytest.raises(DrakeTeleopError, match=r"contact detection needs a load estimate"):
+    with pytest.raises(DrakeTeleopError, match=r"contact detection requires a load estimate"):
         MakeTeleopStation(seen)
 
 

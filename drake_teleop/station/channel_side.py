@@ -61,7 +61,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             _limit_method_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
-            _contact_scale(scenario),
+            _scale_of_contact_force(scenario),
             start_pose(scenario.slave),
             1 / scenario.rates.hand_hz,
             scenario.simulation.seed,
@@ -121,10 +121,9 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def power_scale_of_scenario(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
+    return _scale_of_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
-def _contact_scale(scenario: Scenario) -> float:
-    """Return force_scale times gamma, the scale of the contact force; a gamma of 0 counts as 1."""
+def _scale_of_contact_force(scenario: Scenario) -> float:
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

@@ -218,14 +218,14 @@ class ReplayScene:
         self._sheet = touched.sheet
         self._master = None
         if "master_state" in recorded:
-            self._master = _add_master(self.plant, scenario)
+            self._master = _add_haptic_device(self.plant, scenario)
         finalize_plant(self.plant)
         self._moving_bodies = {
             POSE_SIGNAL_PREFIX + k: body for k, body in MovingBodies(self.plant, touched).items()
         }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._add_bodies(meshcat))
-        _draw_room(meshcat, scenario, with_table=self._master is not None)
+        _draw_floor_and_tables(meshcat, scenario, with_table=self._master is not None)
         # The replay shows the device's base parallel to W, for any alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
@@ -314,9 +314,9 @@ class _ReplayDevice(NamedTuple):
     folder: object = None
 
 
-def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
+def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if scenario.master.leader is not None:
-        return _add_leader(plant, scenario.master.leader)
+        return _add_leader_arm(plant, scenario.master.leader)
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
@@ -326,7 +326,7 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _GRIP_P_E, positions)
 
 
-def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
+def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
     parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
 
@@ -340,7 +340,7 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     )
 
 
-def _draw_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
+def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
     def draw_box(
         name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba
     ):
@@ -356,7 +356,7 @@ def _draw_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> Non
             draw_box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL_COLOUR)
     surroundings = scenario.surroundings
     for k, part in enumerate(() if surroundings is None else surroundings.parts):
-        stand = part.stand
+        stand = part.floor_stand
         if stand is not None and stand.height > 0:
             size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
             draw_box(

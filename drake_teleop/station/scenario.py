@@ -126,7 +126,7 @@ class Scenario:
     @property
     def surroundings(self) -> Environment | None:
         """All objects that the tool can touch as one `Environment`, or None."""
-        things = self._objects
+        things = self._touchables
         if not things:
             return None
         return things[0] if len(things) == 1 else SeveralObjects(things)
@@ -134,10 +134,10 @@ class Scenario:
     @property
     def leaf(self) -> SheetSpring | None:
         """Sheet spring from `sheet_spring` or `environment`, or None."""
-        return next((thing for thing in self._objects if isinstance(thing, SheetSpring)), None)
+        return next((thing for thing in self._touchables if isinstance(thing, SheetSpring)), None)
 
     @property
-    def _objects(self) -> list[Environment]:
+    def _touchables(self) -> list[Environment]:
         own = (thing for thing in (self.sheet_spring, self.slot) if thing is not None)
         return [*own, *self.environment]
 
@@ -166,14 +166,14 @@ class Scenario:
         for index, thing in enumerate(self.environment):
             thing.check(f"{where}:environment[{index}]")
         for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
-            if sum(isinstance(thing, kind) for thing in self._objects) > 1:
+            if sum(isinstance(thing, kind) for thing in self._touchables) > 1:
                 raise DrakeTeleopError(
                     f"the scenario has more than one {name} (one is permitted)",
                     where=f"{where}:environment",
                     remedy="keep one",
                 )
         _check_task(self, where)
-        _check_steps(self, where)
+        _check_integration_step(self, where)
         _check_channel(self, where)
 
 
@@ -201,10 +201,10 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     data, where = ReadScenario(name_or_path)
     scenario = ScenarioFromData(data, where)
     folder = Path(where).parent
-    scenario.slave = scenario.slave.found_from(folder)
-    scenario.master = scenario.master.found_from(folder)
+    scenario.slave = scenario.slave.with_absolute_paths(folder)
+    scenario.master = scenario.master.with_absolute_paths(folder)
     scenario.environment = [
-        thing.found_from(folder) if isinstance(thing, Scene) else thing
+        thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
         for thing in scenario.environment
     ]
     return scenario
@@ -299,7 +299,7 @@ def _check_task(scenario: Scenario, where: str) -> None:
         )
 
 
-def _check_steps(scenario: Scenario, where: str) -> None:
+def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     controlled = simulation.integrator == "runge_kutta3"
     if (

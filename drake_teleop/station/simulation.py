@@ -72,7 +72,7 @@ def simulate(
         for time in np.append(1e-3 * milliseconds, end):
             advance_without_garbage_collection(simulator, time)
             if stops:
-                rows = _stop_at_fault(simulator, simulation.settle, rows)
+                rows = _raise_recorded_fault(simulator, simulation.settle, rows)
             if on_disk is not None and on_disk.num_unwritten_rows() >= _ROWS_PER_PART:
                 on_disk.write_and_clear()
                 rows = 0
@@ -97,7 +97,7 @@ def _task_is_over(simulator: Simulator) -> bool:
     )
 
 
-def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
+def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     for name, column in log_columns(station).items():
@@ -138,9 +138,9 @@ class LogOnDisk:
     ) -> None:
         remove_log(folder)
         self._folder, self._start, self._rows, self._form = folder, start, 0, form
-        self.continue_with(simulator)
+        self.switch_simulator(simulator)
 
-    def continue_with(self, simulator: Simulator) -> None:
+    def switch_simulator(self, simulator: Simulator) -> None:
         self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG_BLOCK_NAME)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())

@@ -15,7 +15,7 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
 from drake_teleop.station.estimation.load_estimator import LoadEstimator
-from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE, ForceScaling
+from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE_S, ForceScaling
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
@@ -34,15 +34,15 @@ from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
-from drake_teleop.station.slave.surroundings import MovingPose
+from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_ports, export_outputs
 
 Array = NDArray[np.float64]
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
 MONITOR_PERIOD_S = 0.01
-# See `_check_friction`.
-_MAX_FRICTION_STEP = 2.0
+# See `_check_friction_time_step`.
+_MAX_FRICTION_RATE_TIMES_STEP = 2.0
 
 
 def MakeSlaveSide(
@@ -118,7 +118,7 @@ def MakeSlaveSide(
             arm,
             R_WB,
             scenario.wrist_sensor.largest_wrench(),
-            max(MAX_SAMPLE_AGE, 2 / scenario.rates.sensor_hz),
+            max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz),
         ),
     )
     estimate = body.load_estimator.GetOutputPort("load_estimate")
@@ -253,7 +253,7 @@ def _add_slave_blocks(
         servo = MakeJointControl(arm, scenario.joint_control, period, start)
     control = builder.AddNamedSystem("joint_control", servo)
     held = samples / rates.joint_control_hz
-    _check_friction(slave, min(held, scenario.simulation.max_step))
+    _check_friction_time_step(slave, min(held, scenario.simulation.max_step))
     torque = control.GetOutputPort("joint_torque")
     builder.Connect(state, control.GetInputPort("slave_state"))
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
@@ -280,8 +280,8 @@ def _add_slave_blocks(
     if ramps:
         rate = control.GetOutputPort("torque_rate")
         builder.Connect(rate, wrist.GetInputPort("torque_rate"))
-        if slave.sensed_sheet is not None:
-            sheet = plant.get_state_output_port(slave.sensed_sheet)
+        if slave.sheet_in_compiled_law is not None:
+            sheet = plant.get_state_output_port(slave.sheet_in_compiled_law)
             builder.Connect(sheet, control.GetInputPort("sheet_state"))
     for name, port in sample.items():
         builder.ExportOutput(port, name)
@@ -321,15 +321,14 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
     return samples_per_event(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
 
 
-def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Raise DrakeTeleopError if dry friction is too fast for a stable `step` [s]."""
+def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
     slope = np.diag(slave.joint_friction / FRICTION_SPEED)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
-    if rate * step > _MAX_FRICTION_STEP:
-        shorter = 0.9 * _MAX_FRICTION_STEP / rate
+    if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
+        shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
         raise DrakeTeleopError(
             f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
             f"{1e3 * step:g} ms",
@@ -355,10 +354,10 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
     if slave.sheet_instance is not None:
         sheet = plant.get_state_output_port(slave.sheet_instance)
         builder.ExportOutput(sheet, "sheet_state")
-        if slave.sensed_sheet is not None:
+        if slave.sheet_in_compiled_law is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))
     for name, body in slave.contact.moving.items():
-        pose = builder.AddNamedSystem(POSE_SIGNAL_PREFIX + name, MovingPose(plant, body))
+        pose = builder.AddNamedSystem(POSE_SIGNAL_PREFIX + name, MovingBodyPose(plant, body))
         builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
         export_outputs(builder, pose, **{POSE_SIGNAL_PREFIX + name: "pose"})
 
@@ -375,7 +374,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         if not scenario.load_estimator.enabled:
             check_identified("load_estimate", estimate[6:])
     scales = scenario.force_scaling.scales()
-    needed = {*scales.as_array} != {scales.gamma}
+    needed = {*scales.load_scales} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
             "sigma and gamma differ, which requires a load estimate, but there is none",

@@ -87,12 +87,12 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         parts = step.get_mutable_value()
         for part, group in zip(parts, self._groups, strict=False):
             part[:] = context.get_discrete_state(group).value()
-        received = self._received.Eval(context)
+        packet = self._received.Eval(context)
         inputs = [
             port.Eval(context) if port.HasValue(context) else np.zeros(port.size())
             for port in self._ports
         ]
-        self._run(inputs, np.ascontiguousarray(received[:-1]), bool(received[-1] > 0.5), *parts)
+        self._step_method(inputs, np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5), *parts)
 
     def _step_results(self, context: Context) -> list[Any]:
         results: list[Any] = self.get_cache_entry(self._step).Eval(context)
@@ -130,7 +130,7 @@ class PassivityAtMaster(_PassivityEndBlock):
         calculate = weak_callback(self._calc_wrench)
         self.DeclareVectorOutputPort("wrench_to_master", 6, calculate, {step})
 
-    def _run(
+    def _step_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, _: Any, ports: Any, wrench: Any,
         packet: Any,
     ) -> None:  # fmt: skip
@@ -171,7 +171,7 @@ class PassivityAtSlave(_PassivityEndBlock):
     def _declare_outputs(self, step: Any) -> None:
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._groups[1]))
 
-    def _run(
+    def _step_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, pose: Any, ports: Any, _: Any,
         packet: Any,
     ) -> None:  # fmt: skip

@@ -71,18 +71,18 @@ class ForceDisplay(DoubleOnly, LeafSystem):
         drive, command = step.get_mutable_value(), self._command.Eval(context)
         display_into(command, device, self._numbers, self._period, self._jacobian, drive)
 
-    def _step_drive(self, context: Context) -> Array:
+    def _display_state(self, context: Context) -> Array:
         drive: Array = self.get_cache_entry(self._step).Eval(context)
         return drive
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_drive(context)[:6])
+        output.SetFromVector(self._display_state(context)[:6])
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_drive(context)[DISPLAYED])
+        output.SetFromVector(self._display_state(context)[DISPLAYED])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._step_drive(context)[DISPLAYED.stop]
+        output[0] = self._display_state(context)[DISPLAYED.stop]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(0, self._step_drive(context))
+        discrete_state.set_value(0, self._display_state(context))

@@ -95,13 +95,13 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         _, fresh = network.receive_packet(self._parameters, line, k + 1, received[:-1])
         count[0], received[-1] = k + 1, fresh
 
-    def _split_state(self, context: Context) -> list[Array]:
+    def _next_state_parts(self, context: Context) -> list[Array]:
         parts: list[Array] = self.get_cache_entry(self._step).Eval(context)
         return parts
 
     def _calc_arriving(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._split_state(context)[-1])
+        output.SetFromVector(self._next_state_parts(context)[-1])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._split_state(context), self._groups, strict=True):
+        for part, group in zip(self._next_state_parts(context), self._groups, strict=True):
             discrete_state.set_value(group, part)

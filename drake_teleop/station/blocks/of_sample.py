@@ -77,7 +77,7 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
             np.zeros(16) if initial is None else finite_array("initial", initial, 16),
         )
 
-    def _declare_sample(self, size: int) -> Any:
+    def _declare_sample_ports(self, size: int) -> Any:
         return _SamplePorts(self)
 
 
@@ -119,7 +119,7 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
         self._gravity_W = finite_array("gravity_W", gravity_W, 3)
         self._orientation = self.DeclareVectorInputPort("R_WS", 9)
 
-    def _declare_sample(self, arm: Any) -> Any:
+    def _declare_sample_ports(self, arm: Any) -> Any:
         return _SamplePorts(self)
 
     def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:

@@ -22,11 +22,10 @@ from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
 
 _GRAVITY_W = (0.0, 0.0, -9.81)
-_MOTION_PORTS = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+_MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
 def _function_for_scalar_type(function: Any, T: Any) -> Callable[..., None]:
-    """Return the compiled function for double, its Python source for other scalar types."""
     return function if T is float else function.py_func
 
 
@@ -60,7 +59,7 @@ def NonContactWrench_(T: Any) -> Any:
             LeafSystem_[T].__init__(self, converter)
             self._phi = np.zeros(10) if phi is None else finite_array("phi", phi, 10)
             self._parameter = self.DeclareNumericParameter(BasicVector_[T](self._phi))
-            self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION_PORTS]
+            self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION_PORT_NAMES]
             self._load = self.DeclareVectorInputPort("load", 10)
             inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
             calculate = weak_callback(self._calc)
@@ -124,7 +123,7 @@ def WrenchScaling_(T: Any) -> Any:
             self._config = config = ForceScalingConfig() if config is None else config
             self._R_WB = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
             self._gravity_W, self._scales = finite_array("gravity_W", gravity_W, 3), config.scales()
-            ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION_PORTS)]
+            ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION_PORT_NAMES)]
             ports += [("load_estimate", 16), ("R_WS", 9)]
             inputs = [self.DeclareVectorInputPort(*port) for port in ports]
             self._inputs, self._orientation = inputs[:-1], inputs[-1]

@@ -74,7 +74,7 @@ class Environment(ABC):
         return None
 
     @property
-    def stand(self) -> FloorStand | None:
+    def floor_stand(self) -> FloorStand | None:
         return None
 
 

@@ -49,7 +49,7 @@ _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 #: Number of columns of the table of joints.
 NUM_JOINT_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
-NUM_POSE_AND_TWIST = 13
+BODY_STATE_SIZE = 13
 
 
 def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
@@ -79,15 +79,15 @@ def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Arra
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_joint_row(plant, context, plant.get_joint(JointIndex(index)), row))
+        rows.append(_joint_table_row(plant, context, plant.get_joint(JointIndex(index)), row))
     return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
-def _joint_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
+def _joint_table_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-    kind, axis = _joint_kind(joint)
+    kind, axis = _joint_type_and_axis(joint)
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     return np.array(
         [
@@ -101,7 +101,7 @@ def _joint_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) 
     )
 
 
-def _joint_kind(joint: Joint) -> tuple[int, Array]:
+def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
     if isinstance(joint, RevoluteJoint):
         return _REVOLUTE_JOINT, joint.revolute_axis()
     if isinstance(joint, PrismaticJoint):

@@ -39,7 +39,7 @@ STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_COLUMN = 22, slice(24, 26), 27
 #: Number of columns of `ShapePairs.known` and `ShapePairs.watched`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
 _STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
-_MIN_SLIP_SPEED = 1e-14  # m/s, as in Drake: a point at rest has a direction
+_MIN_SLIP_SPEED_M_S = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
 class ShapePairs(NamedTuple):
@@ -87,7 +87,7 @@ def ContactPairs(
     for body in map(plant.get_body, touched):
         row = moving.index(int(body.index())) if int(body.index()) in moving else -1
         X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
-        direction = _motion_direction(plant, context, body)
+        direction = _prismatic_joint_direction_W(plant, context, body)
         for other in plant.GetCollisionGeometriesForBody(body):
             for own, X_SOwn in tool.items():
                 if inspector.CollisionFiltered(own, other):
@@ -95,7 +95,7 @@ def ContactPairs(
                 X_Other = X_Body @ inspector.GetPoseInFrame(other)
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
-                    sphere, edges = _row_of_sphere_and_box(inspector, own, other)
+                    sphere, edges = _require_sphere_and_box(inspector, own, other)
                     law = _combined_contact_law(
                         *map(inspector.GetProximityProperties, (own, other))
                     )
@@ -135,7 +135,7 @@ def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
     return box
 
 
-def _row_of_sphere_and_box(
+def _require_sphere_and_box(
     inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
 ) -> tuple[Sphere, Box]:
     sphere, edges = inspector.GetShape(ball), inspector.GetShape(box)
@@ -149,8 +149,7 @@ def _row_of_sphere_and_box(
     )
 
 
-def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
-    """Return the direction (3,) in W along which the body's prismatic joint moves it, or zeros."""
+def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
     plant.SetVelocities(context, np.zeros(plant.num_velocities()))
     direction = np.zeros(3)
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -283,7 +282,7 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
     for i in range(3):
         force[i] = velocity[i] - out * normal[i]
         speed += force[i] * force[i]
-    speed = np.sqrt(speed + _MIN_SLIP_SPEED * _MIN_SLIP_SPEED)
+    speed = np.sqrt(speed + _MIN_SLIP_SPEED_M_S * _MIN_SLIP_SPEED_M_S)
     mu = _friction_coefficient(pair[24], pair[25], speed / pair[26])
     for i in range(3):
         force[i] = f_n * (normal[i] - mu * force[i] / speed)

@@ -19,7 +19,7 @@ from drake_teleop.station.environment.environment import (
     FloorStand,
 )
 
-_BENCH_HEIGHT = 0.15  # from the lower face of the model's bench to the leaf [m]
+_BENCH_HEIGHT_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
@@ -67,9 +67,9 @@ class SheetSpring(Environment):
         return self.effective_mass, self.stiffness, self.damping
 
     @property
-    def stand(self) -> FloorStand:
+    def floor_stand(self) -> FloorStand:
         x, y, z = self.position
-        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
+        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""

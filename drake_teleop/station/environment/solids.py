@@ -23,7 +23,7 @@ from drake_teleop.station.environment.environment import (
 )
 
 _BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
-_WALL_THICKNESS = 0.1  # m; deep enough that a tool leaves through the face
+_WALL_THICKNESS_M = 0.1  # m; deep enough that a tool leaves through the face
 _FOOT_RADIUS, _TABLE_THICKNESS = 0.002, 0.05  # m: radius of the balls, thickness of the table
 _BLOCK_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
 _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
@@ -127,8 +127,8 @@ class Wall(Surface):
     def AddTo(self, plant: MultibodyPlant) -> None:
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
-        behind = RigidTransform([0.0, 0.0, -_WALL_THICKNESS / 2])
-        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _WALL_THICKNESS], self)
+        behind = RigidTransform([0.0, 0.0, -_WALL_THICKNESS_M / 2])
+        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _WALL_THICKNESS_M], self)
 
 
 @settings
@@ -155,7 +155,7 @@ class Block(Surface):
             )
 
     @property
-    def stand(self) -> FloorStand | None:
+    def floor_stand(self) -> FloorStand | None:
         x, y, top = self.position
         across = 0.6 * min(self.table)
         return FloorStand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None

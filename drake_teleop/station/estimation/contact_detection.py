@@ -108,7 +108,7 @@ class ContactDetection(LeafSystem):
             hold=round(config.hold / period),
             following=period / config.drift_time,
         ).settings
-        self._sample = self._declare_sample(arm)
+        self._sample = self._declare_sample_ports(arm)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
@@ -117,7 +117,7 @@ class ContactDetection(LeafSystem):
         self.DeclareStateOutputPort("contact", self._flag)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _declare_sample(self, arm: ArmModel | None) -> Any:
+    def _declare_sample_ports(self, arm: ArmModel | None) -> Any:
         assert arm is not None
         self._arm = arm.table
         return self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)

@@ -114,12 +114,12 @@ class LoadEstimator(LeafSystem):
         start = np.asarray(initial, dtype=float)
         memory = self._estimator.initial_memory(start)
         self._shape, self._watches, self._period = memory.shape, config.watch, period
-        self._sample = self._declare_sample(sample_size)
+        self._sample = self._declare_sample_ports(sample_size)
         estimate = self.DeclareDiscreteState(start)
         self.DeclareDiscreteState(memory.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)
         self.DeclareVectorOutputPort(
-            "load_state", 1, weak_callback(self._calc_state), {self.xd_ticket()}
+            "load_state", 1, weak_callback(self._calc_load_state), {self.xd_ticket()}
         )
         if config.watch:
             unknown = np.zeros(MEMORY_SIZE)
@@ -137,7 +137,7 @@ class LoadEstimator(LeafSystem):
         if config.enabled or config.watch:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _declare_sample(self, size: int) -> Any:
+    def _declare_sample_ports(self, size: int) -> Any:
         return self.DeclareVectorInputPort("sample", size)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -170,7 +170,7 @@ class LoadEstimator(LeafSystem):
     def _load_state_index(self, discrete_state: DiscreteValues) -> int:
         return monitor_state(discrete_state.value(2)) if self._watches else STATE_LEARNING
 
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
+    def _calc_load_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()
         output[0] = self._load_state_index(state)
         if not self._watches:

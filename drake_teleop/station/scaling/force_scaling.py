@@ -41,11 +41,11 @@ from drake_teleop.load.regressor import (
 from drake_teleop.station.slave.arm import ArmModel, acceleration_into, forward_kinematics
 
 #: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
-_SCALES_OF_ELIMINATION = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+_CONTACT_ONLY_SCALES = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 _NUM_SCALES = 6
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
-MAX_SAMPLE_AGE = 0.05
+MAX_SAMPLE_AGE_S = 0.05
 _NO_FAULT, _STALE_FAULT, _READING_FAULT, _JOINTS_FAULT, _LOAD_FAULT = map(
     int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
 )
@@ -61,7 +61,7 @@ class Scales(NamedTuple):
     weight_object: float
 
     @property
-    def as_array(self) -> tuple[float, float, float, float]:
+    def load_scales(self) -> tuple[float, float, float, float]:
         return self.sigma_gripper, self.sigma_object, self.weight_gripper, self.weight_object
 
 
@@ -195,7 +195,7 @@ def find_fault(sample, estimate, time, valid_range):
 
 
 @njit(cache=True)
-def _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out):
+def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out):
     scales = np.empty(_NUM_SCALES)
     blend_scales_at(change, time, scales)
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
@@ -203,7 +203,7 @@ def _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out):
 
 @njit(cache=True, borrows=True)
 def _log_row_into(sample, estimate, gripper, change, time, arm, elimination, valid_range, out):
-    _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out[:6])
+    _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out[:6])
     _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out[6:12])
     out[12] = find_fault(sample, estimate, time, valid_range)
 
@@ -259,7 +259,7 @@ class ForceScaling(LeafSystem):
         arm: ArmModel,
         R_WB: NDArray[np.float64],
         largest_wrench: NDArray[np.float64] | None = None,
-        oldest: float = MAX_SAMPLE_AGE,
+        oldest: float = MAX_SAMPLE_AGE_S,
     ) -> None:
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
@@ -319,13 +319,13 @@ class ForceScaling(LeafSystem):
         parameter.SetFromVector(np.concatenate([now, requested[:-1], [start, requested[-1]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        _scaled_wrench_now_into(
+        _scaled_wrench_at_time_into(
             *self._evaluate_inputs(context), self._arm, output.get_mutable_value()
         )
 
     def _calc_log_row(self, context: Context, output: BasicVector) -> None:
         inputs = self._evaluate_inputs(context)
-        constants = self._arm, _SCALES_OF_ELIMINATION, self._valid_range
+        constants = self._arm, _CONTACT_ONLY_SCALES, self._valid_range
         _log_row_into(*inputs, *constants, output.get_mutable_value())
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
@@ -333,7 +333,7 @@ class ForceScaling(LeafSystem):
         output[0] = find_fault(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        constants = self._arm, _SCALES_OF_ELIMINATION
+        constants = self._arm, _CONTACT_ONLY_SCALES
         _scaled_wrench_into(
             *self._evaluate_inputs(context)[:3], *constants, output.get_mutable_value()
         )

@@ -71,7 +71,7 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
 
 
 @njit(cache=True, borrows=True)
-def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
+def _pose_command_into(pose, references, alignment, translation_scale, rotation_scale, out):
     if references[14] > 0.5:
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
@@ -119,7 +119,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         # The command follows from the first sample on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
-    def Open(self, context: Context, command: NDArray[np.float64]) -> None:
+    def OpenClutch(self, context: Context, command: NDArray[np.float64]) -> None:
         """Open the clutch; the slave's commanded pose X_WS stays at `command` (7,)."""
         references = context.get_discrete_state(0).CopyToVector()
         references[:7], references[14] = command, 0.0
@@ -127,7 +127,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         pose, references = self._pose.Eval(context), context.get_discrete_state(0).value()
-        _command_into(pose, references, *self._scaling, output.get_mutable_value())
+        _pose_command_into(pose, references, *self._scaling, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         references = discrete_state.get_mutable_value(0)
@@ -137,6 +137,6 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         pose = self._pose.Eval(context)
         if not np.isfinite(pose).all():  # the reference must be finite
             return
-        _command_into(pose, references, *self._scaling, references[:7])
+        _pose_command_into(pose, references, *self._scaling, references[:7])
         references[7:14] = pose
         references[14] = float(engage)

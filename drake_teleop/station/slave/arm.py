@@ -129,7 +129,7 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 
 @njit(cache=True, inline="always")
-def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
+def _advance_motion(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
@@ -215,8 +215,8 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
     n = table.shape[0] - 1
     _set_world_at_rest(table, out)
     for row in range(n):
-        _advance_state(table, row, q[row], v[row], vdot[row], out)
-    _advance_state(table, n, 0.0, 0.0, 0.0, out)
+        _advance_motion(table, row, q[row], v[row], vdot[row], out)
+    _advance_motion(table, n, 0.0, 0.0, 0.0, out)
     R_SW = transposed(matrix_at(out, 12))
     for i in range(0, 9, 3):
         out[i], out[i + 1], out[i + 2] = apply_matrix(R_SW, vector_at(out, i))
@@ -230,9 +230,9 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
     for row in range(n):
         if row > 0:
             out[row] = out[row - 1]
-        _advance_state(table, row, q[row], v[row], vdot[row], out[row])
+        _advance_motion(table, row, q[row], v[row], vdot[row], out[row])
     out[n] = out[n - 1]
-    _advance_state(table, n, 0.0, 0.0, 0.0, out[n])
+    _advance_motion(table, n, 0.0, 0.0, 0.0, out[n])
 
 
 @njit(cache=True, inline="always")
@@ -288,9 +288,9 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance_state(table, row, q[row], v[row], vdot[row], x)
+            _advance_motion(table, row, q[row], v[row], vdot[row], x)
         else:
-            _advance_state(table, row, 0.0, 0.0, 0.0, x)
+            _advance_motion(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
     _project_on_joints(table, link, tau_out)
     for row in range(n):
@@ -391,9 +391,9 @@ def forward_dynamics(
     _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance_state(table, row, q[row], v[row], 0.0, x)
+            _advance_motion(table, row, q[row], v[row], 0.0, x)
         else:
-            _advance_state(table, row, 0.0, 0.0, 0.0, x)
+            _advance_motion(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
         _composite_inertia(table, row, x, inertia[row])
     for k in range(6):

@@ -21,13 +21,13 @@ from pydrake.multibody.tree import (
 )
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.model.model_tree import WORLD
+from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import join_names
 
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
 _ROTOR_MASS_KG = 0.14
-_SLIDING_MOTOR_KG = 5.0  # mass that moves with a prismatic joint instead
+_SLIDER_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
 
 
 def is_joint_moving(plant: MultibodyPlant, index: JointIndex) -> bool:
@@ -92,7 +92,7 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
     free = [body for body in bodies if body.index() not in held]
     for body in free:
         plant.WeldFrames(plant.world_frame(), body.body_frame())
-    names = [body.name() for body in free if body.name() != WORLD]
+    names = [body.name() for body in free if body.name() != WORLD_NAME]
     return (
         [f"not connected to the arm and welded to the world: {join_names(names)}"] if names else []
     )
@@ -133,7 +133,7 @@ def weld_joints_at(
         joint = known.get(name)
         if joint is None:
             raise DrakeTeleopError(
-                f"the model has no moving joint named {name!r}",
+                f"the model has no moving joint {name!r}",
                 where="slave.hold",
                 remedy=f"name one of {', '.join(sorted(known))}",
             )
@@ -234,7 +234,7 @@ def assume_rotor_inertias(
     Beyond an `auxiliary` body, which the model does not have, the next joint's links count too.
     """
     joints = [plant.get_joint(index) for index in chain]
-    inertia = _ROTOR_MASS_KG * _chain_length(joints, frame) ** 2
+    inertia = _ROTOR_MASS_KG * _length_of_moving_chain_m(joints, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
@@ -245,13 +245,13 @@ def assume_rotor_inertias(
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())
-        motor[joint.index()].set_default_rotor_inertia(_SLIDING_MOTOR_KG if slides else inertia)
+        motor[joint.index()].set_default_rotor_inertia(_SLIDER_MASS_KG if slides else inertia)
         motor[joint.index()].set_default_gear_ratio(1.0)
     return [
         f"{what}, as the model has no inertia there, for {join_names(names)}"
         for what, names in (
             (f"a rotor inertia of {inertia:.3g} kg m^2", turning),
-            (f"a moved mass of {_SLIDING_MOTOR_KG:g} kg", sliding),
+            (f"a moved mass of {_SLIDER_MASS_KG:g} kg", sliding),
         )
         if names
     ]
@@ -270,8 +270,7 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str])
     return False
 
 
-def _chain_length(chain: list[Joint], frame: Frame) -> float:
-    """Return the length [m] of the links from the first moving joint to `frame`."""
+def _length_of_moving_chain_m(chain: list[Joint], frame: Frame) -> float:
     while chain and chain[0].num_velocities() == 0:
         chain = chain[1:]
     ends = [*(joint.frame_on_parent() for joint in chain[1:]), frame][: len(chain)]

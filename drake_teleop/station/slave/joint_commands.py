@@ -37,7 +37,7 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 
 # Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
 # mechanical stops of commercial arms are farther out.
-_RANGE_TOLERANCE = 0.01
+_RANGE_TOLERANCE_SHARE = 0.01
 
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
@@ -116,14 +116,14 @@ class SlaveMonitor(LeafSystem):
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()
         self._arm = arm
-        tolerance = _RANGE_TOLERANCE * (arm.upper - arm.lower)
+        tolerance = _RANGE_TOLERANCE_SHARE * (arm.upper - arm.lower)
         self._lower, self._upper = arm.lower - tolerance, arm.upper + tolerance
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check_joint_ranges)
 
-    def _check(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _check_joint_ranges(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]

@@ -31,9 +31,9 @@ from drake_teleop.station.slave.model.repair_report import RepairedModel
 from drake_teleop.station.slave.model.sdf_repair import repair_sdf
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose, repair_urdf
 
-_XACRO_FAULT = "is a xacro file, which contains macros instead of a model"
+_XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
-_REPAIR_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
+_REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 
 
 class ModelInPlant(NamedTuple):
@@ -69,7 +69,7 @@ def read_model(
     purpose = purpose._replace(has_geometry=plant.geometry_source_is_registered())
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
-    files.share_packages(parser.package_map())
+    files.merge_packages(parser.package_map())
     files.check(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
@@ -141,9 +141,9 @@ def _repair_file(
     path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
     kind = path.suffix.lower()
-    if kind not in _REPAIR_OF_SUFFIX:
+    if kind not in _REPAIR_FUNCTION_OF_SUFFIX:
         return RepairedModel("", [], {})
     root = read_xml(path)
     if any(element.tag.startswith("xacro:") for element in root.iter()):
         raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=_XACRO_REMEDY)
-    return _REPAIR_OF_SUFFIX[kind](root, path, files, purpose, folder)
+    return _REPAIR_FUNCTION_OF_SUFFIX[kind](root, path, files, purpose, folder)

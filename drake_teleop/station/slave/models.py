@@ -26,7 +26,7 @@ from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 from drake_teleop.station.slave.model_files import read_model
 
-_MAX_NAMES = 12  # names of frames in an error: the most similar ones
+_MAX_LISTED_NAMES = 12  # names of frames in an error: the most similar ones
 
 
 @dataclass(frozen=True)
@@ -132,10 +132,10 @@ def _sensor_frame(
     # Without names that Drake creates for joints.
     ends = ("_parent", "_child", "__model__")
     named = sorted(each for each in names if not each.endswith(ends))
-    nearest = difflib.get_close_matches(name, named, n=_MAX_NAMES, cutoff=0.0)
+    nearest = difflib.get_close_matches(name, named, n=_MAX_LISTED_NAMES, cutoff=0.0)
     known = ", ".join(sorted(nearest))
     raise DrakeTeleopError(
-        f"{len(with_frame) or 'no'} frames are named {name!r}, but one is required",
+        f"{len(with_frame) or 'no'} frames are named {name!r}",
         where=where,
         remedy=f"name one of {known}" if known else "give a model that has links",
     )

@@ -50,7 +50,7 @@ _MIN_DAMPING = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
 _INITIAL_DAMPING, _SEARCH_STEPS, _SEARCH_STARTS = 1e-3, 100, 100
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_ZERO_GRADIENT = 1e-3
+_MAX_ZERO_GRADIENT_M = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
 _REACH_TOLERANCE_M = 5e-6
 # The same tolerance for `find_posture`, which stops the search earlier [m].
@@ -168,7 +168,6 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
 
 @njit(cache=True)
 def _best_step_of_joint(J, e, i):
-    """Return the displacement of joint i alone that reduces the error e (6,) most."""
     slope, square = 0.0, 0.0
     for k in range(6):
         slope += J[k, i] * e[k]
@@ -291,7 +290,7 @@ def follow_pose(
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        if singular > 0.0 and free > _ZERO_GRADIENT * _ZERO_GRADIENT * squared:
+        if singular > 0.0 and free > _MAX_ZERO_GRADIENT_M * _MAX_ZERO_GRADIENT_M * squared:
             return _singularity_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
@@ -334,7 +333,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
             _SEARCH_STEPS, q,
         )  # fmt: skip
         if found in (_STATUS_OK, _BAD_POSE):
-            return _nearest_turns(arm, q, reference), IkStatus(found)
+            return _nearest_equivalent_joints(arm, q, reference), IkStatus(found)
         squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
@@ -343,10 +342,10 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
                 status = _singularity_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = first + part * width
-    return _nearest_turns(arm, nearest, reference), IkStatus(status)
+    return _nearest_equivalent_joints(arm, nearest, reference), IkStatus(status)
 
 
-def _nearest_turns(arm: ArmModel, q: Array, reference: Array) -> Array:
+def _nearest_equivalent_joints(arm: ArmModel, q: Array, reference: Array) -> Array:
     turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
     nearer = q + np.where(arm.table[:-1, IS_PRISMATIC_COLUMN] == 0, turns, 0.0)
     return np.where((arm.lower <= nearer) & (nearer <= arm.upper), nearer, q)
@@ -410,7 +409,7 @@ class NumericInverseKinematics(LeafSystem):
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _solve(self, context: Context, q: Array) -> int:
+    def _solve_command(self, context: Context, q: Array) -> int:
         last = context.get_discrete_state_vector().value()
         time, pose, position = context.get_time(), self._pose, self._position
         status: int = _follow_command(
@@ -419,10 +418,10 @@ class NumericInverseKinematics(LeafSystem):
         return status
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        self._solve(context, output.get_mutable_value())
+        self._solve_command(context, output.get_mutable_value())
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._solve(context, np.empty(self._joints))
+        output[0] = self._solve_command(context, np.empty(self._joints))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         next_state = discrete_state.get_mutable_value(0)

@@ -27,20 +27,20 @@ from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, forward_ki
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
+from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, start_posture
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
-    ContactWith,
+    MakeToolContactModel,
     ToolContactModel,
-    make_no_contact,
+    make_empty_contact_model,
 )
-from drake_teleop.station.slave.tool import AddTool, end_of_shapes
+from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
-_SAME_REACH_M = 1e-3
+_TIP_TOLERANCE_M = 1e-3
 #: Name of the arm's model instance in every plant.
 ARM_INSTANCE_NAME = "arm"
 
@@ -104,7 +104,7 @@ class SlavePlant:
         return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
 
     @property
-    def sensed_sheet(self) -> ModelInstanceIndex | None:
+    def sheet_in_compiled_law(self) -> ModelInstanceIndex | None:
         """`sheet_instance` if the compiled contact law computes its contact, else None."""
         return None if self.contact.beyond else self.sheet_instance
 
@@ -169,16 +169,16 @@ def AddSlavePlant(
     surroundings = None if environment is None else AddEnvironment(plant, environment)
     with translate_drake_errors(slave.path):
         finalize_plant(plant)
-    contact = make_no_contact()
+    contact = make_empty_contact_model()
     if environment is not None and surroundings is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
-        contact = ContactWith(plant, scene_graph, frame, tool, environment, surroundings)
+        _remove_arm_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
+        contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
     start = start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
-        check_strength(arm, start)
+        check_motor_strength(arm, start)
     friction = friction_of_joints(slave.friction, arm.joint_names)
     if friction.any():
         AddJointFriction(builder, plant, instance, friction, arm.velocity_index)
@@ -235,7 +235,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     """Parse arm, tool and payload into a plant; rename the arm's model instance to "arm"."""
     slave = Slave() if slave is None else slave
     model = ParseModel(
-        plant, slave.path, slave.sensor_frame, slave.packages, slave.X_WBase, slave.hold
+        plant, slave.path, slave.sensor_frame, slave.package_folders, slave.X_WBase, slave.hold
     )
     if plant.HasModelInstanceNamed(ARM_INSTANCE_NAME):
         plant.RenameModelInstance(
@@ -246,7 +246,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
     assumptions, folders = [*model.assumptions], [model.folder]
     if slave.tool is not None:
-        tool = AddTool(plant, slave.tool, frame, slave.packages)
+        tool = AddTool(plant, slave.tool, frame, slave.package_folders)
         assumptions += tool.assumptions
         folders += [tool.folder] if tool.folder is not None else []
         if model_bodies:
@@ -285,7 +285,7 @@ def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
             scene_graph.RemoveGeometry(plant.get_source_id(), shape)
 
 
-def _remove_shapes(
+def _remove_arm_shapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
 ) -> None:
     carried = {body.index() for body in load}
@@ -295,8 +295,7 @@ def _remove_shapes(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
-def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
-    """Return corners (k, 3) in S [m] of the hull or bounding box of each shape on the sensor."""
+def _hull_corners_on_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
@@ -317,10 +316,9 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
     return hulls
 
 
-def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the end p_S (3,) [m], in the middle of the hulls that reach farthest along z_S."""
+def _farthest_point_along_z(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     reach = max(float(hull[:, 2].max()) for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SAME_REACH_M]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_TOLERANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
@@ -340,9 +338,9 @@ def _tip_of_tool(
             for frame in (parsed.sensor_frame, tip)
         )
         return X_WS.InvertAndCompose(X_WTip).translation()
-    reach = None if slave.tool is None else end_of_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
-        return _end_of_hulls(hulls)
+    reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
+    if slave.tool is None and (hulls := _hull_corners_on_sensor_S(slave)):
+        return _farthest_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 

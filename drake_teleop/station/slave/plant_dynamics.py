@@ -18,7 +18,7 @@ from drake_teleop.common.vectors import (
     rotate_vector,
     vector_at,
 )
-from drake_teleop.station.environment.moving_bodies import NUM_POSE_AND_TWIST, poses_and_twists_into
+from drake_teleop.station.environment.moving_bodies import BODY_STATE_SIZE, poses_and_twists_into
 from drake_teleop.station.environment.point_contact import (
     BODY_COLUMN,
     NUM_PAIR_COLUMNS,
@@ -31,7 +31,7 @@ from drake_teleop.station.slave.surroundings import ToolContactModel
 
 #: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
 PROXIMITY_FAR, PROXIMITY_TOUCHING, PROXIMITY_NEAR_MONITORED = range(3)
-_WATCHED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
+_MONITORED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
 _TOUCH_TOLERANCE_M = 1e-9  # m
 
 
@@ -55,7 +55,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False
-    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
@@ -102,7 +102,7 @@ def _place_box_at_body(pair, bodies, placed):
 def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
     """Return a code PROXIMITY_ for the tool; `pairs`, `watched`: `ShapePairs.known`, `.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
-    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
@@ -110,7 +110,7 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
             _place_box_at_body(pair, bodies, placed)
         else:
             copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
-        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
+        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _MONITORED_DISTANCE_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
         box = _place_box_at_body(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
@@ -161,7 +161,7 @@ class ToolContact(LeafSystem):
 
 
 @njit(cache=True)
-def assemble_state(state, around, x):
+def assemble_plant_state(state, around, x):
     """Write x from the arm's `state` [q; v] and `around` [leaf deflection, rate, plant's q; v]."""
     n = state.shape[0] // 2
     copy_into(x, 0, state, 0, n)
@@ -184,7 +184,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
         x[half - 1 : 2 * half : half],
         x[2 * half :],
     )
-    if not _take_given_wrench(given, x, wrench_W):
+    if not _take_or_request_wrench(given, x, wrench_W):
         environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
     else:
         applied = np.empty(6)
@@ -194,7 +194,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _take_given_wrench(given, x, wrench_W):
+def _take_or_request_wrench(given, x, wrench_W):
     """Copy the next wrench of `given` to `wrench_W` and return True; without one write a request.
 
     `given` is empty, or has a row [number given, number used, x of the request] and then wrenches.

@@ -51,11 +51,11 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 #: Larger overlaps are reported [m]; smaller ones are rounding of models.
-MIN_DEPTH_M = 1e-3
-_MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
+MIN_OVERLAP_M = 1e-3
+_MAX_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_POSTURES, _OVERLAP_BY_DESIGN_SHARE = 200, 0.95
-_SAME_DIRECTION = 0.999  # cosine of the angle between the axes of a telescope
+_MIN_COSINE_OF_PARALLEL_AXES = 0.999  # cosine of the angle between the axes of a telescope
 _NUM_POLYHEDRON_SIDES = 24  # points on a circumference of a round shape
 
 
@@ -93,11 +93,11 @@ class PostureShapes:
         self.tool_bodies = {body.index() for body in beyond}
         if sticks and not any(map(self._has_shapes, self.moving_bodies() - self.tool_bodies)):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
-        _make_solid(self.plant, self._scene_graph)
+        _prepare_collision_shapes(self.plant, self._scene_graph)
         finalize_plant(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
-        self._exclude_joined()
+        self._exclude_joined_bodies()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = self.plant.GetMyMutableContextFromRoot(self._root)
@@ -132,8 +132,7 @@ class PostureShapes:
     def tool_body(self) -> BodyIndex:
         return self._parsed.tool
 
-    def sensor_link(self) -> set[BodyIndex]:
-        """Return the indices of the bodies that are welded to the sensor, also of the tool."""
+    def sensor_bodies(self) -> set[BodyIndex]:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
@@ -183,7 +182,7 @@ class PostureShapes:
             found[first, second] = min(each.distance, found.get((first, second), np.inf))
         return found
 
-    def _exclude_joined(self) -> None:
+    def _exclude_joined_bodies(self) -> None:
         plant, manager = self.plant, self._scene_graph.collision_filter_manager()
 
         def bodies_of_link(body: RigidBody) -> set[BodyIndex]:
@@ -203,7 +202,7 @@ class PostureShapes:
                 axis, others = R_WF @ joint.translation_axis(), telescopes
                 telescopes = []
                 for other, bodies in others:
-                    if bodies & joined and abs(axis @ other) > _SAME_DIRECTION:
+                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_PARALLEL_AXES:
                         joined |= bodies
                     else:
                         telescopes.append((other, bodies))
@@ -215,7 +214,7 @@ class PostureShapes:
     def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
         least = int(np.ceil(_OVERLAP_BY_DESIGN_SHARE * _NUM_POSTURES))
-        limits = sampled_range(self.arm)
+        limits = joint_sampling_range(self.arm)
         for left in range(_NUM_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
             counts.update(p for p in self._distances_of_bodies() if not self.surroundings & set(p))
@@ -224,7 +223,7 @@ class PostureShapes:
         return {pair for pair, count in counts.items() if count >= least}
 
 
-def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
+def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
     """Return lower and upper ends (n,) of random joint positions: limits, at most one turn wide."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
@@ -257,7 +256,7 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
     found = []
     for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
-        if distance > -MIN_DEPTH_M or (of_arm and with_surroundings):
+        if distance > -MIN_OVERLAP_M or (of_arm and with_surroundings):
             continue
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:
@@ -269,7 +268,7 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
     return found
 
 
-def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+def _prepare_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     """Use visual shapes of bodies without collision shapes; remove unbounded collision shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
@@ -281,7 +280,7 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
             shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
             is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
-            is_limited = box is not None and max(box.half_width()) < _MAX_SIZE_M
+            is_limited = box is not None and max(box.half_width()) < _MAX_SHAPE_SIZE_M
             here, name = RigidTransform(inspector.GetPoseInFrame(geometry)), f"solid_{k}"
             if is_curved:
                 shape = Convex(here.inverse() @ surface_points(inspector, geometry).T, name)

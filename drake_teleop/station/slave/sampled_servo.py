@@ -22,12 +22,12 @@ from drake_teleop.station.slave.joint_control import (
     servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_dynamics import assemble_state, plant_rates
+from drake_teleop.station.slave.plant_dynamics import assemble_plant_state, plant_rates
 
 Array = NDArray[np.float64]
 
 #: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
-_EVENT_HZ = 2000.0
+_MIN_EVENT_HZ = 2000.0
 
 
 def samples_per_event(control_hz: float, hand_hz: float) -> int:
@@ -39,7 +39,7 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
     whole = round(ratio)
     if whole < 1 or abs(ratio - whole) > 1e-9 * whole:
         return 1
-    most = max(int(control_hz / _EVENT_HZ), 1)
+    most = max(int(control_hz / _MIN_EVENT_HZ), 1)
     return next(m for m in range(min(most, whole), 0, -1) if whole % m == 0)
 
 
@@ -61,7 +61,7 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
     predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
-    assemble_state(state, sheet, x)
+    assemble_plant_state(state, sheet, x)
     now[:] = 0.0
     rate[:] = 0.0
     for k in range(samples):
@@ -90,7 +90,7 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
 
 
 @njit(cache=True)
-def _evaluate_line(state, time, torque):
+def _evaluate_torque_line(state, time, torque):
     """Write the torque (n,) at `time` [s]; `state` is a `line`, then its start time [s]."""
     n = torque.shape[0]
     for i in range(n):
@@ -125,21 +125,21 @@ class SampledServo(LeafSystem):
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._at_rest, self._sheet = np.zeros(2), None
-        if slave.sensed_sheet is not None:
+        if slave.sheet_in_compiled_law is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, q_start)
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
-        torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_rate)
+        torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
         self.DeclareVectorOutputPort("joint_torque", n, torque, when)
         self.DeclareVectorOutputPort("torque_rate", n, rate, {self.xd_ticket()})
         self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         line = context.get_discrete_state_vector().value()
-        _evaluate_line(line, context.get_time(), output.get_mutable_value())
+        _evaluate_torque_line(line, context.get_time(), output.get_mutable_value())
 
-    def _calc_rate(self, context: Context, output: BasicVector) -> None:
+    def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
         n = self._n
         output.SetFromVector(context.get_discrete_state_vector().value()[n : 2 * n])
 

@@ -21,11 +21,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, ToolShapes
 from drake_teleop.station.slave.models import ParseScene
-from drake_teleop.station.slave.surroundings import supports_pose
+from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
 #: Folders of converted meshes, kept while the process runs.
 _MESH_FOLDERS: list[TemporaryDirectory[str]] = []
-_RESERVED_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
+_RESERVED_BODY_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
 _MESH_RESOLUTION_M = 0.005  # m, edge length of the mesh of the tool's ball
 
 
@@ -64,7 +64,7 @@ class Scene(Environment):
     def hydroelastic(self) -> bool:
         return self.contact == "hydroelastic"
 
-    def found_from(self, folder: Path) -> "Scene":
+    def with_absolute_paths(self, folder: Path) -> "Scene":
         """Return a copy with the absolute path of `file`, if it exists in `folder`."""
         path = (folder / self.file).resolve()
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
@@ -76,7 +76,7 @@ class Scene(Environment):
             _MESH_FOLDERS.append(folder)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
-            if body.name() in _RESERVED_NAMES:
+            if body.name() in _RESERVED_BODY_NAMES:
                 raise DrakeTeleopError(
                     f"the body name {body.name()} is reserved for the station",
                     where=str(path),
@@ -84,7 +84,7 @@ class Scene(Environment):
                 )
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
-            if not supports_pose(joint):
+            if not supports_pose_conversion(joint):
                 raise DrakeTeleopError(
                     f"the joint {joint.name()} has the unsupported type {joint.type_name()}",
                     where=str(path),

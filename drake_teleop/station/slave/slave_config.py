@@ -84,8 +84,7 @@ class Slave:
         return Path(self.model) if self.model else models_dir() / "rx90.sdf"
 
     @property
-    def packages(self) -> tuple[Path, ...]:
-        """Folders in which package:// addresses are searched."""
+    def package_folders(self) -> tuple[Path, ...]:
         return tuple(Path(folder) for folder in self.package_paths)
 
     @property
@@ -127,7 +126,7 @@ class Slave:
         if self.tool is not None:
             self.tool.check(f"{where}.tool")
 
-    def found_from(self, folder: Path) -> "Slave":
+    def with_absolute_paths(self, folder: Path) -> "Slave":
         """Return a copy with absolute paths; relative ones are relative to `folder`."""
 
         def resolved_path(name: str) -> str:

@@ -27,8 +27,8 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
+    BODY_STATE_SIZE,
     NUM_JOINT_COLUMNS,
-    NUM_POSE_AND_TWIST,
     JointTable,
     poses_and_twists_into,
 )
@@ -39,7 +39,7 @@ from drake_teleop.station.environment.point_contact import (
 )
 
 _FRAME_TOLERANCE = 1e-12  # rounding of frames
-_MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
+_MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
 
 
 class AddedEnvironment(NamedTuple):
@@ -80,7 +80,7 @@ class ToolContactModel(NamedTuple):
         return self.pairs, self.joints
 
 
-def make_no_contact() -> ToolContactModel:
+def make_empty_contact_model() -> ToolContactModel:
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, NUM_PAIR_COLUMNS)), np.zeros((0, NUM_JOINT_COLUMNS))
     watched = np.zeros((0, NUM_MONITORED_COLUMNS))
@@ -97,7 +97,7 @@ def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> AddedEnvi
     return AddedEnvironment([ModelInstanceIndex(index) for index in added], sheet)
 
 
-def ContactWith(
+def MakeToolContactModel(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     sensor_frame: Frame,
@@ -112,7 +112,7 @@ def ContactWith(
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
-    contact = make_no_contact()._replace(
+    contact = make_empty_contact_model()._replace(
         # Integers, because Drake's identifiers would keep the plant alive.
         bodies=frozenset(int(index) for index in shapes),
         shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
@@ -125,7 +125,7 @@ def ContactWith(
             contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_masses(plant, context, contact)
-    if beyond := _unmodelled_contact(environment, contact):
+    if beyond := _reason_for_drake_contact(environment, contact):
         return contact._replace(beyond=beyond)
     joints, order = contact.joints, list[int]()
     if contact.moving:
@@ -159,7 +159,7 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactM
     if not contact.moving:
         return
     inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
-    if not inertia.min() > _MIN_INERTIA:
+    if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
         bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         raise DrakeTeleopError(
@@ -169,7 +169,7 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactM
         )
 
 
-def _unmodelled_contact(environment: Environment, contact: ToolContactModel) -> str:
+def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:
     if environment.hydroelastic:
         return "contacts have areas"
     if contact.sheet is not None and len(environment.parts) > 1:
@@ -188,18 +188,18 @@ def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, 
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     names = [body.name() for body in moving]
     return {
-        _unique_signal_name(
+        _name_as_identifier(
             body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()
         ): (body.index())
         for body in moving
     }
 
 
-def _unique_signal_name(name: str) -> str:
+def _name_as_identifier(name: str) -> str:
     return re.sub(r"\W+", "_", name)
 
 
-def supports_pose(joint: Joint) -> bool:
+def supports_pose_conversion(joint: Joint) -> bool:
     """Return whether `joint_positions_of_pose` supports the type of the joint."""
     kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
@@ -215,7 +215,7 @@ def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> NDArray[np.fl
     return np.concatenate([turned, X_FM.translation()])[: joint.num_positions()]
 
 
-class MovingPose(LeafSystem):
+class MovingBodyPose(LeafSystem):
     """Block that outputs the pose X_WB (7,) of a moving body from the whole plant's [q; v]."""
 
     __slots__ = ONE_DICT
@@ -223,7 +223,7 @@ class MovingPose(LeafSystem):
     def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
         super().__init__()
         self._joints, order = JointTable(plant, [body])
-        self._bodies = np.empty((len(order), NUM_POSE_AND_TWIST))
+        self._bodies = np.empty((len(order), BODY_STATE_SIZE))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))
 

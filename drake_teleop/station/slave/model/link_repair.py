@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, parse_number
-from drake_teleop.station.slave.model.model_tree import WORLD
+from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
 _INERTIA_ENTRIES = {
@@ -21,7 +21,7 @@ _INERTIA_ENTRIES = {
 }
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _ROUNDING_SHARE, _SUSPICIOUS_SHARE = 1e-3, 0.05
-_NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
+_MIN_CHANGE_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
 _TRIANGLE_INEQUALITY_MARGIN = 1e-9
 
@@ -39,7 +39,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
         elif inertial is not None:
             link.remove(inertial)
         return not is_sdf
-    if name == WORLD:
+    if name == WORLD_NAME:
         link.remove(inertial)
         return False
     text = _mass_text(inertial)
@@ -88,7 +88,7 @@ def possible_inertia(
 ) -> NDArray[np.float64]:
     """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
-    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
+    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _MIN_CHANGE_KG_M2:
         report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"

@@ -19,7 +19,7 @@ from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
-_READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
+_COLLISION_MESH_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Numbers of each dimension of a shape.
 _DIMENSIONS_OF_SHAPE = {
     "box": {"size": 3},
@@ -30,7 +30,7 @@ _DIMENSIONS_OF_SHAPE = {
     "mesh": {},
     "plane": {},
 }
-_MIN_CORNERS = 3  # of a mesh
+_MIN_MESH_VERTICES = 3  # of a mesh
 _STICK_RADIUS_M = 0.035
 _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -109,13 +109,13 @@ def _mesh_fault(
     except DrakeTeleopError as error:
         return str(error)
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
-    if suffix not in (".stl", *_READABLE_SUFFIXES):
+    if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):
         return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
-    if (suffix == ".stl" or shape.tag == "collision") and not _is_readable(file, written):
+    if (suffix == ".stl" or shape.tag == "collision") and not _is_mesh_readable(file, written):
         return f"{Path(address).suffix} meshes are empty or damaged"
     if suffix == ".stl" and folder is not None:
         target = folder / f"{len(list(folder.iterdir()))}_{file.stem}.obj"
-        target.write_text(_obj_of_stl(file, written))
+        target.write_text(_obj_text_of_stl(file, written))
         file = target
     if mesh.get("filename"):
         mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
@@ -125,11 +125,11 @@ def _mesh_fault(
 
 
 @lru_cache(maxsize=1024)
-def _is_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
+def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
     if path.suffix.lower() in (".gltf", ".vtk"):
         try:
             with silent_stderr():
-                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_CORNERS
+                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_MESH_VERTICES
         except RuntimeError:
             return False
     try:
@@ -140,7 +140,7 @@ def _is_readable(path: Path, _: int) -> bool:  # the time: an edited file is rea
 
 
 @lru_cache(maxsize=1024)
-def _obj_of_stl(path: Path, _: int) -> str:
+def _obj_text_of_stl(path: Path, _: int) -> str:
     triangles = read_triangles(path)
     with suppress(ValueError):
         triangles = convex_hull(triangles.vertices)
@@ -165,7 +165,6 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
 
 
 def _pose_in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
-    """Return the pose X_BodyFrame of a frame that is on `body` or on a body welded to it."""
     pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
     while on.index() != body.index():
         weld = inboard[on.index()]

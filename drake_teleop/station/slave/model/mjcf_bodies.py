@@ -14,16 +14,16 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
     MAX_VALUE,
-    MIN_LENGTH,
+    MIN_VECTOR_LENGTH,
     Attributes,
     Mjcf,
-    rotation_to,
+    smallest_rotation_of_z_to,
 )
 from drake_teleop.station.slave.model.mjcf_masses import (
     NO_MASS,
     MassProperties,
     combine_properties,
-    fitted_shape,
+    fit_primitive,
     mesh_properties,
     primitive_properties,
 )
@@ -31,7 +31,7 @@ from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
 
 # Elements that generate bodies or joints.
 _GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
-_DEFAULT_DENSITY = 1000.0  # kg/m^3, default of MuJoCo
+_DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
 _UNSUPPORTED_SHAPES = ("hfield", "sdf")
 _NUM_SIZES_OF_SHAPE = {
     "sphere": 1,
@@ -41,7 +41,7 @@ _NUM_SIZES_OF_SHAPE = {
     "box": 3,
 }  # numbers in size
 _ROUND_SHAPES = ("capsule", "cylinder")
-_MAX_VISIBLE_GROUP = 2  # as in MuJoCo and Drake
+_MAX_VISIBLE_GEOM_GROUP = 2  # as in MuJoCo and Drake
 _Array = NDArray[np.float64]
 
 
@@ -64,7 +64,7 @@ class Joint:
         turn = RotationMatrix(AngleAxis(q - self.ref, self.axis))
         return RigidTransform(turn, self.anchor - turn @ self.anchor)
 
-    def in_other_axes(self, X: RigidTransform) -> Joint:
+    def transformed_by(self, X: RigidTransform) -> Joint:
         """Return a copy whose anchor and axis are transformed by X."""
         anchor, axis = X @ self.anchor, X.rotation() @ self.axis
         limits, ref = self.limits, self.ref
@@ -87,8 +87,7 @@ class Geom:
 
     @property
     def is_visible(self) -> bool:
-        """Whether MuJoCo shows the shape by default."""
-        return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GROUP
+        return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GEOM_GROUP
 
 
 def takes_part_in_contacts(shape: Attributes) -> bool:
@@ -110,7 +109,6 @@ class Body:
     is_auxiliary: bool = False  # a body that the file does not have
 
     def with_descendants(self) -> list[Body]:
-        """Return the body and all bodies that it carries."""
         return [self, *(body for child in self.children for body in child.with_descendants())]
 
     def path_to(self, name: str) -> list[Body]:
@@ -152,37 +150,37 @@ class BodyReader:
         """Return the world with its shapes and all bodies."""
         world = Body("world", RigidTransform())
         for element in self._mjcf.root.findall("worldbody"):
-            self._read_content(world, element, element.get("childclass", ""), RigidTransform())
+            self._read_children(world, element, element.get("childclass", ""), RigidTransform())
         return world
 
     def read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
         """Return the body in `element`, with all bodies on it; X_PF is its frame in the parent."""
-        name = element.get("name") or self._invent_name("body")
+        name = element.get("name") or self._make_unused_name("body")
         attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
         body = Body(name, X_PF @ self._mjcf.pose(attributes))
         childclass = element.get("childclass") or childclass
-        self._read_content(body, element, childclass, RigidTransform())
+        self._read_children(body, element, childclass, RigidTransform())
         return body
 
-    def _invent_name(self, stem: str) -> str:
+    def _make_unused_name(self, stem: str) -> str:
         for number in self._counters.setdefault(stem, count(1)):
             if (name := f"{stem}_{number}") not in self._names:
                 break
         return name
 
-    def _read_content(
+    def _read_children(
         self, body: Body, element: Element, childclass: str, X_BF: RigidTransform
     ) -> None:
         for child in element:
             attributes = self._mjcf.attributes(child, childclass, f"{child.tag} of {body.name}")
             if child.tag == "frame":
                 inner = child.get("childclass") or childclass
-                self._read_content(body, child, inner, X_BF @ self._mjcf.pose(attributes))
+                self._read_children(body, child, inner, X_BF @ self._mjcf.pose(attributes))
             elif child.tag == "body":
                 body.children.append(self.read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
                 body.joints.append(
-                    self._read_joint(body, attributes, child.tag).in_other_axes(X_BF)
+                    self._read_joint(body, attributes, child.tag).transformed_by(X_BF)
                 )
             elif child.tag == "geom":
                 self._add_geom(body, attributes, X_BF)
@@ -194,11 +192,11 @@ class BodyReader:
                 body.generators.append(child.tag)
 
     def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:
-        name = given.get("name") or self._invent_name(f"{body.name}_joint")
+        name = given.get("name") or self._make_unused_name(f"{body.name}_joint")
         given.label = f"joint {name}"
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
-        if np.linalg.norm(axis) < MIN_LENGTH:
+        if np.linalg.norm(axis) < MIN_VECTOR_LENGTH:
             self._mjcf.report.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.limits("range", "limited", automatic=self._mjcf.autolimits)
@@ -217,7 +215,7 @@ class BodyReader:
         X_FG, size = self._mjcf.pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
         if "fromto" in given and kind in (*_ROUND_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
-            X_FG = RigidTransform(rotation_to(ends[0] - ends[1]), ends.mean(axis=0))
+            X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
             half = float(np.linalg.norm(ends[0] - ends[1])) / 2
             size = [size[0], half, 0.0] if kind in _ROUND_SHAPES else [size[0], size[0], half]
         found = self.meshes.find(name) if name else None
@@ -236,7 +234,7 @@ class BodyReader:
         if mesh is not None and kind != "mesh":
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
-                X_GM, size = fitted_shape(mesh, kind, by_box=by_box)
+                X_GM, size = fit_primitive(mesh, kind, by_box=by_box)
             except ValueError as error:
                 self.lost.setdefault(str(error), []).append((body, given))
                 return
@@ -261,7 +259,7 @@ class BodyReader:
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
-            given = combine_properties([self._geom_mass(geom) for geom in body.geoms])
+            given = combine_properties([self._mass_of_geom(geom) for geom in body.geoms])
         mass, centre, inertia = given or NO_MASS
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:
@@ -271,7 +269,7 @@ class BodyReader:
             inertia = np.eye(3) * np.trace(inertia) / 3
         return MassProperties(max(mass, compiler.number("boundmass", 0.0)), centre, inertia)
 
-    def _geom_mass(self, geom: Geom) -> MassProperties:
+    def _mass_of_geom(self, geom: Geom) -> MassProperties:
         groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
             return NO_MASS
@@ -285,5 +283,5 @@ class BodyReader:
             self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return NO_MASS
         mass = geom.attributes.number("mass", -1.0)
-        density = geom.attributes.number("density", _DEFAULT_DENSITY)
+        density = geom.attributes.number("density", _DEFAULT_DENSITY_KG_M3)
         return shape.with_mass(mass if mass >= 0.0 else density * shape.mass).in_frame(geom.X_BG)

@@ -12,9 +12,9 @@ from pydrake.math import RigidTransform
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 
-_MAX_NAMES = 12  # names of frames in an error: the most similar ones
+_MAX_LISTED_NAMES = 12  # names of frames in an error: the most similar ones
 _LOOP_TAGS = ("connect", "weld", "distance")
-_DYNAMICS_WITH_STATE = (
+_UNBOUNDED_DYNAMICS_TYPES = (
     "integrator",
     "muscle",
     "user",
@@ -34,7 +34,7 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
             for top, *_ in tops
             for name in _names_of_elements(top, tag)
         }
-        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_NAMES, cutoff=0.0)
+        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_LISTED_NAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies"
         what = f"{len(carriers) or 'no'} frames are named {sensor!r}; {remedy}"
         for fault in (what, *reader.meshes.inaccessible):
@@ -47,17 +47,17 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     for name in (*others, *world.generators):
         mjcf.report.state_assumption("left out, because the arm does not carry it:", name)
     world.generators.clear()
-    arm = _separate_joints(reader.read_body(*carriers[0]))
+    arm = _split_into_one_joint_bodies(reader.read_body(*carriers[0]))
     if kind == "site":
-        measured = {site for each in mjcf.children("sensor") if (site := _force_site(each))}
-        arm = _insert_site(arm, sensor, is_measured=sensor in measured)
+        measured = {site for each in mjcf.children("sensor") if (site := _measured_site(each))}
+        arm = _insert_body_at_site(arm, sensor, is_measured=sensor in measured)
         mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
     return world
 
 
 def read_world_and_bodies(reader: BodyReader) -> Body:
-    return _separate_joints(reader.read_world())
+    return _split_into_one_joint_bodies(reader.read_world())
 
 
 def hold_joints(
@@ -101,7 +101,7 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
             report.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
-        elif element.tag in _LOOP_TAGS and _is_loop(given, carriers):
+        elif element.tag in _LOOP_TAGS and _closes_loop(given, carriers):
             report.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
@@ -134,13 +134,13 @@ def _names_of_elements(top: Element, tag: str) -> set[str]:
     return {each.get("name", "") for each in top.iter(tag)}
 
 
-def _force_site(sensor: Element) -> str:
+def _measured_site(sensor: Element) -> str:
     is_wrench = sensor.tag in ("force", "torque")
     return sensor.get("site", "") if is_wrench else ""
 
 
-def _separate_joints(body: Body) -> Body:
-    body.children = [_separate_joints(child) for child in body.children]
+def _split_into_one_joint_bodies(body: Body) -> Body:
+    body.children = [_split_into_one_joint_bodies(child) for child in body.children]
     outer, innermost = None, body
     for joint in body.joints[:-1]:
         part = Body(f"{body.name}_{joint.name}", body.X_PB, [joint], is_auxiliary=True)
@@ -156,7 +156,7 @@ def _separate_joints(body: Body) -> Body:
     return outer
 
 
-def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
+def _insert_body_at_site(body: Body, site: str, *, is_measured: bool) -> Body:
     """Add a massless body at the pose of a site, as sensor frame.
 
     The new body carries the site's body if a `force` or `torque` sensor measures there
@@ -164,7 +164,7 @@ def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
     """
     if site not in body.sites:
         body.children = [
-            _insert_site(child, site, is_measured=is_measured) for child in body.children
+            _insert_body_at_site(child, site, is_measured=is_measured) for child in body.children
         ]
         return body
     X_BS = body.sites.pop(site)
@@ -172,7 +172,7 @@ def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
         body.children.append(Body(site, X_BS, is_auxiliary=True))
         return body
     X_SB = X_BS.inverse()
-    joints = [joint.in_other_axes(X_SB) for joint in body.joints]
+    joints = [joint.transformed_by(X_SB) for joint in body.joints]
     inner = replace(body, X_PB=X_SB, joints=[])
     return Body(site, body.X_PB @ X_BS, joints, children=[inner], is_auxiliary=True)
 
@@ -188,7 +188,7 @@ def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
     return dict(collect_carriers(arm, "world"))
 
 
-def _is_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
+def _closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
     ends = [given.get("body1", "world"), given.get("body2", "world")]
     if "site1" in given or not all(end == "world" or end in carriers for end in ends):
         return False  # a free or mocap body, another arm
@@ -232,7 +232,6 @@ def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
 
 
 def _force_per_control(given: Attributes, tag: str) -> float:
-    """Return force per unit of the control signal; 0 for actuators such as position servos."""
     if tag == "motor":
         return 1.0
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
@@ -241,7 +240,7 @@ def _force_per_control(given: Attributes, tag: str) -> float:
     if (
         biased
         or given.get("gaintype", "fixed") != "fixed"
-        or given.get("dyntype") in _DYNAMICS_WITH_STATE
+        or given.get("dyntype") in _UNBOUNDED_DYNAMICS_TYPES
     ):
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])

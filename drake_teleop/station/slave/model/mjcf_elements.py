@@ -16,8 +16,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_MAX_DEPTH = 150  # largest depth of nested elements
-MIN_LENGTH = 1e-9
+_MAX_NESTING_DEPTH = 150  # largest depth of nested elements
+MIN_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
@@ -148,18 +148,18 @@ class Mjcf:
         if "xyaxes" in given:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
-            if np.linalg.norm(z) < MIN_LENGTH:
+            if np.linalg.norm(z) < MIN_VECTOR_LENGTH:
                 self.report.add_fault(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
             return RotationMatrix(columns / np.linalg.norm(columns, axis=0))
-        return rotation_to(given.vector("zaxis", (0.0, 0.0, 1.0)))
+        return smallest_rotation_of_z_to(given.vector("zaxis", (0.0, 0.0, 1.0)))
 
     def _insert_includes(
         self, element: Element, path: Path, included: set[Path], depth: int
     ) -> None:
-        if depth > _MAX_DEPTH:
-            what = f"its elements are nested more than {_MAX_DEPTH} deep"
+        if depth > _MAX_NESTING_DEPTH:
+            what = f"its elements are nested more than {_MAX_NESTING_DEPTH} deep"
             raise DrakeTeleopError(what, where=str(self.path))
         content = list[Element]()
         for child in element:
@@ -211,7 +211,7 @@ def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> RotationMat
     return RotationMatrix(AngleAxis(angle, axis / length)) if length else RotationMatrix()
 
 
-def rotation_to(z: NDArray[np.float64]) -> RotationMatrix:
+def smallest_rotation_of_z_to(z: NDArray[np.float64]) -> RotationMatrix:
     """Return the smallest rotation that turns the z axis to the direction `z` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))

@@ -80,17 +80,17 @@ def mesh_properties(mesh: Mesh) -> MassProperties:
     centre = area @ corners.mean(axis=1) / max(float(area.sum()), 1e-300)
     if mesh.inertia == "shell":
         return _properties_of_simplices(corners - centre, area, centre)
-    volume = _volumes(corners - centre, mesh.inertia)
+    volume = _tetrahedron_volumes(corners - centre, mesh.inertia)
     if volume.sum() <= 0.0:
         return NO_MASS
     centre = centre + volume @ (corners - centre).sum(axis=1) / 4 / volume.sum()
     # As in MuJoCo, the volumes are computed again about the centre of mass.
     return _properties_of_simplices(
-        corners - centre, _volumes(corners - centre, mesh.inertia), centre, 4
+        corners - centre, _tetrahedron_volumes(corners - centre, mesh.inertia), centre, 4
     )
 
 
-def fitted_shape(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
+def fit_primitive(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
     """Return pose and size of the primitive, such as a box, that MuJoCo fits to a mesh.
 
     Its size follows from the mesh's inertia, or with `by_box` from its bounding box (`fitaabb`).
@@ -129,7 +129,7 @@ def _properties_of_simplices(
     return MassProperties(mass, centre, inertia)
 
 
-def _volumes(corners: _Array, mode: str) -> _Array:
+def _tetrahedron_volumes(corners: _Array, mode: str) -> _Array:
     volume = np.linalg.det(corners) / 6
     return np.abs(volume) if mode == "legacy" else volume
 

@@ -51,7 +51,7 @@ class Mesh:
             if self.file is not None:
                 vertices, faces = read_triangles(self.file)
             else:
-                vertices, faces = check_triangles(_read_inline(self._attributes))
+                vertices, faces = check_triangles(_read_inline_mesh(self._attributes))
             moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
             if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
                 faces = faces[:, ::-1]
@@ -126,7 +126,7 @@ class MeshLibrary:
         return file, ""
 
 
-def _read_inline(attributes: Attributes) -> Triangles:
+def _read_inline_mesh(attributes: Attributes) -> Triangles:
     vertices = np.array(attributes["vertex"].split(), dtype=float).reshape(-1, 3)
     if "face" not in attributes:
         return convex_hull(vertices)

@@ -70,7 +70,7 @@ def repair_mjcf(
     _check_bodies(world, report)
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
-    _state_lost_shapes(reader, report)
+    _report_lost_shapes(reader, report)
     report.raise_faults(path)
     text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
     report.raise_faults(path)
@@ -98,7 +98,7 @@ def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -
 
     def set_masses_below(body: Body, is_moved: bool) -> None:
         is_moved |= id(body) in moving
-        _set_mass(body, reader, factor, mjcf.report, is_moved=is_moved)
+        _set_mass_of_body(body, reader, factor, mjcf.report, is_moved=is_moved)
         if id(body) in moving and body.inertial is NO_MASS and not body.is_auxiliary:
             mjcf.report.state_assumption("no inertia of", body.name)
         for child in body.children:
@@ -108,7 +108,7 @@ def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -
         set_masses_below(body, is_moved=False)
 
 
-def _set_mass(
+def _set_mass_of_body(
     body: Body, reader: BodyReader, factor: float, report: RepairReport, *, is_moved: bool
 ) -> None:
     if body.is_auxiliary:
@@ -134,7 +134,7 @@ def _total_mass_in_file(mjcf: Mjcf) -> float:
     return mass if mass > 0.0 else np.inf
 
 
-def _state_lost_shapes(reader: BodyReader, report: RepairReport) -> None:
+def _report_lost_shapes(reader: BodyReader, report: RepairReport) -> None:
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if takes_part_in_contacts(shape) or not body.geoms:

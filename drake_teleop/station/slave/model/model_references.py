@@ -25,8 +25,8 @@ from drake_teleop.common.texts import read_yaml
 
 # Limits for all files together (repeated includes count again), and bytes of one text file.
 _MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
-_MAX_NAME_LENGTH = 4096
-_MAX_DEPTH = 20  # largest depth of nested includes
+_MAX_PATH_LENGTH = 4096
+_MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
 _BINARY_SUFFIXES = (
     ".obj",
     ".glb",
@@ -57,7 +57,7 @@ class ModelFiles:
     def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
         self._model, self._folder = model, model.resolve().parent
         self._total = 0, 0
-        _check_size(1, model.stat().st_size, model)
+        _check_num_files_and_size(1, model.stat().st_size, model)
         self.packages: dict[str, Path] = {}
         inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
         for folder in (*package_paths, *inner):
@@ -78,7 +78,7 @@ class ModelFiles:
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._bases = {""}
 
-    def share_packages(self, known: PackageMap) -> None:
+    def merge_packages(self, known: PackageMap) -> None:
         """Merge `packages` with Drake's map `known`, without the package that Drake downloads."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
@@ -117,7 +117,7 @@ class ModelFiles:
             self._sizes.clear()
             files, size = self._check_and_measure(path, ())
         self._total = self._total[0] + files, self._total[1] + size
-        _check_size(*self._total, self._model)
+        _check_num_files_and_size(*self._total, self._model)
 
     def _check_and_measure(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
@@ -127,7 +127,7 @@ class ModelFiles:
                 where=where,
                 remedy="move it there, or name its folder: --package-path, slave.package_paths",
             )
-        if real in including or len(including) > _MAX_DEPTH:
+        if real in including or len(including) > _MAX_INCLUDE_DEPTH:
             what = "includes itself" if real in including else "is nested too deeply"
             raise DrakeTeleopError(
                 f"{what} through {path.name}", where=where, remedy="remove this reference"
@@ -140,11 +140,11 @@ class ModelFiles:
                     remedy="correct the path or add the file",
                 )
             files, size = 1, real.stat().st_size
-            _check_size(files, size, path)
+            _check_num_files_and_size(files, size, path)
             for named in list(self._referenced_files(real)):
                 more = self._check_and_measure(named, (*including, real))
                 files, size = files + more[0], size + more[1]
-                _check_size(files, size, path)
+                _check_num_files_and_size(files, size, path)
             self._sizes[real] = files, size
         return self._sizes[real]
 
@@ -154,8 +154,8 @@ class ModelFiles:
             tops.append(Path.cwd())  # Drake resolves nested includes from here
         folders = {top / base for top in tops for base in self._bases}
         try:
-            for address in self._addresses(path):
-                if len(address) > _MAX_NAME_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
+            for address in self._addresses_in_file(path):
+                if len(address) > _MAX_PATH_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
                     what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
@@ -164,7 +164,7 @@ class ModelFiles:
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
-    def _addresses(self, path: Path) -> Iterator[str]:
+    def _addresses_in_file(self, path: Path) -> Iterator[str]:
         kind = path.suffix.lower()
         if path.is_dir():  # Gazebo model folder
             yield from (
@@ -192,7 +192,6 @@ class ModelFiles:
 
 
 def _is_installed_package(folder: Path) -> bool:
-    """Return whether a folder is an installed Python package that does not contain the home."""
     return (
         os.path.isfile(folder / "__init__.py")
         and any(each.is_dir() for each in folder.parent.glob("*.dist-info"))
@@ -208,7 +207,7 @@ def _existing_paths(path: Path | None) -> list[Path]:
         return []
 
 
-def _check_size(files: int, size: int, path: Path) -> None:
+def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
     most = _MAX_BYTES if files > 1 or path.suffix.lower() in _BINARY_SUFFIXES else _MAX_TEXT
     if files > _MAX_FILES or size > most:
         what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
@@ -227,7 +226,7 @@ def read_xml(path: Path) -> Element:
     parser.CharacterDataHandler = builder.data
 
     def reject_entity(name: str | None, *_: object) -> NoReturn:
-        raise ValueError(f"the XML entity {name} is not defined in this file")
+        raise ValueError(f"the entity {name} is not defined in this XML file")
 
     parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = reject_entity
     try:
@@ -235,7 +234,7 @@ def read_xml(path: Path) -> Element:
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: invalid encoding
         remedy = "give a URDF or SDF that other readers of XML take too"
-        raise DrakeTeleopError(f"is not XML: {error}", where=str(path), remedy=remedy) from None
+        raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
 
 
 def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
@@ -275,6 +274,6 @@ def _addresses_in_gltf(path: Path) -> list[str]:
         json.loads(data, object_pairs_hook=keep_addresses)
     except (ValueError, RecursionError) as error:
         raise DrakeTeleopError(
-            f"is not a glTF file: {error}", where=str(path), remedy="export it again"
+            f"is not a glTF file ({error})", where=str(path), remedy="export it again"
         ) from None
     return found

@@ -12,14 +12,14 @@ from drake_teleop.station.slave.model.repair_report import RepairedModel, Repair
 from drake_teleop.station.slave.model.urdf_repair import (
     ModelPurpose,
     finish_repair,
-    repair_scope,
+    repair_links_and_joints,
     repair_urdf,
 )
 
 _MODEL_CONFIG, _URDF, _SDF = "model.config", ".urdf", ".sdf"
 _INCLUDE_URI_PATH = ".//include/uri"
 # Children that Drake reads; it also reads elements with its own prefix.
-_READ_TAGS_OF = {
+_READABLE_CHILD_TAGS = {
     "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
     "link": {"pose", "inertial", "collision", "visual"},
     "collision": {"pose", "geometry", "surface"},
@@ -33,13 +33,13 @@ def repair_sdf(
     """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
-        _keep_one_model(root, file, files, purpose.sensor, report)
+        _keep_model_with_sensor(root, file, files, purpose.sensor, report)
         for element in list(root.iter()):
-            allowed = _READ_TAGS_OF.get(element.tag)
+            allowed = _READABLE_CHILD_TAGS.get(element.tag)
             for child in list(element) if allowed else ():
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
-    repair_scope(root, purpose, report, is_sdf=True)
+    repair_links_and_joints(root, purpose, report, is_sdf=True)
     for model in root.findall("model"):
         model.set("name", model.get("name") or file.stem)
     report.raise_faults(file)
@@ -92,7 +92,7 @@ def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
     return found
 
 
-def _keep_one_model(
+def _keep_model_with_sensor(
     root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
 ) -> None:
     worlds = root.findall("world")
