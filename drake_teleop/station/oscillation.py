@@ -62,10 +62,7 @@ def find_unexplained_oscillation(
 def find_unexplained_pose_oscillation(
     t: Array, command: Array, actual: Array, near: float
 ) -> Flags:
-    """Return (N,) flags: True while position or orientation of the actual pose oscillates alone.
-
-    `command` and `actual` are (N, 7); the rules are those of `find_unexplained_oscillation`.
-    """
+    """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not."""
     turned, wanted = (doubled_quaternions_near(pose, command) for pose in (actual, command))
     swaying = find_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
     return swaying | find_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)

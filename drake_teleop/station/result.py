@@ -166,7 +166,7 @@ class SimulationResult:
         except KeyError:
             names = self._ipython_key_completions_()
             near = difflib.get_close_matches(str(name), names, n=3) or self.signals
-            raise KeyError(f"there is no signal {name!r}, but {', '.join(near)}") from None
+            raise KeyError(f"there is no signal {name!r}; there are {', '.join(near)}") from None
 
     def _find_column(self, name: object) -> tuple[str, int] | None:
         signal = str(name).partition(".")[0]
@@ -197,7 +197,7 @@ class SimulationResult:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
             raise DrakeTeleopError(
-                f"{error.name or 'a library'} is not installed (pandas frames require it)",
+                f"{error.name or 'a library'} is not installed, but pandas frames require it",
                 where="to_pandas",
                 remedy=remedy_to_install_extra("notebook"),
             ) from None

@@ -57,7 +57,7 @@ _MAX_CONTACT_STEP_S = 1.25e-4
 @settings
 @dataclass
 class Rates:
-    """Sampling rates. The paper has sensor 8 kHz, hand above 2 kHz, joint control 10 kHz."""
+    """Sampling rates. Those of the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
 
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
     hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")

@@ -89,10 +89,7 @@ class Box(Surface):
 def AddFixedBox(
     plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
 ) -> None:
-    """Add a box with edges `size` (3,) [m] that is welded to the world.
-
-    In a plant without scene graph it has no shape.
-    """
+    """Weld a box with edges `size` (3,) [m] to the world; its shape requires a scene graph."""
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
     if plant.geometry_source_is_registered():

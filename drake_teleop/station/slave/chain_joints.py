@@ -101,10 +101,7 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
 def check_chain(
     plant: MultibodyPlant, chain: list[JointIndex], dependent: dict[str, str], where: str
 ) -> None:
-    """Raise DrakeTeleopError if a joint of the chain is in `dependent` or has several axes.
-
-    `dependent` contains reasons by joint or link.
-    """
+    """Raise DrakeTeleopError if a joint of the chain has several axes or is in `dependent`."""
     for joint in (plant.get_joint(index) for index in chain):
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
             if name in dependent:

@@ -70,9 +70,9 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 def _all_solutions_into(
     R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array
 ) -> int:
-    """Write all eight solutions to q (8, 6); return the status.
+    """Write all eight solutions to q (8, 6); return the `IkStatus`.
 
-    Out of reach they are nan, or with `clamp` those of the nearest wrist centre in reach.
+    Out of reach they are nan, or with `clamp` those of the nearest reachable wrist centre.
     """
     status = _OK
     x = p[0] - FLANGE_OFFSET_M * R[0, 2]

@@ -41,10 +41,7 @@ _RANGE_TOLERANCE_SHARE = 0.01
 
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
-    """Return the key in `IK_METHODS` for a scenario's setting.
-
-    A DrakeTeleopError is raised if the closed form does not exist for the arm.
-    """
+    """Return the key in `IK_METHODS` for setting `name`; DrakeTeleopError if the arm has none."""
     if name == AUTOMATIC_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):

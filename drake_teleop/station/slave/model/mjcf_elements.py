@@ -64,9 +64,9 @@ class Attributes(dict[str, str]):
         return self.numbers(name, (default,))[0]
 
     def limits(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
-        """Return the range in attribute `name`, or None if it is off.
+        """Return the range in attribute `name`, or None if attribute `flag` switches it off.
 
-        The attribute `flag` switches it on or off, or else `automatic` for a nonzero range.
+        Without `flag`, `automatic` switches a range of nonzero width on.
         """
         lower, upper = self.numbers(name, (0.0, 0.0))
         limited = self.get(flag, "auto")

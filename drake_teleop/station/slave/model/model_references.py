@@ -107,9 +107,9 @@ class ModelFiles:
         return any(path.resolve().is_relative_to(root) for root in roots)
 
     def check(self, path: Path) -> None:
-        """Check a file and the files that it references, except meshes of the model's own links.
+        """Raise DrakeTeleopError if a file references forbidden, missing, or too large files.
 
-        A DrakeTeleopError is raised for forbidden, missing or too large files and cycles.
+        Meshes of the model's own links are not checked.
         """
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
