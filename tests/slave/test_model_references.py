@@ -118,7 +118,7 @@ def test_a_binary_gltf_reads_no_file_outside(folder: Path) -> None:
     head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
     (folder / "x.glb").write_bytes(head + text)
     with pytest.raises(DrakeTeleopError, match=OUTSIDE):
-        ModelFiles(write(folder, a_urdf=urdf("x.glb")), ()).check(folder / "x.glb")
+        ModelFiles(write(folder, a_urdf=urdf("x.glb")), ()).check_file(folder / "x.glb")
 
 
 @pytest.mark.parametrize(

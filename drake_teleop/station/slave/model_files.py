@@ -70,7 +70,7 @@ def read_model(
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
     files.merge_packages(parser.package_map())
-    files.check(path)
+    files.check_file(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
     expected = SCENE_DESCRIPTION if purpose.is_scene else ROBOT_DESCRIPTION

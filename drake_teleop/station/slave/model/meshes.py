@@ -105,7 +105,7 @@ def _mesh_fault(
             " (name their folder: --package-path, slave.package_paths)"
         )
     try:
-        files.check(file)
+        files.check_file(file)
     except DrakeTeleopError as error:
         return str(error)
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns

@@ -140,7 +140,7 @@ class BodyReader:
                     parent.remove(child)
                 elif child.tag == "frame":
                     attributes = Attributes(child.attrib, "frame", self._mjcf.report)
-                    collect_bodies(child, childclass, X_WF @ self._mjcf.pose(attributes))
+                    collect_bodies(child, childclass, X_WF @ self._mjcf.read_pose(attributes))
 
         for element in self._mjcf.root.findall("worldbody"):
             collect_bodies(element, "", RigidTransform())
@@ -157,7 +157,7 @@ class BodyReader:
         """Return the body in `element`, with all bodies on it; X_PF is its frame in the parent."""
         name = element.get("name") or self._make_unused_name("body")
         attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
-        body = Body(name, X_PF @ self._mjcf.pose(attributes))
+        body = Body(name, X_PF @ self._mjcf.read_pose(attributes))
         childclass = element.get("childclass") or childclass
         self._read_children(body, element, childclass, RigidTransform())
         return body
@@ -172,10 +172,10 @@ class BodyReader:
         self, body: Body, element: Element, childclass: str, X_BF: RigidTransform
     ) -> None:
         for child in element:
-            attributes = self._mjcf.attributes(child, childclass, f"{child.tag} of {body.name}")
+            attributes = self._mjcf.attributes_of(child, childclass, f"{child.tag} of {body.name}")
             if child.tag == "frame":
                 inner = child.get("childclass") or childclass
-                self._read_children(body, child, inner, X_BF @ self._mjcf.pose(attributes))
+                self._read_children(body, child, inner, X_BF @ self._mjcf.read_pose(attributes))
             elif child.tag == "body":
                 body.children.append(self.read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
@@ -185,7 +185,7 @@ class BodyReader:
             elif child.tag == "geom":
                 self._add_geom(body, attributes, X_BF)
             elif child.tag == "site":
-                body.sites[child.get("name", "")] = X_BF @ self._mjcf.pose(attributes)
+                body.sites[child.get("name", "")] = X_BF @ self._mjcf.read_pose(attributes)
             elif child.tag == "inertial":
                 body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
             elif child.tag in _GENERATOR_TAGS:
@@ -199,7 +199,7 @@ class BodyReader:
         if np.linalg.norm(axis) < MIN_VECTOR_LENGTH:
             self._mjcf.report.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
-        limits = given.limits("range", "limited", automatic=self._mjcf.autolimits)
+        limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
         if kind == "hinge":
             limits = limits and (
@@ -212,7 +212,7 @@ class BodyReader:
 
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
-        X_FG, size = self._mjcf.pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
+        X_FG, size = self._mjcf.read_pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
         if "fromto" in given and kind in (*_ROUND_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
             X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
@@ -252,9 +252,9 @@ class BodyReader:
         if "fullinertia" in given:
             xx, yy, zz, xy, xz, yz = given.vector("fullinertia", (0.0,) * 6)
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.pose(given))
+        return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.read_pose(given))
 
-    def mass(self, body: Body) -> MassProperties:
+    def mass_properties(self, body: Body) -> MassProperties:
         """Return the body's mass properties from its `inertial` element, or from its shapes."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")

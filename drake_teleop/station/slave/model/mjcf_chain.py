@@ -49,7 +49,7 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     world.generators.clear()
     arm = _split_into_one_joint_bodies(reader.read_body(*carriers[0]))
     if kind == "site":
-        measured = {site for each in mjcf.children("sensor") if (site := _measured_site(each))}
+        measured = {site for each in mjcf.elements_in("sensor") if (site := _measured_site(each))}
         arm = _insert_body_at_site(arm, sensor, is_measured=sensor in measured)
         mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
@@ -94,8 +94,8 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
     """Report couplings between `joints` as faults; report other couplings as left out."""
     report, moving = mjcf.report, {joint.name for joint in joints}
     carriers = _moving_body_of_each_body(arm, {id(body) for body in chain})
-    for element in mjcf.children("equality"):
-        given = mjcf.attributes(element, "", element.tag)
+    for element in mjcf.elements_in("equality"):
+        given = mjcf.attributes_of(element, "", element.tag)
         ends = [given.get(name, "") for name in ("joint1", "joint2")]
         if given.get("active") == "false":
             continue
@@ -106,7 +106,7 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
             report.state_assumption("no effect on the arm of the equality", name)
-    for element in mjcf.children("tendon"):
+    for element in mjcf.elements_in("tendon"):
         for name in (each.get("joint", "") for each in element.iter("joint")):
             if name in moving:
                 report.state_assumption("no tendon, which the model has, of", name)
@@ -119,7 +119,7 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
 
 def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
     """Report all couplings and springs, which Drake does not read from MJCF."""
-    for element in (*mjcf.children("equality"), *mjcf.children("tendon")):
+    for element in (*mjcf.elements_in("equality"), *mjcf.elements_in("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()
             mjcf.report.state_repair("no coupling, which Drake does not read from MJCF, by", name)
@@ -202,8 +202,8 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
     Limits of several actuators add up. The joint's own `actuatorfrcrange` limits their sum.
     """
     by_joint: dict[str, float] = {}
-    for element in mjcf.children("actuator"):
-        given = mjcf.attributes(element, "", f"actuator {element.get('name', '')}")
+    for element in mjcf.elements_in("actuator"):
+        given = mjcf.attributes_of(element, "", f"actuator {element.get('name', '')}")
         name = given.get("joint") or given.get("jointinparent")
         if name:
             by_joint[name] = by_joint.get(name, 0.0) + _effort_limit_of_actuator(
@@ -211,7 +211,7 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
             )
     limits = {}
     for joint in joints:
-        own = joint.attributes.limits(
+        own = joint.attributes.read_range(
             "actuatorfrcrange", "actuatorfrclimited", automatic=mjcf.autolimits
         )
         limit = min(by_joint.get(joint.name, float("inf")), _effort_in_both_directions(own))
@@ -223,10 +223,10 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
 def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
     gear = abs(given.numbers("gear", (1.0,))[0])
     force = _effort_in_both_directions(
-        given.limits("forcerange", "forcelimited", automatic=mjcf.autolimits)
+        given.read_range("forcerange", "forcelimited", automatic=mjcf.autolimits)
     )
     if (gain := _force_per_control(given, tag)) > 0.0:
-        control = given.limits("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
+        control = given.read_range("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
         force = min(force, gain * _effort_in_both_directions(control))
     return gear * force
 

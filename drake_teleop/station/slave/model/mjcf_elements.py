@@ -63,7 +63,7 @@ class Attributes(dict[str, str]):
     def number(self, name: str, default: float) -> float:
         return self.numbers(name, (default,))[0]
 
-    def limits(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
+    def read_range(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
         """Return the range in attribute `name`, or None if attribute `flag` switches it off.
 
         Without `flag`, `automatic` switches a range of nonzero width on.
@@ -97,13 +97,13 @@ class Mjcf:
         for element in self.root.findall("default"):
             self._read_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
-    def file(self, element: Element, name: str, folder: str) -> Path | None:
+    def find_file(self, element: Element, name: str, folder: str) -> Path | None:
         """Return the file `name` in `folder`, beside the main or else the included MJCF file."""
         places = [self.path.resolve().parent, self._folders.get(element)]
         found = (self.files.find_file(name, place / folder) for place in places if place)
         return next((file for file in found if file is not None and not file.is_dir()), None)
 
-    def children(self, section: str) -> Iterator[Element]:
+    def elements_in(self, section: str) -> Iterator[Element]:
         """Yield the elements in all sections of this name, such as two `asset` sections."""
         for element in self.root.findall(section):
             yield from element
@@ -112,7 +112,7 @@ class Mjcf:
         degrees = self.compiler.get("angle", "degree") == "degree"
         return math.radians(value) if degrees else value
 
-    def attributes(self, element: Element, childclass: str, label: str) -> Attributes:
+    def attributes_of(self, element: Element, childclass: str, label: str) -> Attributes:
         """Return the attributes of an element, with defaults of its class or else `childclass`."""
         name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
@@ -122,7 +122,7 @@ class Mjcf:
         defaults = self._defaults[name].get(kind, {})
         return Attributes(_merge_defaults(defaults, element.attrib), label, self.report)
 
-    def pose(self, attributes: Attributes) -> RigidTransform:
+    def read_pose(self, attributes: Attributes) -> RigidTransform:
         """Return the pose of an element in its parent, from `pos` and its orientation."""
         return RigidTransform(
             self._rotation_of_element(attributes), attributes.vector("pos", (0.0,) * 3)
@@ -170,7 +170,7 @@ class Mjcf:
                 content.append(child)
                 continue
             name = child.get("file", "")
-            file = self.file(child, name, "")
+            file = self.find_file(child, name, "")
             if file is None:
                 self.report.add_fault(f"the included file {name!r} was not found")
             elif file.resolve() in included:

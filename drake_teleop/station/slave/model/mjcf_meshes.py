@@ -36,7 +36,7 @@ class Mesh:
         self._scale = attributes.vector("scale", (1.0, 1.0, 1.0))
         reference = {"pos": attributes.get("refpos", "0 0 0")}
         reference["quat"] = attributes.get("refquat", "1 0 0 0")
-        self._X_FM = mjcf.pose(Attributes(reference, attributes.label, mjcf.report))
+        self._X_FM = mjcf.read_pose(Attributes(reference, attributes.label, mjcf.report))
         self._triangles: Triangles | None = None
 
     @property
@@ -82,9 +82,9 @@ class MeshLibrary:
         self._mjcf = mjcf
         self._meshes: dict[str, Mesh | str] = {}
         self.inaccessible: list[str] = []  # faults of files that may not be read
-        for element in mjcf.children("asset"):
+        for element in mjcf.elements_in("asset"):
             label = f"{element.tag} {element.get('name') or element.get('file', '')}"
-            attributes = mjcf.attributes(element, "", label)
+            attributes = mjcf.attributes_of(element, "", label)
             file, fault = self._load_mesh(element, attributes)
             if element.tag == "mesh":
                 mesh = Mesh(mjcf, attributes, file)
@@ -110,12 +110,12 @@ class MeshLibrary:
             name = re.split(r"[/\\]", name)[-1]
         own = "meshdir" if element.tag == "mesh" else "texturedir"
         folder = compiler.get(own, compiler.get("assetdir", ""))
-        file = self._mjcf.file(element, name, folder)
+        file = self._mjcf.find_file(element, name, folder)
         if file is None:
             return None, _NOT_FOUND_FAULT
         if self._mjcf.files.may_read(file):
             try:
-                self._mjcf.files.check(file)
+                self._mjcf.files.check_file(file)
             except DrakeTeleopError as error:
                 self.inaccessible.append(str(error))
                 return None, str(error)

@@ -113,7 +113,7 @@ def _set_mass_of_body(
 ) -> None:
     if body.is_auxiliary:
         return
-    properties = reader.mass(body)
+    properties = reader.mass_properties(body)
     if properties.mass <= 0.0:
         if is_moved and properties.inertia.any():
             report.state_repair("an inertia without a mass left out of", body.name)
@@ -130,7 +130,8 @@ def _set_mass_of_body(
 
 def _total_mass_in_file(mjcf: Mjcf) -> float:
     reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
-    mass = sum(reader.mass(body).mass for body in reader.read_world().with_descendants()[1:])
+    bodies = reader.read_world().with_descendants()[1:]
+    mass = sum(reader.mass_properties(body).mass for body in bodies)
     return mass if mass > 0.0 else np.inf
 
 

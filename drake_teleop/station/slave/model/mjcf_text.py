@@ -30,9 +30,9 @@ class MjcfText:
         self._meshes: dict[tuple[int, bool], str] = {}
         self._colours = {
             element.get("name", ""): rgba
-            for element in mjcf.children("asset")
+            for element in mjcf.elements_in("asset")
             if element.tag == "material"
-            and (rgba := mjcf.attributes(element, "", "material").get("rgba"))
+            and (rgba := mjcf.attributes_of(element, "", "material").get("rgba"))
         }
 
     def write(self, world: Body, moving: list[Joint]) -> str:
@@ -41,7 +41,7 @@ class MjcfText:
         self._write_content(top, world)
         names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
-        for each in self._mjcf.children("contact"):
+        for each in self._mjcf.elements_in("contact"):
             ends = {name: each.get(name, "") for name in ("body1", "body2")}
             if each.tag == "exclude" and names.issuperset(ends.values()):
                 SubElement(contact, "exclude", ends)

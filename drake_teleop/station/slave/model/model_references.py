@@ -106,7 +106,7 @@ class ModelFiles:
         roots = (*self._roots, *self.packages.values())
         return any(path.resolve().is_relative_to(root) for root in roots)
 
-    def check(self, path: Path) -> None:
+    def check_file(self, path: Path) -> None:
         """Raise DrakeTeleopError if a file references forbidden, missing, or too large files.
 
         Meshes of the model's own links are not checked.
