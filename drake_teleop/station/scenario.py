@@ -328,7 +328,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         scenario.is_direct and scenario.contact_detection is None
     ):
         raise DrakeTeleopError(
-            "a leader that commands joints requires a direct channel (others transmit poses)",
+            "a leader that commands joints requires a direct channel (a network transmits poses)",
             where=f"{where}:master.leader.leads",
             remedy="set it to pose, or remove network, passivity and contact_detection",
         )

@@ -475,7 +475,7 @@ def _joint(parent, child):
 @pytest.mark.parametrize(
     ("ends", "expected"),
     [
-        (("ab", "bc", "ca"), "a circle through b"),
+        (("ab", "bc", "ca"), "a loop through b"),
         (("ab", "cb"), "b is the child of two joints, ab and cb"),
     ],
 )

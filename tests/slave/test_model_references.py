@@ -277,7 +277,7 @@ INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
             }
             | {"m12_sdf": sdf(LINK)}
         ),
-        "needs more than 2000 files",
+        "exceeds the limit of 2000 files",
     ),
     "a long way": (
         lambda _: (
@@ -333,9 +333,9 @@ def test_file_in_working_folder_is_outside_model(
 def test_too_large_files_are_rejected(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=gltf())
     monkeypatch.setattr(model_references, "_MAX_TEXT", 400)
-    assert any("needs more than" in words for words in parse(path).assumptions)
+    assert any("exceeds the limit" in words for words in parse(path).assumptions)
     monkeypatch.setattr(model_references, "_MAX_TEXT", 100)
-    with pytest.raises(DrakeTeleopError, match=r"a\.urdf: needs more than"):
+    with pytest.raises(DrakeTeleopError, match=r"a\.urdf: exceeds the limit of"):
         parse(path)
 
 

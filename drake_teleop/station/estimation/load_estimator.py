@@ -24,7 +24,7 @@ from drake_teleop.load.online.watched import (
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
 # Samples between two checks for settling.
-_SAMPLES_PER_CHECK = 16
+_SAMPLES_PER_SETTLING_CHECK = 16
 
 
 @settings
@@ -162,7 +162,7 @@ class LoadEstimator(LeafSystem):
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
         # The check for settling takes longer than the update.
-        due = self._watches and round(time / self._period) % _SAMPLES_PER_CHECK == 0
+        due = self._watches and round(time / self._period) % _SAMPLES_PER_SETTLING_CHECK == 0
         if due and self._estimator.is_settled_at(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))

@@ -148,7 +148,7 @@ def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> fl
 
 
 @njit(cache=True)
-def _nearest_branch(
+def _nearest_branch_into(
     R: Array, p: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
     if not np.isfinite(reference.sum()):
@@ -192,7 +192,7 @@ def solve_pose_command(
     R[0, 0], R[0, 1], R[0, 2] = 1 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
     R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
     R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
-    return _nearest_branch(R, pose[4:7], reference, lower, upper, max_step, q)
+    return _nearest_branch_into(R, pose[4:7], reference, lower, upper, max_step, q)
 
 
 def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
@@ -222,7 +222,7 @@ def nearest_branch(
     q = np.empty(6)
     # Drake's matrices are stored by columns; one layout avoids a second compilation.
     R = np.ascontiguousarray(R_WS)
-    status = _nearest_branch(R, p_WS, q_reference, lower, upper, max_step, q)
+    status = _nearest_branch_into(R, p_WS, q_reference, lower, upper, max_step, q)
     return q, IkStatus(status)
 
 

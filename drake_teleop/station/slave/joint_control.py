@@ -79,7 +79,7 @@ class JointControlConfig:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE_NAME and self.interface is not None:
             raise DrakeTeleopError(
-                "the servo computed_torque has no position interface",
+                "the servo computed_torque has bandwidths, but no position interface",
                 where=f"{where}.interface",
                 remedy="leave it out, or choose another servo, such as position",
             )

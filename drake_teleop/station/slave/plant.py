@@ -125,7 +125,7 @@ def start_pose(slave: Slave) -> NDArray[np.float64]:
 
 def NominalSlave(slave: Slave) -> SlavePlant:
     written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _nominal_slave(HashableByValue(slave), written)
+    return _cached_nominal_slave(HashableByValue(slave), written)
 
 
 class HashableByValue:
@@ -142,7 +142,7 @@ class HashableByValue:
 
 
 @lru_cache(maxsize=4)  # parsing takes longer than building a station
-def _nominal_slave(key: HashableByValue, _: tuple[int, ...]) -> SlavePlant:
+def _cached_nominal_slave(key: HashableByValue, _: tuple[int, ...]) -> SlavePlant:
     return AddSlavePlant(DiagramBuilder(), key.value, None)
 
 

@@ -52,7 +52,8 @@ class PositionInterface:
         periods = rate / self.command_hz
         if periods < 1.0 or abs(periods - round(periods)) > 1e-6 * periods:
             raise DrakeTeleopError(
-                f"rates.joint_control_hz, {rate:g} Hz, is no multiple of {self.command_hz:g} Hz",
+                f"rates.joint_control_hz, {rate:g} Hz, is no multiple of command_hz,"
+                f" {self.command_hz:g} Hz",
                 where=f"{where}.command_hz",
                 remedy="choose a rate of the joint control that is a multiple of it",
             )

@@ -238,11 +238,11 @@ def start_overlaps(
     """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
     written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _start_overlaps(HashableByValue((slave, parts)), written)
+    return _cached_start_overlaps(HashableByValue((slave, parts)), written)
 
 
 @lru_cache(maxsize=4)
-def _start_overlaps(
+def _cached_start_overlaps(
     key: HashableByValue, _: tuple[int, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value

@@ -142,7 +142,7 @@ def MakeToolContactModel(
         return contact._replace(beyond=str(error))
     known, watched, unknown = found
     if not len(known):
-        return contact._replace(beyond=unknown or "nothing has a shape")
+        return contact._replace(beyond=unknown or "no shapes can touch")
     size = plant.num_multibody_states() if len(joints) else 0
     return contact._replace(pairs=known, watched=watched, joints=joints, plant_size=size)
 
@@ -171,9 +171,9 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactM
 
 def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:
     if environment.hydroelastic:
-        return "contacts have areas"
+        return "contact is hydroelastic"
     if contact.sheet is not None and len(environment.parts) > 1:
-        return "the leaf is not alone"
+        return "the sheet spring is not the only object"
     return ""
 
 

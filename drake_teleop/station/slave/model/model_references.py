@@ -212,7 +212,7 @@ def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
     if files > _MAX_FILES or size > most:
         what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
         raise DrakeTeleopError(
-            f"needs more than {what}, the limit", where=str(path), remedy="remove or simplify parts"
+            f"exceeds the limit of {what}", where=str(path), remedy="remove or simplify parts"
         )
 
 
