@@ -15,7 +15,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import ArmModel
 from drake_teleop.station.slave.plant import NominalSlave, ParsedSlave, ParseSlave, finalize_plant
-from drake_teleop.station.slave.posture_shapes import sampled_range
+from drake_teleop.station.slave.posture_shapes import joint_sampling_range
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 #: Overlaps below this depth are rounding of hulls [m].
@@ -83,7 +83,7 @@ def _overlaps(
     at_start, positions = depths(), plant.GetPositions(context)
     random, counts = np.random.default_rng(5), Counter[frozenset[BodyIndex]]()
     motions = {pair: list[np.ndarray]() for pair in at_start}
-    for q in random.uniform(*sampled_range(arm), (_NUM_POSTURES, arm.num_joints)):
+    for q in random.uniform(*joint_sampling_range(arm), (_NUM_POSTURES, arm.num_joints)):
         posture = positions.copy()
         posture[arm.position_index] = q
         plant.SetPositions(context, posture)

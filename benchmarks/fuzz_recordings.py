@@ -122,7 +122,7 @@ def new(path: Path) -> None:
                 raise AssertionError("something is left") from None
             raise
         slave = LoadScenario(station / "station.yaml").slave
-        read = slave.path, slave.packages, slave.sensor_frame
+        read = slave.path, slave.package_folders, slave.sensor_frame
         if read != (model.resolve(), (packages.resolve(),), frame):
             raise AssertionError(f"is read as {read!r}")
 

@@ -43,7 +43,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
-from drake_teleop.station.slave.home import R_WS_HOME, home_position
+from drake_teleop.station.slave.home import R_WS_HOME, home_posture
 from drake_teleop.station.slave.inverse_kinematics import nearest_branch
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -63,7 +63,7 @@ def motion(arm: Any, frequency: float, amplitude: float) -> tuple[Array, Array, 
     coarse = np.arange(0.0, SECONDS + 0.02, min(4e-3, 0.02 / frequency))
     x = np.clip(coarse / 0.6, 0.0, 1.0)
     swing = x**3 * (10 - 15 * x + 6 * x**2) * np.sin(2 * np.pi * frequency * coarse)
-    path, q = [], home_position(arm, list(START))
+    path, q = [], home_posture(arm, list(START))
     for z in START[2] + amplitude * swing:
         place = np.array([START[0], START[1], z])
         q, _ = nearest_branch(R_WS_HOME.matrix(), place, q, arm.lower, arm.upper)
@@ -100,7 +100,7 @@ def turning(arm: Any, seed: int) -> tuple[Array, Array, Array]:
     random, n = np.random.default_rng(seed), arm.num_joints
     w, phase = 2 * np.pi * random.uniform(0.5, 3.0, (4, n)), random.uniform(0, 2 * np.pi, (4, n))
     angle = w * (np.arange(round(7.0 / T)) * T)[:, None, None] + phase
-    q = home_position(arm, list(START)) + np.sum(2.0 / w**2 * np.sin(angle), axis=1)
+    q = home_posture(arm, list(START)) + np.sum(2.0 / w**2 * np.sin(angle), axis=1)
     return q, np.sum(2.0 / w * np.cos(angle), axis=1), -np.sum(2.0 * np.sin(angle), axis=1)
 
 

@@ -221,7 +221,7 @@ def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
             assert len(str(error).splitlines()) == 1 and not station.parent.exists()
             continue
         slave = LoadScenario(station / "station.yaml").slave
-        read = [slave.path, *slave.packages, slave.tool.path]
+        read = [slave.path, *slave.package_folders, slave.tool.path]
         assert read == [path.resolve() for path in (arm, folder, ARM.parent, tool)]
         assert slave.sensor_frame == name and len(list(station.iterdir())) == 1
         equal += 1

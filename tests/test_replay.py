@@ -171,7 +171,7 @@ def test_all_logs_of_a_folder_are_replayed(tmp_path, scenario, result, monkeypat
     summary = replay_command(tmp_path, tmp_path / "out", quiet=True)
     films = [tmp_path / "out" / "a.html", tmp_path / "out" / "b.html"]
     assert [entry["film"] for entry in summary["films"]] == [str(film) for film in films]
-    with pytest.raises(DrakeTeleopError, match="has no scenario beside it; give --sc"):
+    with pytest.raises(DrakeTeleopError, match="has no scenario file beside it; give --sc"):
         replay_command(tmp_path / "logs" / "without_scenario.parquet", tmp_path / "out")
 
 

@@ -185,10 +185,19 @@ class Silent(LeafSystem):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"master": ({"wrench_command": 6}, {})}, "master_side: there is no output port 'pose_c"),
-        ({"master": ({}, {"pose_command": 7})}, "master_side: there is no input port 'wrench_c"),
+        (
+            {"master": ({"wrench_command": 6}, {})},
+            "master_side: the block has no output port 'pose_c",
+        ),
+        (
+            {"master": ({}, {"pose_command": 7})},
+            "master_side: the block has no input port 'wrench_c",
+        ),
         ({"master": ({"wrench_command": 6}, {"pose_command": 6})}, "'pose_command' has 6 .* 7"),
-        ({"slave": ({"pose_command": 7}, {})}, "slave_side: there is no output port 'wrench_B'"),
+        (
+            {"slave": ({"pose_command": 7}, {})},
+            "slave_side: the block has no output port 'wrench_B'",
+        ),
         ({"slave": ({"pose_command": 7}, {"wrench_B": 3})}, "'wrench_B' has 3 numbers.* 6"),
     ],
 )
@@ -201,7 +210,9 @@ def test_side_without_required_port_gives_one_error(options, message):
 def test_network_requires_more_ports_of_a_custom_slave():
     scenario = replace(Scenario(), channel=Channel(delay=0.01))
     slave = Silent({"pose_command": 7}, {"wrench_B": 6})
-    with pytest.raises(DrakeTeleopError, match="slave_side: there is no output port 'pose_slave'"):
+    with pytest.raises(
+        DrakeTeleopError, match="slave_side: the block has no output port 'pose_slave'"
+    ):
         MakeTeleopStation(scenario, slave=slave)
     whole = Silent({"pose_command": 7}, {"wrench_B": 6, "pose_slave": 7, "saturated": 1})
     assert "pose_received" in simulate(MakeTeleopStation(scenario, slave=whole), SHORT)
@@ -278,8 +289,11 @@ def test_a_torque_that_is_no_number_keeps_the_arm_where_it_is():
     ("controller", "says"),
     [
         ("impedance", "controller: expected System, found 'impedance'; make a Drake system"),
-        (Silent({"wrench_B": 6}, {}), "controller: there is no input port 'pose_command'"),
-        (Silent({"pose_command": 7}, {}), "controller: there is no output port 'joint_torque'"),
+        (Silent({"wrench_B": 6}, {}), "controller: the block has no input port 'pose_command'"),
+        (
+            Silent({"pose_command": 7}, {}),
+            "controller: the block has no output port 'joint_torque'",
+        ),
         (Follower("joint_torque", 5), "its output port 'joint_torque' has 5 numbers"),
     ],
 )
@@ -298,7 +312,9 @@ def test_a_custom_channel_takes_the_place_of_the_scenarios():
     )
     own, expected = (simulate(station, scenario.simulation) for station in stations)
     np.testing.assert_array_equal(own["pose_received"], expected["pose_received"])
-    with pytest.raises(DrakeTeleopError, match="channel: there is no input port 'pose_command'"):
+    with pytest.raises(
+        DrakeTeleopError, match="channel: the block has no input port 'pose_command'"
+    ):
         MakeTeleopStation(scenario, channel=Silent({}, {}))
 
 

@@ -436,12 +436,12 @@ def trajectory_of_joint_5(slave, amplitude: float) -> FourierTrajectory:
 
 
 def test_elimination_without_load_estimate_is_rejected():
-    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .*no load estimate; "):
+    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .*estimate, but there is none; "):
         MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0))
     MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0, load_estimator__enabled=True))
     MakeTeleopStation(Scenario())
     seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
-    with pytest.raises(DrakeTeleopError, match=r"contact detection needs a load estimate"):
+    with pytest.raises(DrakeTeleopError, match=r"contact detection requires a load estimate"):
         MakeTeleopStation(seen)
 
 

@@ -23,7 +23,7 @@ from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Rea
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.signals import SIGNALS
-from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.slave.home import home_posture
 from drake_teleop.station.task_measures import task_failure, task_measures
 
 T = np.arange(0.0, 4.0 + 1e-9, 1e-3)
@@ -33,7 +33,7 @@ SETTLE = 0.25
 
 @functools.cache  # what it compiles is not for each worker to compile while it collects
 def home():
-    return home_position(slave_arm(Scenario()), Scenario().slave.position)
+    return home_posture(slave_arm(Scenario()), Scenario().slave.position)
 
 
 def measures(task, **log):

@@ -166,7 +166,7 @@ class _Station:
         name = "pose_command" if other.scenario.is_direct else "pose_received"
         command = other.signal_value(name)
         scaling, context = self.block_and_context("kinematic_scaling")
-        scaling.Open(context, command)
+        scaling.OpenClutch(context, command)
         if not self.scenario.is_direct:
             channel, context = self.block_and_context("channel")
             side = self.station.GetSubsystemByName("slave_side")
@@ -240,7 +240,7 @@ class Session:
             self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:
             self._on_disk.write_and_clear()
-            self._on_disk.continue_with(station.simulator)
+            self._on_disk.switch_simulator(station.simulator)
         else:
             self._earlier_rows.append(self._recorded_signals())
         station.simulator.Initialize(InitializeParams(suppress_initialization_events=True))

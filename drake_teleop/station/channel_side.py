@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
-    """Build the channel of a scenario: wires only for an ideal network without a method.
+    """Build a scenario's channel; without network and passivity method it has only wires.
 
     .. pydrake_system::
 
@@ -39,8 +39,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         output_ports:
         - pose_to_slave: (7,) X_WS, setpoint of the slave
         - wrench_to_master: (6,) F_E_B, wrench to render [N, N m]
-        - contact_at_hand: signal for the log (with contact detection)
-        - pose_received, ports: signals for the log (not for wires)
+        - contact_at_hand: contact flag at the master (with contact detection)
+        - pose_received, ports: `station.signals` for the log (not for wires)
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
@@ -61,7 +61,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
             _limit_method_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
-            _contact_scale(scenario),
+            _scale_of_contact_force(scenario),
             start_pose(scenario.slave),
             1 / scenario.rates.hand_hz,
             scenario.simulation.seed,
@@ -94,9 +94,9 @@ def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> P
 
 
 def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
-    """Return the scenario's passivity method, with mass and servo of the arm if it needs them.
+    """Return the settings of the passivity method, with mass and servo of the arm if required.
 
-    A DrakeTeleopError is raised if the arm has fewer than six joints (unbounded mass).
+    Then a DrakeTeleopError is raised for an arm with fewer than six joints (unbounded mass).
     """
     passivity = scenario.passivity
     if not METHODS[passivity.method].needs_arm_mass or passivity.slave_mass is not None:
@@ -104,7 +104,8 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"the mass of an arm with {slave.arm.num_joints} joints is unbounded in a direction",
+            f"the method requires an arm with 6 or more joints, not {slave.arm.num_joints} (its"
+            " mass is unbounded in directions in which it cannot move)",
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
@@ -120,10 +121,9 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def power_scale_of_scenario(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
+    return _scale_of_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
-def _contact_scale(scenario: Scenario) -> float:
-    """Return force scale times gamma, where a gamma of 0 (no displayed contact) counts as 1."""
+def _scale_of_contact_force(scenario: Scenario) -> float:
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

@@ -15,9 +15,9 @@ Array = NDArray[np.float64]
 # A touch begins where the force exceeds this share of the largest force within the time around it.
 _TOUCH_FORCE_SHARE, _FORCE_WINDOW_S = 0.1, 0.1
 # Smallest time between two touches [s]; closer ones are bounces of one touch-down.
-_MIN_INTERVAL_S = 0.005
+_MIN_TOUCH_INTERVAL_S = 0.005
 # Largest time between two touches of a series [s]: 5 Hz.
-_MAX_INTERVAL_S = 0.2
+_MAX_TOUCH_INTERVAL_S = 0.2
 # Smallest number of touches, duration [s] and force [N] of a series.
 _MIN_TOUCHES, _MIN_DURATION_S, _MIN_FORCE_N = 8, 0.3, 0.5
 # Largest time between a touch and the reversal of the command that explains it [s].
@@ -35,9 +35,9 @@ class Chatter(NamedTuple):
 
 
 def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
-    """Return each series of touches that no reversal of the command explains.
+    """Return each long series of touches, without touches explained by reversals of the command.
 
-    It has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
+    A series has 8 or more touches, at most 0.2 s apart, and lasts 0.3 s or longer.
 
     Args:
         t: (N,) evenly spaced times [s].
@@ -46,7 +46,7 @@ def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
     """
     touches = remove_explained_times(_find_touches(t, force), reversals, _MAX_TIME_TO_REVERSAL_S)
     found = []
-    for series in split_at_gaps(touches, _MAX_INTERVAL_S):
+    for series in split_at_gaps(touches, _MAX_TOUCH_INTERVAL_S):
         if len(series) < _MIN_TOUCHES or series[-1] - series[0] < _MIN_DURATION_S:
             continue
         start, stop = float(series[0]), float(series[-1])
@@ -63,4 +63,4 @@ def _find_touches(t: Array, force: Array) -> Array:
     rows = 2 * round(_FORCE_WINDOW_S / (t[1] - t[0])) + 1
     least = _TOUCH_FORCE_SHARE * maximum_filter1d(force, rows)[1:]
     starts = t[1:][(force[1:] > least) & (force[:-1] <= least)]
-    return starts[np.diff(starts, prepend=-np.inf) >= _MIN_INTERVAL_S]
+    return starts[np.diff(starts, prepend=-np.inf) >= _MIN_TOUCH_INTERVAL_S]

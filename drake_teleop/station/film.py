@@ -34,38 +34,38 @@ ShowFrame = Callable[[float, int], None]
 FRAMES_PER_SECOND = 50
 # A longer replay has a lower frame rate; a frame takes 3 kB and the browser interpolates.
 _MAX_FRAMES = 2000
-_MIN_DURATION_S = 6.0  # shortest replay with the default speed [s]
+_MIN_REPLAY_DURATION_S = 6.0  # shortest replay with the default speed [s]
 _SLOW_MOTION_FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # slow-motion factors of the player
 
 _SHAFT_RADIUS_M, _HEAD_LENGTH_M = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
 _ARROW_M_PER_N = 0.003
-_DEFAULT_COLOUR = Rgba(0.9, 0.9, 0.9)  # Drake's own default
-_R_FLIPPED = RotationMatrix.MakeXRotation(np.pi)
+_DEFAULT_SHAPE_COLOUR = Rgba(0.9, 0.9, 0.9)  # Drake's own default
+_HALF_TURN_ABOUT_X = RotationMatrix.MakeXRotation(np.pi)
 # Meshcat's page has no viewport: a telephone would use a width of 980 pixels.
-_POLICY_TAG = '<meta http-equiv="Content-Security-Policy" content="{}">'
-_TITLE_TAG = (
+_SECURITY_POLICY_TAG = '<meta http-equiv="Content-Security-Policy" content="{}">'
+_PAGE_TITLE_TAG = (
     '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
 )
 
 
 class Canvas(Protocol):
-    """Receiver of poses and properties: Meshcat or an object with the same methods."""
+    """Interface for 3D objects with poses and properties: Meshcat or a substitute."""
 
     def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
-        """Set the pose of the object at `path`, at a time of the recording [s]."""
+        """Set the pose of the object at scene `path`, for a time of the recording [s]."""
 
     def SetProperty(self, path: str, property: str, value: Any, time: float) -> None:
-        """Set a property, such as "scale", at a time of the recording [s]."""
+        """Set a property of an object, such as "scale", for a time of the recording [s]."""
 
 
 @dataclass(frozen=True)
 class DisplayedNumber:
-    """Number displayed beside the replay.
+    """Number over time that the page of a replay displays.
 
     Args:
         values: (F,) one value per frame; NaN where the number does not exist.
-        colour: colour of the curve, "#rrggbb"; "" for no curve. All curves share one scale.
-        arrow: True if arrows of this colour represent the number.
+        colour: colour of its curve, "#rrggbb"; "" for no curve. All curves share one scale.
+        arrow: True if the scene shows arrows of this colour for it.
     """
 
     name: str
@@ -88,14 +88,14 @@ class DisplayedNumber:
 
 @dataclass(frozen=True)
 class ReplayFile:
-    """Contents of a 3D replay, except the scene.
+    """Contents of the page of a 3D replay, without the 3D scene.
 
     Args:
         times: (F,) times of the frames, evenly spaced, at least two [s].
-        slow_motion: initial speed: seconds of replay per second of `times`.
-        readings: numbers beside the replay.
-        shaded: intervals of `times` that the curves mark.
-        clock, curves: labels; in that of the curves "{top}" is replaced by the largest value.
+        slow_motion: initial factor: seconds of replay per second of `times`.
+        readings: numbers that the page displays.
+        shaded: time spans (start, stop) that are shaded behind the curves.
+        clock, curves: labels; "{top}" in `curves` is replaced by the largest value.
     """
 
     title: str
@@ -158,21 +158,21 @@ class ReplayFile:
         }
         player = render_page("drake_teleop.common", "player.html.j2", film=film)
         head, body, tail = page.rpartition("</body>")
-        whole = head.replace("<title>Drake MeshCat<", _TITLE_TAG, 1) + player + body + tail
+        whole = head.replace("<title>Drake MeshCat<", _PAGE_TITLE_TAG, 1) + player + body + tail
         return whole.replace(
-            "<title>", _POLICY_TAG.format(content_security_policy(whole)) + "<title>", 1
+            "<title>", _SECURITY_POLICY_TAG.format(content_security_policy(whole)) + "<title>", 1
         )
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times (F,) of a replay's frames [s], and its slow motion (replay per real second).
+    """Return times (F,) of a replay's frames [s], and the seconds of replay per real second.
 
-    By default the replay lasts at least 6 s.
+    By default this factor makes the replay last at least 6 s.
     """
     span = stop - start
     if slow_motion is None:
         slow_motion = next(
-            (s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_DURATION_S),
+            (s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_REPLAY_DURATION_S),
             _SLOW_MOTION_FACTORS[-1],
         )
     frames = min(math.ceil(span * slow_motion * FRAMES_PER_SECOND - 1e-6), _MAX_FRAMES)
@@ -191,9 +191,9 @@ def add_shapes(
     path: str,
     inspector: SceneGraphInspector,
     shapes: Iterable[GeometryId],
-    colour: Rgba = _DEFAULT_COLOUR,
+    colour: Rgba = _DEFAULT_SHAPE_COLOUR,
 ) -> None:
-    """Add a body's shapes to Meshcat below `path`, in the model's colours or else in `colour`."""
+    """Add a body's shapes to Meshcat below `path`; `colour` is for shapes without their own."""
     for shape in shapes:
         seen = inspector.GetIllustrationProperties(shape)
         own = colour if seen is None else seen.GetPropertyOrDefault("phong", "diffuse", colour)
@@ -225,7 +225,7 @@ class ForceArrow:
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
         R = along.matrix()
         middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD_LENGTH_M) * R[:, 2]
-        back = along @ _R_FLIPPED
+        back = along @ _HALF_TURN_ABOUT_X
         put = canvas.SetTransform
         put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
         put(f"{self._path}/head", RigidTransform(back, tip), film_time)

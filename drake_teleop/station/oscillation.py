@@ -1,4 +1,4 @@
-"""Oscillations that the command does not explain: reversals of signals, and series of events."""
+"""Detection of oscillations in recorded signals that the commanded motion does not explain."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 
 
 def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
-    """Return indices of local extremes of x (N,) that differ by more than `swing` from the last."""
+    """Return indices of maxima and minima of x (N,); successive ones differ by > `swing`."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
@@ -40,10 +40,10 @@ def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
 def find_unexplained_oscillation(
     t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_WINDOW_S
 ) -> Flags:
-    """Return (N,) booleans: True while the actual motion oscillates and the command does not.
+    """Return (N,) flags: True while the actual motion oscillates and the command does not.
 
     An oscillation has at least four reversals larger than `swing`, each within 0.5 s of the
-    previous one. A reversal of the command explains one of the motion within `near` [s].
+    previous one. A reversal of the command excludes one of the motion within `near` [s].
 
     Args:
         t: (N,) times [s].
@@ -62,30 +62,30 @@ def find_unexplained_oscillation(
 def find_unexplained_pose_oscillation(
     t: Array, command: Array, actual: Array, near: float
 ) -> Flags:
-    """Return (N,) booleans as `oscillates`, of position or orientation, for poses (N, 7)."""
+    """Return (N,) flags: True while the actual pose (N, 7) oscillates and the command does not."""
     turned, wanted = (doubled_quaternions_near(pose, command) for pose in (actual, command))
     swaying = find_unexplained_oscillation(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
     return swaying | find_unexplained_oscillation(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
 
 
 def pose_reversals(t: Array, pose: Array) -> Array:
-    """Return the sorted times [s] at which a component of the pose (N, 7) reverses."""
+    """Return the sorted times [s] at which a component of the pose (N, 7) reverses its motion."""
     rows = [find_reversals(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
     rows += [find_reversals(x, _MIN_AMPLITUDE_RAD) for x in doubled_quaternions_near(pose, pose).T]
     return np.sort(t[np.concatenate(rows)])
 
 
 def doubled_quaternions_near(pose: Array, reference: Array) -> Array:
-    """Return (N, 4) twice the quaternions of poses (N, 7): small changes equal the rotation [rad].
+    """Return twice the quaternions (N, 4) of poses (N, 7); small differences are angles [rad].
 
-    The quaternions take the sign of the first one of `reference`.
+    Each quaternion has the sign that is nearer to the first one of `reference` (N, 7).
     """
     q: Array = pose[:, :4]
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
 
 
 def remove_explained_times(times: Array, causes: Array, near: float) -> Array:
-    """Return event times [s] without the nearest one to each cause within `near` [s]."""
+    """Remove, for each cause, the nearest event within `near` [s]; return the other times [s]."""
     for cause in causes:
         distances = np.abs(times - cause)
         if len(times) and distances.min() < near:

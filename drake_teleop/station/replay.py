@@ -74,7 +74,7 @@ _OPTIONAL_SIGNALS = ("master_state", "contact_wrench_S", "force_to_master", "she
 def replay_command(
     run: Path, out: Path, *, scenario: str | Path | None = None, quiet: bool = False
 ) -> dict[str, Any]:
-    """Write the replays of logged runs, and summary.json with their paths; return the summary.
+    """Write a 3D replay for each log, and summary.json with their paths; return the summary.
 
     Args:
         run: folder written by `run` or `reproduce`, or a log in it.
@@ -110,7 +110,7 @@ def write_replay(
     missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
         raise DrakeTeleopError(
-            f"cannot be shown: it contains no {', '.join(missing) or 'samples'}",
+            f"the log cannot be shown: it contains no {', '.join(missing) or 'samples'}",
             where="replay",
             remedy="give the log of a station with a simulated slave",
         )
@@ -169,7 +169,7 @@ def _row_norms(vectors: Array) -> Array:
 def _find_logs(run: Path) -> list[Path]:
     if not os.path.exists(run):
         raise DrakeTeleopError(
-            "there is no such folder", where=str(run), remedy="give the folder of a run"
+            "there is no such file or folder", where=str(run), remedy="give the folder of a run"
         )
     if run.suffix == ".parquet":
         return [run]
@@ -191,14 +191,14 @@ def _find_scenario(log: Path) -> Path:
         if path.exists():
             return path
     raise DrakeTeleopError(
-        "has no scenario beside it",
+        "this log has no scenario file beside it",
         where=str(log),
         remedy="give --scenario, a shipped one or a YAML file",
     )
 
 
 class ReplayScene:
-    """Meshcat scene of a replay, which shows one sample at a time.
+    """3D scene of a replay in Meshcat, which shows one sample of a log at a time.
 
     `plant` contains slave, surroundings and haptic device, for shapes and kinematics only.
     """
@@ -218,14 +218,14 @@ class ReplayScene:
         self._sheet = touched.sheet
         self._master = None
         if "master_state" in recorded:
-            self._master = _add_master(self.plant, scenario)
+            self._master = _add_haptic_device(self.plant, scenario)
         finalize_plant(self.plant)
         self._moving_bodies = {
             POSE_SIGNAL_PREFIX + k: body for k, body in MovingBodies(self.plant, touched).items()
         }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._add_bodies(meshcat))
-        _draw_room(meshcat, scenario, with_table=self._master is not None)
+        _draw_floor_and_tables(meshcat, scenario, with_table=self._master is not None)
         # The replay shows the device's base parallel to W, for any alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
@@ -249,7 +249,7 @@ class ReplayScene:
                 yield path, body
 
     def show_sample(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
-        """Show row `sample` of the signals at a time of the recording [s]."""
+        """Record row `sample` of the signals as the scene at `film_time` [s] of the replay."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
@@ -304,7 +304,7 @@ class ReplayScene:
 class _ReplayDevice(NamedTuple):
     """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    `positions` converts joint positions to those of the plant.
+    `positions` is a function from logged joint positions to the plant's.
     """
 
     instance: ModelInstanceIndex
@@ -314,9 +314,9 @@ class _ReplayDevice(NamedTuple):
     folder: object = None
 
 
-def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
+def _add_haptic_device(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     if scenario.master.leader is not None:
-        return _add_leader(plant, scenario.master.leader)
+        return _add_leader_arm(plant, scenario.master.leader)
     is_phantom = scenario.master.model == PHANTOM_NAME
     name = "phantom" if is_phantom else "grip"
     (master,) = Parser(plant, "master").AddModels(str(models_dir() / f"{name}.sdf"))
@@ -326,7 +326,7 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _ReplayDevice:
     return _ReplayDevice(master, plant.GetFrameByName("stylus", master), _GRIP_P_E, positions)
 
 
-def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
+def _add_leader_arm(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
     parsed = leader.add_to_plant(plant, RigidTransform([*_MASTER_BASE_P_WB[:2], _TABLE_HEIGHT_M]))
 
@@ -340,7 +340,7 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _ReplayDevice:
     )
 
 
-def _draw_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
+def _draw_floor_and_tables(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
     def draw_box(
         name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba
     ):
@@ -356,7 +356,7 @@ def _draw_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> Non
             draw_box(f"leg_{i}", (0.04, 0.04, height), (x + dx, y + dy, height / 2), _STEEL_COLOUR)
     surroundings = scenario.surroundings
     for k, part in enumerate(() if surroundings is None else surroundings.parts):
-        stand = part.stand
+        stand = part.floor_stand
         if stand is not None and stand.height > 0:
             size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
             draw_box(

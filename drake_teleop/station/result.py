@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
-_METADATA_KEY = "drake_teleop.signals"
+_SIGNAL_METADATA_KEY = "drake_teleop.signals"
 # Longer curves are drawn as minimum and maximum of blocks.
 _MAX_CURVE_POINTS = 20_000
 # Columns of the canonical log (README, "Logs") for each signal.
-_CANONICAL_COLUMNS = {
+_CANONICAL_COLUMN_NAMES = {
     "sample_time": ("t",),
     "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
     "specific_force_S": ("s_x", "s_y", "s_z"),
@@ -67,7 +67,7 @@ class Signal:
             expect_type(str, text, "signal")
         if len(units) != len(self.components):
             raise DrakeTeleopError(
-                f"{len(self.components)} components, but {len(units)} units",
+                f"the signal has {len(self.components)} components, but {len(units)} units",
                 where=self.name,
                 remedy="give one unit, or one per component",
             )
@@ -79,7 +79,7 @@ class Signal:
 
 
 class SimulationResult:
-    """Sampled signals of one simulation on one time base.
+    """Recorded signals of one simulation, sampled at common times.
 
     ``result["measured_wrench_S"]`` is an (N, k) array; ``result["measured_wrench_S.f_x"]`` and
     ``result["t"]`` are (N,) columns. ``len(result)`` and iteration refer to the signals' names.
@@ -88,7 +88,7 @@ class SimulationResult:
     Args:
         t: (N,) sample times [s].
         signals: arrays by name, (N, k), or (N,) for one component.
-        specs: descriptions; they define the order.
+        specs: description of each signal; they define the order.
 
     Raises:
         DrakeTeleopError: if names, lengths or numbers of components are inconsistent.
@@ -97,12 +97,12 @@ class SimulationResult:
     def __init__(
         self, t: ArrayLike, signals: Mapping[str, ArrayLike], specs: Sequence[Signal]
     ) -> None:
-        self._t = _read_only(float_array("t", t))
+        self._t = _read_only_view(float_array("t", t))
         self._specs = {spec.name: spec for spec in specs}
         if self._specs.keys() != signals.keys():
             odd = sorted(self._specs.keys() ^ signals.keys())
             raise DrakeTeleopError(
-                f"the names of signals and specs differ in {', '.join(odd)}",
+                f"only one of `signals` and `specs` contains {', '.join(odd)}",
                 where="signals",
                 remedy="give each signal one spec",
             )
@@ -119,11 +119,11 @@ class SimulationResult:
             array = array[:, np.newaxis]
         if array.shape != shape:
             raise DrakeTeleopError(
-                f"has shape {array.shape} instead of {shape}",
+                f"has shape {array.shape} instead of {shape} (times, components)",
                 where=name,
                 remedy="give a row per time and a column per component",
             )
-        return _read_only(array)
+        return _read_only_view(array)
 
     @property
     def t(self) -> NDArray[np.float64]:
@@ -159,23 +159,23 @@ class SimulationResult:
             return SimulationResult(self._t[name], rows, self.specs)
         if name == "t":
             return self._t
-        if (found := self._column(name)) is not None:
+        if (found := self._find_column(name)) is not None:
             return self._values[found[0]][:, found[1]]
         try:
             return self._values[name]
         except KeyError:
             names = self._ipython_key_completions_()
             near = difflib.get_close_matches(str(name), names, n=3) or self.signals
-            raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
+            raise KeyError(f"there is no signal {name!r}; there are {', '.join(near)}") from None
 
-    def _column(self, name: object) -> tuple[str, int] | None:
+    def _find_column(self, name: object) -> tuple[str, int] | None:
         signal = str(name).partition(".")[0]
         if signal not in self._specs or name not in self._specs[signal].columns:
             return None
         return signal, self._specs[signal].columns.index(str(name))
 
     def __contains__(self, name: object) -> bool:
-        return name == "t" or name in self._specs or self._column(name) is not None
+        return name == "t" or name in self._specs or self._find_column(name) is not None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._specs)
@@ -197,7 +197,7 @@ class SimulationResult:
             return self.to_dataframe().to_pandas()
         except ModuleNotFoundError as error:
             raise DrakeTeleopError(
-                f"{error.name or 'a library'} is not installed",
+                f"{error.name or 'a library'} is not installed, but pandas frames require it",
                 where="to_pandas",
                 remedy=remedy_to_install_extra("notebook"),
             ) from None
@@ -222,15 +222,15 @@ class SimulationResult:
         """
         import polars as pl
 
-        missing = [name for name in _CANONICAL_COLUMNS if name not in self]
+        missing = [name for name in _CANONICAL_COLUMN_NAMES if name not in self]
         if missing:
             raise DrakeTeleopError(
-                f"the result contains no {', '.join(missing)}",
+                f"the result contains no {', '.join(missing)} (a sensor log needs these signals)",
                 where="sensor log",
                 remedy="record the wrist sensor's signals",
             )
         columns: dict[str, NDArray[np.float64]] = {}
-        for name, names in _CANONICAL_COLUMNS.items():
+        for name, names in _CANONICAL_COLUMN_NAMES.items():
             columns |= dict(zip(names, self[name].T, strict=True))
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
@@ -244,14 +244,14 @@ class SimulationResult:
     def _write_parquet_file(self, path: Path, aside: Path | None = None) -> None:
         specs = [asdict(spec) for spec in self.specs]
         # Fixed row groups: polars' default may depend on the number of threads.
-        metadata = {_METADATA_KEY: json.dumps(specs)}
+        metadata = {_SIGNAL_METADATA_KEY: json.dumps(specs)}
         table = self.to_dataframe()
         write_table(path, table, aside=aside, metadata=metadata, row_group_size=2**16)
 
     def write_part(self, folder: Path, first_row: int) -> None:
         """Write this result as one part of a longer log, in the format of `write_parquet`.
 
-        The same rows written again replace the part.
+        A part with the same `first_row` is replaced.
 
         Args:
             folder: folder of the log, prepared by `remove_log`.
@@ -274,7 +274,7 @@ class SimulationResult:
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log larger than the memory: each access to a signal reads it from the disk.
+        """Open a log that may be larger than the memory: each access to a signal reads the disk.
 
         Args:
             path: file or folder of parts, from `write_parquet` or `simulate`.
@@ -287,12 +287,12 @@ class SimulationResult:
         expect_type((str, Path), path, "result")
         path = Path(path)
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
-        parts = _log_parts(path)
+        parts = _files_of_log(path)
         for part in parts:
             with wrap_read_errors(part, remedy, "is not a simulation result"):
                 check_parquet(part)
         with wrap_read_errors(path, remedy, "is not a simulation result"):
-            text = pl.read_parquet_metadata(parts[0])[_METADATA_KEY]
+            text = pl.read_parquet_metadata(parts[0])[_SIGNAL_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = _read_columns(path, ["t"])[:, 0]
         return cls(t, _SignalsOnDisk(path, specs), specs)
@@ -327,7 +327,7 @@ class SimulationResult:
         return figure
 
     def _plot_panels(self, name: str) -> list[tuple[str, str, list[int]]]:
-        if (found := self._column(name)) is not None:
+        if (found := self._find_column(name)) is not None:
             signal, index = found
             return [(signal, self._specs[signal].units[index], [index])]
         if name not in self._specs:
@@ -371,7 +371,7 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         columns = self._columns[name]
         with wrap_read_errors(self._path, "write it again"):
-            return _read_only(_read_columns(self._path, columns))
+            return _read_only_view(_read_columns(self._path, columns))
 
     def __contains__(self, name: object) -> bool:
         return name in self._columns
@@ -405,7 +405,7 @@ def _signal_text(spec: Signal) -> str:
     return f"{text}  {spec.description}" if spec.description else text
 
 
-def _log_parts(path: Path) -> list[Path]:
+def _files_of_log(path: Path) -> list[Path]:
     return sorted(path.glob(LOG_PARTS_PATTERN)) or [path]
 
 
@@ -413,13 +413,13 @@ def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
     import polars as pl
 
     refuse_fork()
-    table = pl.read_parquet(_log_parts(path), columns=columns)
+    table = pl.read_parquet(_files_of_log(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
-        raise ValueError(f"{', '.join(columns)} hold no numbers")
+        raise ValueError(f"columns {', '.join(columns)} do not contain numbers")
     return table.to_numpy()
 
 
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+def _read_only_view(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view

@@ -1,4 +1,4 @@
-"""Warnings about a run from its recorded signals, and about overlaps of shapes at its start."""
+"""Warnings about a simulated run, from its recorded signals and overlapping shapes at its start."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
 
-_MIN_DURATION_S = 0.2
+_MIN_SPAN_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
 # Gaps between time spans that are shorter are closed [s].
-_MAX_GAP_S = 0.05
+_MAX_CLOSED_GAP_S = 0.05
 # Share of a limit from which the limit counts as reached (rounding).
 _SHARE_AT_LIMIT = 1 - 1e-9
 # Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
 # Settling time of the command of `ledger` with sufficient energy [s].
-_SETTLING_TIME_S = 0.05
+_LEDGER_SETTLING_TIME_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
 # Smallest reported amplitude of a joint.
 _MIN_JOINT_AMPLITUDE_RAD = np.deg2rad(0.1)
 # Number of time constants of the position loop until the error is 0.3 %.
-_SETTLING_TIME_CONSTANTS = 6.0
+_NUM_SETTLING_TIME_CONSTANTS = 6.0
 # Time in which an intent at rest moves by less than a distance.
 _REST_S, _MAX_REST_MOTION_M = 0.5, 1e-4
 # Smallest number of periods of an oscillating force.
@@ -61,7 +61,7 @@ _MAX_LISTED_TIMES = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """Return one sentence, with times, for each condition in docs/running.md that occurred.
+    """Return a warning, with times, for each condition listed in docs/running.md that occurred.
 
     Checks whose signals were not recorded are skipped. `arm` is the slave's arm, with limits.
     """
@@ -69,9 +69,9 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_faults(result),
         _check_limits(result, scenario, arm),
         _check_channel(result, scenario),
-        _check_joints(result, scenario, arm),
-        _check_hand(result),
-        _check_contact(result),
+        _check_joint_tracking(result, scenario, arm),
+        _check_hand_oscillation(result),
+        _check_contact_chatter(result),
         _check_rendered_force(result),
     )
     overlaps, _ = start_overlaps(scenario.slave, scenario.surroundings)
@@ -88,17 +88,17 @@ def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
     """
     spans: Spans = []
     for start, stop in contact_spans(t, happened):
-        if spans and start - spans[-1][1] < _MAX_GAP_S:
+        if spans and start - spans[-1][1] < _MAX_CLOSED_GAP_S:
             start = spans.pop()[0]
         spans.append((start, stop))
     return [(start, stop) for start, stop in spans if stop - start >= least]
 
 
 def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """Return (N,) distance of the actual motion from the range of recent commands.
+    """Return (N,) distances of the actual motion from the range of the last commands.
 
-    A delay, or a loop without overshoot, stays inside this range. `t` (N,) are evenly spaced times
-    [s], `command` and `actual` are (N, k); the range covers the time `window` [s].
+    The range covers the last `window` [s], so a pure delay gives 0. `t` (N,) are evenly spaced
+    times [s], `command` and `actual` are (N, k).
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _running_maximum(command, rows)
@@ -149,7 +149,7 @@ def _check_limits(
             full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
         yield (
             "the device displays its largest force or torque",
-            find_spans(t, full, _MIN_DURATION_S),
+            find_spans(t, full, _MIN_SPAN_S),
         )
         ended = device.is_at_end_stop(result["master_state"][:, : device.num_joints])
         yield "the device is at the end of its workspace", find_spans(t, ended)
@@ -169,7 +169,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         silent = result[f"ports.{end}_silent"] > timeout
         yield (
             f"the {end}'s end is in its safe state, no packets arrive from the {other},",
-            find_spans(t, silent, _MIN_DURATION_S),
+            find_spans(t, silent, _MIN_SPAN_S),
         )
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.networks_of_directions()[0]) + timeout
@@ -177,22 +177,22 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
     for command, actual, least, unit, scale in _position_and_rotation_parts(sent, received):
         lag = lag_beyond_delay(t, command, actual, window)
-        spans = find_spans(t, lag > least, _MIN_DURATION_S)
+        spans = find_spans(t, lag > least, _MIN_SPAN_S)
         largest = _maximum_within(t, lag, spans)
         yield (
             f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
             " more than its delay explains,",
             spans,
         )
-    yield from _check_reserve(result, scenario)
+    yield from _check_energy(result, scenario)
     oscillating = find_unexplained_pose_oscillation(t, sent, received, REVERSAL_WINDOW_S + window)
     yield (
         f"the channel ({by}) makes the slave's command oscillate",
-        find_spans(t, oscillating, _MIN_DURATION_S),
+        find_spans(t, oscillating, _MIN_SPAN_S),
     )
 
 
-def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+def _check_energy(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
     speed_limit = METHODS[scenario.passivity.method].speed_limit
     if speed_limit is None or len(result.t) < 2:
         return
@@ -202,17 +202,17 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         scenario
     )
     limit = speed_limit(config, mass)
-    then = t - _packet_ages(t, scenario)
-    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _SETTLING_TIME_S
+    then = t - _newest_packet_ages_s(t, scenario)
+    window = longest_delay(scenario.channel.networks_of_directions()[0]) + _LEDGER_SETTLING_TIME_S
     for g, (command, actual, least, unit, scale) in enumerate(
         _position_and_rotation_parts(sent, received)
     ):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
-        far = lag_beyond_delay(t, asked, actual, _SETTLING_TIME_S)
+        far = lag_beyond_delay(t, asked, actual, _LEDGER_SETTLING_TIME_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
         speed = _running_maximum(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
-        if held.sum() * row < _MIN_DURATION_S:
+        if held.sum() * row < _MIN_SPAN_S:
             continue
         enough, speed_unit = np.array(config.reserve), ("m/s", "rad/s")[g]
         enough[g] *= (speed[held].max() / limit[g]) ** 2
@@ -223,7 +223,7 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
             " pose (move more slowly, or increase the energy:"
             f" passivity.{scenario.passivity.method}.reserve"
-            f" {_join_values(enough)} and initial {_join_values(enough + config.hand_reserve)}),",
+            f" {_format_list(enough)} and initial {_format_list(enough + config.hand_reserve)}),",
             find_spans(t, held),
         )
 
@@ -241,19 +241,18 @@ def _position_and_rotation_parts(
     )
 
 
-def _packet_ages(t: Array, scenario: Scenario) -> Array:
-    """Return (N,) age of the newest packet at the slave's end [s], from the network model."""
+def _newest_packet_ages_s(t: Array, scenario: Scenario) -> Array:
     period = 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     line, seed = scenario.channel.networks_of_directions()[0], scenario.simulation.seed
     return (step - newest_packets(line, seed, FORWARD, step[-1] + 1, period)[step]) * period
 
 
-def _join_values(values: Array) -> str:
+def _format_list(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _check_joints(
+def _check_joint_tracking(
     result: SimulationResult, scenario: Scenario, arm: ArmModel
 ) -> Iterator[tuple[str, Spans]]:
     if "joint_command" not in result:
@@ -261,35 +260,35 @@ def _check_joints(
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
     window = (
-        _SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
+        _NUM_SETTLING_TIME_CONSTANTS * scenario.joint_control.tracking_delay_s
         + 1 / scenario.rates.joint_control_hz
     )
     for k in range(command.shape[1]):
         far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, IS_PRISMATIC_COLUMN] != 0.0
-        spans = find_spans(t, far > (_MIN_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_DURATION_S)
+        spans = find_spans(t, far > (_MIN_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_SPAN_S)
         largest = _maximum_within(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
     oscillating = find_unexplained_oscillation(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
     yield (
         "the slave oscillates while its command does not,",
-        find_spans(t, oscillating, _MIN_DURATION_S),
+        find_spans(t, oscillating, _MIN_SPAN_S),
     )
 
 
-def _check_hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_hand_oscillation(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     if "intent" in result and "pose_master" in result:
         oscillating = find_unexplained_pose_oscillation(
             result.t, result["intent"], result["pose_master"], REVERSAL_WINDOW_S
         )
         yield (
             "the hand oscillates while its intent does not,",
-            find_spans(result.t, oscillating, _MIN_DURATION_S),
+            find_spans(result.t, oscillating, _MIN_SPAN_S),
         )
 
 
-def _check_contact(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_contact_chatter(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     if "true_contact_wrench_W" not in result:
         return
     force = np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
@@ -316,7 +315,7 @@ def _check_rendered_force(result: SimulationResult) -> Iterator[tuple[str, Spans
     rests = np.linalg.norm(largest - least, axis=1) < _MAX_REST_MOTION_M
     rests[:rows] = False
     rms = np.sqrt(np.maximum(uniform_filter1d((force**2).sum(axis=1), rows), 0.0))
-    spans = find_spans(t, rests & (rms > MAX_HIGH_FREQUENCY_FORCE_N), _MIN_DURATION_S)
+    spans = find_spans(t, rests & (rms > MAX_HIGH_FREQUENCY_FORCE_N), _MIN_SPAN_S)
     if not spans:
         return
     start, stop = max(spans, key=lambda span: span[1] - span[0])

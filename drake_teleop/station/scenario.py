@@ -57,7 +57,7 @@ _MAX_CONTACT_STEP_S = 1.25e-4
 @settings
 @dataclass
 class Rates:
-    """Sampling rates. The paper: sensor 8 kHz, hand above 2 kHz, joint control 10 kHz."""
+    """Sampling rates. Those of the paper: sensor 8 kHz, hand > 2 kHz, joint control 10 kHz."""
 
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
     hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
@@ -126,7 +126,7 @@ class Scenario:
     @property
     def surroundings(self) -> Environment | None:
         """All objects that the tool can touch as one `Environment`, or None."""
-        things = self._objects
+        things = self._touchables
         if not things:
             return None
         return things[0] if len(things) == 1 else SeveralObjects(things)
@@ -134,10 +134,10 @@ class Scenario:
     @property
     def leaf(self) -> SheetSpring | None:
         """Sheet spring from `sheet_spring` or `environment`, or None."""
-        return next((thing for thing in self._objects if isinstance(thing, SheetSpring)), None)
+        return next((thing for thing in self._touchables if isinstance(thing, SheetSpring)), None)
 
     @property
-    def _objects(self) -> list[Environment]:
+    def _touchables(self) -> list[Environment]:
         own = (thing for thing in (self.sheet_spring, self.slot) if thing is not None)
         return [*own, *self.environment]
 
@@ -166,14 +166,14 @@ class Scenario:
         for index, thing in enumerate(self.environment):
             thing.check(f"{where}:environment[{index}]")
         for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
-            if sum(isinstance(thing, kind) for thing in self._objects) > 1:
+            if sum(isinstance(thing, kind) for thing in self._touchables) > 1:
                 raise DrakeTeleopError(
-                    f"there is more than one {name}",
+                    f"the scenario has more than one {name} (one is permitted)",
                     where=f"{where}:environment",
                     remedy="keep one",
                 )
         _check_task(self, where)
-        _check_steps(self, where)
+        _check_integration_step(self, where)
         _check_channel(self, where)
 
 
@@ -201,10 +201,10 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
     data, where = ReadScenario(name_or_path)
     scenario = ScenarioFromData(data, where)
     folder = Path(where).parent
-    scenario.slave = scenario.slave.found_from(folder)
-    scenario.master = scenario.master.found_from(folder)
+    scenario.slave = scenario.slave.with_absolute_paths(folder)
+    scenario.master = scenario.master.with_absolute_paths(folder)
     scenario.environment = [
-        thing.found_from(folder) if isinstance(thing, Scene) else thing
+        thing.with_absolute_paths(folder) if isinstance(thing, Scene) else thing
         for thing in scenario.environment
     ]
     return scenario
@@ -219,7 +219,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
 def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
     """Return the YAML file of this name in a folder of shipped files, or else the given path.
 
-    `kind` is the file's name in the DrakeTeleopError if neither exists.
+    A DrakeTeleopError about "no `kind`", such as "scenario", is raised if neither exists.
     """
     expect_type((str, Path), name_or_path, kind)
     names = sorted(path.stem for path in folder.glob("*.yaml"))
@@ -231,7 +231,7 @@ def shipped_file(kind: str, name_or_path: str | Path, folder: Path) -> Path:
 
 
 def settings_from_data(schema: type[_T], data: Any, where: str, defaults: _T | None = None) -> _T:
-    """Return settings from parsed YAML data without checks of ranges; `where` is for messages."""
+    """Return settings from parsed YAML data, with unchecked ranges; `where` begins messages."""
     check_structure(schema, data, where)
     data = dict(data)
     things = [dict(thing) for thing in data.pop("environment", [])] if schema is Scenario else []
@@ -276,7 +276,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
             config, place = getattr(scenario, block), f"scenario:{block}.{inner}"
             if config is None or isinstance(config, str):
                 raise DrakeTeleopError(
-                    f"the scenario has no block {block} to change",
+                    f"{block} is null or a text in this scenario, so it has no field {inner}",
                     where=place,
                     remedy=f"set the whole block {block} first",
                 )
@@ -293,13 +293,13 @@ def _check_task(scenario: Scenario, where: str) -> None:
     check_task(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
-            "the operator's task requires a scale above 0",
+            "the scale is 0, but the operator's task requires motion of the slave (above 0)",
             where=f"{where}:kinematic_scaling.translation_scale",
             remedy="set it above 0, or operator.task: null",
         )
 
 
-def _check_steps(scenario: Scenario, where: str) -> None:
+def _check_integration_step(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     controlled = simulation.integrator == "runge_kutta3"
     if (
@@ -308,7 +308,7 @@ def _check_steps(scenario: Scenario, where: str) -> None:
         and simulation.max_step > _MAX_CONTACT_STEP_S
     ):
         raise DrakeTeleopError(
-            f"steps of {simulation.max_step:g} s are too long for contact",
+            f"fixed steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",
             remedy=f"set it to {_MAX_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
         )
@@ -320,7 +320,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         timeout = scenario.channel.timeout or MAX_TIMEOUT_S
         if line.rate_hz is not None and timeout < 2 / line.rate_hz:
             raise DrakeTeleopError(
-                f"{timeout:g} s are shorter than two packet intervals at {line.rate_hz:g} Hz",
+                f"the timeout, {timeout:g} s, is below two packet intervals at {line.rate_hz:g} Hz",
                 where=f"{where}:channel.timeout",
                 remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
@@ -328,7 +328,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
         scenario.is_direct and scenario.contact_detection is None
     ):
         raise DrakeTeleopError(
-            "a channel transmits poses, not joint positions",
+            "a leader that commands joints requires a direct channel (a network transmits poses)",
             where=f"{where}:master.leader.leads",
             remedy="set it to pose, or remove network, passivity and contact_detection",
         )
@@ -336,7 +336,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
     scales = (scaling.translation_scale, scaling.rotation_scale)
     if scenario.passivity.method != "none" and min(scales) == 0.0:
         raise DrakeTeleopError(
-            "requires kinematic scales above 0",
+            "passivity methods require kinematic scales above 0",
             where=f"{where}:passivity.method",
             remedy="set both scales of kinematic_scaling above 0, or method: none",
         )

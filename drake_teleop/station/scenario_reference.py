@@ -1,4 +1,4 @@
-"""Reference page, JSON schema and commented YAML of a scenario, generated from the dataclasses."""
+"""Reference page, JSON schema and commented YAML of scenarios, generated from the dataclasses."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
 _COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
-_FILE_HEAD = """\
+_YAML_FILE_HEAD = """\
 # Each field has its value, [the permitted values] and its meaning. Omitted fields have their
 # defaults. Lines that begin with # are fields and blocks that this scenario does not use; remove
 # the # to use them.
 """
 
-_REFERENCE_HEAD = """\
+_REFERENCE_PAGE_HEAD = """\
 # Every field of a scenario
 
 A scenario is a YAML file; what it leaves out keeps the default that stands here. This page is made
@@ -48,16 +48,16 @@ and sections are those of the paper; (E) marks an estimate of ours, where the pa
 
 def to_commented_yaml(scenario: Scenario) -> str:
     """Return the scenario as YAML text; a comment explains each field."""
-    return _FILE_HEAD + "\n".join(_block_lines(scenario)) + "\n"
+    return _YAML_FILE_HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
-def _all_texts(value: Any) -> list[str]:
+def _find_texts(value: Any) -> list[str]:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
         value = [*value, *value.values()]
     if isinstance(value, (list, tuple)):
-        return [word for each in value for word in _all_texts(each)]
+        return [word for each in value for word in _find_texts(each)]
     return [str(value)] if isinstance(value, (str, Path)) and str(value) else []
 
 
@@ -73,10 +73,10 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
     found = ScenarioFromData(parse_yaml(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
-    if found != scenario and _all_texts(found) != _all_texts(scenario):
+    if found != scenario and _find_texts(found) != _find_texts(scenario):
         names = [field.name for field in dataclasses.fields(scenario)]
         lost = [
-            n for n in names if _all_texts(getattr(found, n)) != _all_texts(getattr(scenario, n))
+            n for n in names if _find_texts(getattr(found, n)) != _find_texts(getattr(scenario, n))
         ]
         raise DrakeTeleopError(
             f"YAML cannot represent the scenario's block {' and '.join(lost)}",
@@ -87,8 +87,8 @@ def write_scenario(path: Path, scenario: Scenario, heading: Sequence[str] = ()) 
 
 
 def reference_page() -> str:
-    """Return the reference in Markdown: a table per block with field, default, range, meaning."""
-    return _REFERENCE_HEAD + "".join(_sections_of_page(Scenario(), ""))
+    """Return the scenario reference in Markdown: a table of fields, ranges, meanings per block."""
+    return _REFERENCE_PAGE_HEAD + "".join(_sections_of_page(Scenario(), ""))
 
 
 def json_schema() -> str:
@@ -122,7 +122,7 @@ def _block_lines(config: Any) -> list[str]:
     lines = []
     for entry in entries:
         if entry.kind == "block":
-            lines += _inner_lines(entry)
+            lines += _inner_block_lines(entry)
             continue
         line = f"{starts[entry.name]:{column}}  # {_comment_of_field(entry)}"
         of_preset = preset is not None and entry.default == getattr(preset, entry.name)
@@ -130,13 +130,13 @@ def _block_lines(config: Any) -> list[str]:
     return lines
 
 
-def _inner_lines(entry: FieldInfo) -> list[str]:
+def _inner_block_lines(entry: FieldInfo) -> list[str]:
     if entry.default:
         return _field_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.lists:
-        return _commented_out(_field_lines(entry, blocks))
-    return [line for block in blocks for line in _commented_out(_field_lines(entry, block))]
+        return _comment_out_lines(_field_lines(entry, blocks))
+    return [line for block in blocks for line in _comment_out_lines(_field_lines(entry, block))]
 
 
 def _field_lines(entry: FieldInfo, value: Any) -> list[str]:
@@ -157,7 +157,7 @@ def _indent(lines: list[str]) -> list[str]:
     return [f"  {line}" for line in lines]
 
 
-def _commented_out(lines: list[str]) -> list[str]:
+def _comment_out_lines(lines: list[str]) -> list[str]:
     return [f"# {line}" for line in lines]
 
 

@@ -33,7 +33,7 @@ def _joint_names(joints: int) -> str:
 _STATE, _STATE_UNITS = _state_components_and_units(6)
 _JOINTS = _joint_names(6)
 # Signals with one component per joint.
-_JOINT_SIGNALS = ("joint_position", "joint_torque", "joint_command")
+_JOINT_SIGNAL_NAMES = ("joint_position", "joint_torque", "joint_command")
 
 
 #: All signals in the order of the log, for an arm with six joints.
@@ -130,7 +130,7 @@ SIGNALS = {
 
 
 def signal_of(name: str, size: int) -> Signal:
-    """Return the description of a signal for `size` components; SI units of revolute joints."""
+    """Return the description of a signal with `size` components, for any number of joints."""
     if name.startswith(POSE_SIGNAL_PREFIX):
         return _signal(
             name,
@@ -140,7 +140,7 @@ def signal_of(name: str, size: int) -> Signal:
     signal = SIGNALS[name]
     if size == len(signal.components):
         return signal
-    if name in _JOINT_SIGNALS:
+    if name in _JOINT_SIGNAL_NAMES:
         return _signal(name, _joint_names(size), signal.units[0], signal.description)
     if name in ("slave_state", "master_state"):
         return _signal(name, *_state_components_and_units(size // 2), signal.description)

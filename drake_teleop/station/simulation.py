@@ -1,4 +1,4 @@
-"""Simulation of a station; the result contains the named signals."""
+"""Simulation of a station, which returns its recorded signals."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def simulate(
         for time in np.append(1e-3 * milliseconds, end):
             advance_without_garbage_collection(simulator, time)
             if stops:
-                rows = _stop_at_fault(simulator, simulation.settle, rows)
+                rows = _raise_recorded_fault(simulator, simulation.settle, rows)
             if on_disk is not None and on_disk.num_unwritten_rows() >= _ROWS_PER_PART:
                 on_disk.write_and_clear()
                 rows = 0
@@ -97,7 +97,7 @@ def _task_is_over(simulator: Simulator) -> bool:
     )
 
 
-def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
+def _raise_recorded_fault(simulator: Simulator, start: float, rows: int) -> int:
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG_BLOCK_NAME).FindLog(simulator.get_context())
     for name, column in log_columns(station).items():
@@ -106,7 +106,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
         for k in np.flatnonzero(log.data()[column][0, rows:])[:1] + rows:
             what = FAULT_MEANINGS[Fault(int(log.data()[column][0, k]))]
             raise DrakeTeleopError(
-                f"at {log.sample_times()[k] - start:.3f} s {what}",
+                f"the run stops at {log.sample_times()[k] - start:.3f} s by a fault: {what}",
                 where="simulation.on_fault",
                 remedy="set it to continue, and the run goes on in its safe state",
             )
@@ -114,7 +114,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
 
 
 def log_columns(station: Diagram) -> dict[str, slice]:
-    """Return for each signal, by name, the slice of its rows in the station's log."""
+    """Return, by signal name, the slice of the signal's components in the station's log."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
     return {p.get_name(): slice(e - p.size(), e) for p, e in zip(ports, ends, strict=True)}
@@ -125,8 +125,8 @@ class LogOnDisk:
 
     Args:
         folder: folder of the log; an old log is replaced.
-        start: time that becomes t = 0 [s].
-        form: converts the rows to the common form of all parts.
+        start: simulation time that becomes t = 0 [s].
+        form: function that converts each part before it is written.
     """
 
     def __init__(
@@ -138,9 +138,9 @@ class LogOnDisk:
     ) -> None:
         remove_log(folder)
         self._folder, self._start, self._rows, self._form = folder, start, 0, form
-        self.continue_with(simulator)
+        self.switch_simulator(simulator)
 
-    def continue_with(self, simulator: Simulator) -> None:
+    def switch_simulator(self, simulator: Simulator) -> None:
         self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG_BLOCK_NAME)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
@@ -149,7 +149,7 @@ class LogOnDisk:
         return int(self._sink.num_samples())
 
     def write_and_clear(self) -> None:
-        """Write the rows in memory as the next part and clear them; repeatable if interrupted."""
+        """Write the rows in memory as the next part and clear them; safe to repeat."""
         part = self._read_rows()
         self._write_part(part)
         self._sink.Clear()

@@ -1,4 +1,4 @@
-"""Slave side of the station: arm with inverse kinematics, wrist sensor and load elimination."""
+"""Slave side of the station: arm, inverse kinematics, wrist sensor, elimination of the load."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
 from drake_teleop.station.estimation.load_estimator import LoadEstimator
-from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE, ForceScaling
+from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE_S, ForceScaling
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddCompiledWristSensor
@@ -34,15 +34,15 @@ from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
 from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
-from drake_teleop.station.slave.surroundings import MovingPose
+from drake_teleop.station.slave.surroundings import MovingBodyPose
 from drake_teleop.station.wiring import connect_ports, export_outputs
 
 Array = NDArray[np.float64]
 
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
 MONITOR_PERIOD_S = 0.01
-# See `_check_friction`.
-_MAX_FRICTION_STEP = 2.0
+# See `_check_friction_time_step`.
+_MAX_FRICTION_RATE_TIMES_STEP = 2.0
 
 
 def MakeSlaveSide(
@@ -53,7 +53,7 @@ def MakeSlaveSide(
     noise_floor: NoiseFloor | None = None,
     controller: System | None = None,
 ) -> Diagram:
-    """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, force scaling.
+    """Build the slave side: joint control, arm, wrist sensor, load estimator, force scaling.
 
     .. pydrake_system::
 
@@ -66,7 +66,7 @@ def MakeSlaveSide(
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
         - saturated: (1,) 1 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
-        - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
+        - the parts of a sample (`signals_of_sample`), slave_state, joint_torque, joint_command,
           ik_status, scaled_wrench_S, fault: signals
         - load_estimate, contact_wrench_S (if the load is identified or estimated online): signals
         - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
@@ -118,7 +118,7 @@ def MakeSlaveSide(
             arm,
             R_WB,
             scenario.wrist_sensor.largest_wrench(),
-            max(MAX_SAMPLE_AGE, 2 / scenario.rates.sensor_hz),
+            max(MAX_SAMPLE_AGE_S, 2 / scenario.rates.sensor_hz),
         ),
     )
     estimate = body.load_estimator.GetOutputPort("load_estimate")
@@ -173,7 +173,7 @@ def _is_torque_controller(controller: System | None, scenario: Scenario) -> bool
     ):
         if not has:
             remedy = "docs/station.md lists its ports"
-            raise DrakeTeleopError(f"there is no {port}", where="controller", remedy=remedy)
+            raise DrakeTeleopError(f"the block has no {port}", where="controller", remedy=remedy)
     scenario.master.check_pose_mode("a custom controller")
     return bool(torques)
 
@@ -201,8 +201,8 @@ def _add_inverse_kinematics(
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Build the slave side without master: its joints follow an excitation trajectory.
 
-    `trajectory` runs once after the settling time. Output ports are the signals of `MakeSlaveSide`
-    that need neither command nor elimination.
+    `trajectory` runs once after the settling time. Output ports are those of `MakeSlaveSide`
+    that need neither a pose command nor force scaling.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
@@ -253,7 +253,7 @@ def _add_slave_blocks(
         servo = MakeJointControl(arm, scenario.joint_control, period, start)
     control = builder.AddNamedSystem("joint_control", servo)
     held = samples / rates.joint_control_hz
-    _check_friction(slave, min(held, scenario.simulation.max_step))
+    _check_friction_time_step(slave, min(held, scenario.simulation.max_step))
     torque = control.GetOutputPort("joint_torque")
     builder.Connect(state, control.GetInputPort("slave_state"))
     builder.Connect(torque, plant.get_actuation_input_port(slave.instance))
@@ -280,8 +280,8 @@ def _add_slave_blocks(
     if ramps:
         rate = control.GetOutputPort("torque_rate")
         builder.Connect(rate, wrist.GetInputPort("torque_rate"))
-        if slave.sensed_sheet is not None:
-            sheet = plant.get_state_output_port(slave.sensed_sheet)
+        if slave.sheet_in_compiled_law is not None:
+            sheet = plant.get_state_output_port(slave.sheet_in_compiled_law)
             builder.Connect(sheet, control.GetInputPort("sheet_state"))
     for name, port in sample.items():
         builder.ExportOutput(port, name)
@@ -321,15 +321,14 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
     return samples_per_event(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
 
 
-def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Raise DrakeTeleopError for dry friction that stops a joint within one step [s]."""
+def _check_friction_time_step(slave: SlavePlant, step: float) -> None:
     if not slave.joint_friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
     slope = np.diag(slave.joint_friction / FRICTION_SPEED)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
-    if rate * step > _MAX_FRICTION_STEP:
-        shorter = 0.9 * _MAX_FRICTION_STEP / rate
+    if rate * step > _MAX_FRICTION_RATE_TIMES_STEP:
+        shorter = 0.9 * _MAX_FRICTION_RATE_TIMES_STEP / rate
         raise DrakeTeleopError(
             f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
             f"{1e3 * step:g} ms",
@@ -355,10 +354,10 @@ def _add_tool_contact(builder: DiagramBuilder, slave: SlavePlant, state: OutputP
     if slave.sheet_instance is not None:
         sheet = plant.get_state_output_port(slave.sheet_instance)
         builder.ExportOutput(sheet, "sheet_state")
-        if slave.sensed_sheet is not None:
+        if slave.sheet_in_compiled_law is not None:
             builder.Connect(sheet, contact.GetInputPort("sheet_state"))
     for name, body in slave.contact.moving.items():
-        pose = builder.AddNamedSystem(POSE_SIGNAL_PREFIX + name, MovingPose(plant, body))
+        pose = builder.AddNamedSystem(POSE_SIGNAL_PREFIX + name, MovingBodyPose(plant, body))
         builder.Connect(plant.get_state_output_port(), pose.GetInputPort("plant_state"))
         export_outputs(builder, pose, **{POSE_SIGNAL_PREFIX + name: "pose"})
 
@@ -375,16 +374,16 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         if not scenario.load_estimator.enabled:
             check_identified("load_estimate", estimate[6:])
     scales = scenario.force_scaling.scales()
-    needed = {*scales.as_array} != {scales.gamma}
+    needed = {*scales.load_scales} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "sigma and gamma differ, but there is no load estimate",
+            "sigma and gamma differ, which requires a load estimate, but there is none",
             where="load_estimate",
             remedy="pass the estimate of identify_load, or set load_estimator.enabled",
         )
     if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "contact detection needs a load estimate",
+            "contact detection requires a load estimate, but there is none",
             where="load_estimate",
             remedy="pass the estimate of identify_load as load_estimate",
         )

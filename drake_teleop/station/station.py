@@ -1,4 +1,4 @@
-"""Teleoperation system of the paper's Fig. 4 as one Drake Diagram.
+"""Construction of the paper's teleoperation system (Fig. 4) as one Drake Diagram.
 
 operator, haptic device --- network, passivity --- arm, wrist sensor, elimination
       master side        <->      channel       <->          slave side"""
@@ -29,7 +29,7 @@ def MakeTeleopStation(
     channel: System | None = None,
     slave: System | None = None,
 ) -> Diagram:
-    """Build the bilateral station: master side, channel, slave side.
+    """Build the teleoperation station: master side, channel and slave side.
 
     The output ports are the sides' signals (`station.signals`), which are recorded. The input ports
     clutch, intended_pose and intended_twist of the master side may stay unconnected.

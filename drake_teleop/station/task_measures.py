@@ -45,11 +45,11 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     task = scenario.operator.task
     if task is None:
         raise DrakeTeleopError(
-            "there is no task to measure",
+            "the scenario has no operator's task to measure",
             where="operator.task",
             remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
         )
-    state, t, ended = result["task_state"], result.t, _end_sample(result)
+    state, t, ended = result["task_state"], result.t, _last_row_of_task(result)
     begun = int(np.argmax(state[:, PHASE_INDEX] != PHASE_WAITING))
     span = slice(begun, ended + 1)
     done = state[ended, OUTCOME_INDEX] > 0.0
@@ -85,7 +85,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     """Return the reason why the task failed (timeout, given up, not achieved); "" after success."""
-    task, state, ended = scenario.operator.task, result["task_state"], _end_sample(result)
+    task, state, ended = scenario.operator.task, result["task_state"], _last_row_of_task(result)
     assert task is not None
     at, outcome = float(result.t[ended]), state[ended, OUTCOME_INDEX]
     if outcome > 0.0:
@@ -112,7 +112,7 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     )
 
 
-def _end_sample(result: SimulationResult) -> int:
+def _last_row_of_task(result: SimulationResult) -> int:
     outcome = result["task_state"][:, OUTCOME_INDEX]
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 

@@ -21,7 +21,7 @@ COMBINED_PORTS = {
 
 
 def export_outputs(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
-    """Export output ports of a block under their own names, or as `new_name="port"`."""
+    """Export output ports of a block by name; `new_name="port"` exports under another name."""
     for name, port in (dict(zip(names, names, strict=True)) | renamed).items():
         builder.ExportOutput(block.GetOutputPort(port), name)
 
@@ -29,9 +29,9 @@ def export_outputs(builder: DiagramBuilder, block: System, *names: str, **rename
 def connect_ports(
     builder: DiagramBuilder, source: System, name: str, target: System, entry: str
 ) -> None:
-    """Connect output port `name` of one side to input port `entry` of another.
+    """Connect output port `name` of the source to input port `entry` of the target.
 
-    A DrakeTeleopError is raised if a side lacks the port or the sizes differ.
+    A DrakeTeleopError is raised if a port is missing or the sizes differ.
     """
     output = source.HasOutputPort(name) and source.GetOutputPort(name)
     port = target.HasInputPort(entry) and target.GetInputPort(entry)
@@ -39,8 +39,8 @@ def connect_ports(
     _check_port_size(port, target, f"input port '{entry}'")
     if output.size() != port.size():
         raise DrakeTeleopError(
-            f"its output port '{name}' has {output.size()} numbers, {target.get_name()} expects "
-            f"{port.size()}",
+            f"its output port '{name}' has {output.size()} numbers, but input port '{entry}' of "
+            f"{target.get_name()} expects {port.size()}",
             where=source.get_name(),
             remedy="docs/station.md lists the ports that each side has",
         )
@@ -78,7 +78,7 @@ def record_signals(
 def _check_port_size(port: Any, side: System, what: str) -> None:
     if not port:
         raise DrakeTeleopError(
-            f"there is no {what}",
+            f"the block has no {what}",
             where=side.get_name(),
             remedy="docs/station.md lists the ports that each side has",
         )

@@ -26,7 +26,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator, read_recorded_signals
 from drake_teleop.station.slave.arm import forward_kinematics, inverse_dynamics, jacobian
-from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.slave.home import home_posture
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 PERIOD = 5e-4
@@ -62,7 +62,7 @@ def stale_weight(scenario: Scenario, direction):
     of the tool's centre of mass.
     """
     arm = slave_arm(scenario)
-    q = home_position(arm, scenario.slave.position)
+    q = home_posture(arm, scenario.slave.position)
     still, J, R, p = np.zeros(6), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
 
     def torque(q, vdot):

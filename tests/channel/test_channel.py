@@ -163,7 +163,7 @@ def test_directions_may_differ():
         ({"channel": Channel(network="lan", delay=0.1)}, r"channel\.network.*cannot be combined"),
         (
             {"channel": Channel(rate_hz=10.0, timeout=0.15)},
-            r"channel\.timeout.*shorter than two packet intervals",
+            r"channel\.timeout.*below two packet intervals",
         ),
         ({"channel": Channel(backward=NetworkConfig(loss=0.9, burst_loss=0.5))}, r"loss"),
     ],

@@ -82,8 +82,8 @@ def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
         (slot.X_WM @ pose @ (corners * box.size()).T)[2].min()
         for pose, box in _boxes_of_slot(slot).values()
     )
-    assert slot.foot == pytest.approx(lowest, abs=1e-12)
-    assert slot.stand[2:] == (0.5, -0.2, slot.foot)
+    assert slot.floor_bottom_height == pytest.approx(lowest, abs=1e-12)
+    assert slot.floor_stand[2:] == (0.5, -0.2, slot.floor_bottom_height)
 
 
 def test_materials_of_both_sides_combine_to_those_of_the_slot():

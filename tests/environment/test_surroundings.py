@@ -225,7 +225,7 @@ def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
         return
     # Its log has the leaf, and no other body moves.
     assert station.HasOutputPort("sheet_state")
-    assert "leaf is not alone" in sensor.reason_beyond_contact_law
+    assert "sheet spring is not the only object" in sensor.reason_beyond_contact_law
 
 
 def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
@@ -379,7 +379,7 @@ def test_invalid_environment_is_one_error(thing, what):
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        ("<drake:compliant_hydroelastic/>", "", "no shape in it is hydroelastic"),
+        ("<drake:compliant_hydroelastic/>", "", "hydroelastic, but no shape in the file is"),
         ("</link>", '</link><joint name="j" type="fixed"><child>gone</child></joint>',
          "pad.sdf: joint j has no parent link"),
         ('link name="pad"', 'link name="tool"', "the body name tool is reserved"),
@@ -397,7 +397,7 @@ def test_scene_that_cannot_be_touched_is_one_error(old, new, what, tmp_path):
 def test_moving_body_without_mass_is_one_error(tmp_path):
     (tmp_path / "ghost.urdf").write_text('<robot name="ghost"><link name="ghost"/></robot>')
     scene = Scene(file=str(tmp_path / "ghost.urdf"), fixed=False)
-    with pytest.raises(DrakeTeleopError, match="ghost can move, and has no mass"):
+    with pytest.raises(DrakeTeleopError, match="ghost can move, but has no mass"):
         AddSlavePlant(DiagramBuilder(), Slave(), scene)
 
 

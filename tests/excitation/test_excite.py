@@ -415,7 +415,7 @@ def test_chain_with_an_unsupported_joint_is_refused(urdf, joint, expected):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ('<parent link="l0"/>', '<parent link="l3"/>', "joints form a circle through l"),
+        ('<parent link="l0"/>', '<parent link="l3"/>', "joints form a loop through l"),
         (
             '<child link="finger"/>',
             '<child link="l3"/>',
@@ -475,7 +475,7 @@ def _joint(parent, child):
 @pytest.mark.parametrize(
     ("ends", "expected"),
     [
-        (("ab", "bc", "ca"), "a circle through b"),
+        (("ab", "bc", "ca"), "a loop through b"),
         (("ab", "cb"), "b is the child of two joints, ab and cb"),
     ],
 )
@@ -501,7 +501,7 @@ def test_nested_models_may_repeat_names(tmp_path):
 )
 def test_undefined_xml_entity_is_refused(urdf, entity):
     urdf.write_text(entity + urdf.read_text().replace("</robot>", "&e;</robot>"))
-    with pytest.raises(DrakeTeleopError, match=r"is not XML \(the entity e is not in this file"):
+    with pytest.raises(DrakeTeleopError, match=r"is not XML \(the entity e is not defined in"):
         ParseModel(MultibodyPlant(0.0), urdf, "l6")
 
 
@@ -572,7 +572,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
     ("options", "expected"),
     [
         (["--sensor-frame", "nose"], "no frames are named 'nose'"),
-        (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits for 6 joints"),
+        (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits, but 6 joints"),
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
         (["--sensor-frame", "l6", "--payload", "0.1"], "already contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),

@@ -129,8 +129,8 @@ def test_follower_respects_position_and_speed_limits(scenario):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"channel": Channel(delay=0.01)}, "master.leader.leads: a channel transmits poses"),
-        ({"slave__sensor_frame": "wrist_2", "slave__home": HOME[:5]}, "has 6 joints, the slave 5"),
+        ({"channel": Channel(delay=0.01)}, "leader.leads: a leader that commands joints requires"),
+        ({"slave__sensor_frame": "wrist_2", "slave__home": HOME[:5]}, "6 joints, but the slave 5"),
     ],
 )
 def test_unsupported_joint_mode_is_rejected(scenario, change, expected):

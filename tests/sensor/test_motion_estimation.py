@@ -38,7 +38,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     without_parts,
 )
 from drake_teleop.station.slave.arm import sensor_motion
-from drake_teleop.station.slave.home import R_WS_HOME, home_position
+from drake_teleop.station.slave.home import R_WS_HOME, home_posture
 from drake_teleop.station.slave.inverse_kinematics import nearest_branch
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
@@ -59,7 +59,7 @@ QUIET = dataclasses.replace(
 
 @functools.cache  # what it compiles is not for each worker to compile while it collects
 def home() -> Array:
-    return home_position(ARM, [0.55, 0.0, 0.45])
+    return home_posture(ARM, [0.55, 0.0, 0.45])
 
 
 def truth_of(motion, arm=ARM) -> Array:

@@ -10,7 +10,7 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.home import check_strength, home_position, start_posture
+from drake_teleop.station.slave.home import check_motor_strength, home_posture, start_posture
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize_plant
@@ -88,7 +88,7 @@ def read(slave):
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
     model, assumed = parsed.arm()
-    check_strength(model, start_posture(slave, model))
+    check_motor_strength(model, start_posture(slave, model))
     return [*parsed.assumptions, *assumed]
 
 
@@ -97,7 +97,7 @@ TWO = mjcf(
     "<joint name='c' axis='0 1 0'/><geom size='.1'/></body></body>{}"
 )
 FINGER = joint(9, parent="l5", child="f", inside='<mimic joint="j2"/>') + link("f")
-WORLD = link("world", "") + link("l0")
+WORLD_NAME = link("world", "") + link("l0")
 BALL = '<drake:joint name="j3" type="ball"><parent link="l2"/><child link="l3"/></drake:joint>'
 ANOTHER = re.sub("</?robot.*?>", "", arm()).replace('="l', '="m').replace('="j', '="k')
 DAMPED = '<dynamics damping="-1"/>'
@@ -116,16 +116,17 @@ ERRORS = {
     "URDF called SDF": ("sdf", arm(), "arm.sdf: cannot be read as a robot"),
     "URDF called MJCF": ("xml", arm(), "does not contain a mujoco tag"),
     "no such kind": ("usda", "#usda 1.0", "give a URDF, SDF, MJCF.*not a recognized type"),
-    "a macro by its name": ("urdf.xacro", arm(), "is a xacro file; run it through xacro first"),
+    "a macro by its name": ("urdf.xacro", arm(),
+                            "is a xacro file, not a model; run it through xacro first"),
     "a macro by what is in it": ("urdf", '<robot name="a" xmlns:xacro="x"><xacro:arm/></robot>',
-                                 "arm.urdf: is a xacro file; run it through xacro first"),
+                                 "arm.urdf: is a xacro file, not a model; run it through xacro"),
     "a macro's number": ("urdf", with_inertial((MASS, '<mass value="${m}"/>')),
                          "link l3: mass ..m. kg is not between 0 and"),
     # Trees
     "a loop": ("urdf", arm(beyond=joint(9, parent="l6", child="l2")),
                "l2 is the child of two joints, j2 and j9"),
-    "a circle": ("urdf", arm(j3=joint(3, parent="l5")), "joints form a circle through l"),
-    "a joint on itself": ("urdf", arm(j3=joint(3, parent="l3")), "a circle through l3"),
+    "a circle": ("urdf", arm(j3=joint(3, parent="l5")), "joints form a loop through l"),
+    "a joint on itself": ("urdf", arm(j3=joint(3, parent="l3")), "a loop through l3"),
     "a bushing": ("urdf", arm(beyond="<drake:linear_bushing_rpy/>"), "form a loop, by drake:"),
     "no parent": ("urdf", arm(j3=joint(3).replace('<parent link="l2"/>', "")),
                   "joint j3 has no parent link"),
@@ -182,7 +183,7 @@ ERRORS = {
                        "<multiplier>1</multiplier></mimic></axis>")), "j moves with another"),
     "SDF of a gearbox": ("sdf", sdf(sdf_joint("gearbox")), "j is a gearbox joint"),
     "SDF of a fixed arm": ("sdf", sdf(sdf_joint("fixed")),
-                           "sensor_frame: no moving joint between the world and l6"),
+                           "sensor_frame: no moving joint is between the world and l6"),
     "directives that are none": ("dmd.yaml", "directives: [{add_modell: {}}]",
                                  "arm.dmd.yaml:1:14: YAML"),
     "directives with a field too many": ("dmd.yaml", "directives: [{add_model: {name: a, file: "
@@ -254,7 +255,7 @@ ASSUMED = {
                                  "^acceleration limits"),
     "a fixed finger that moves with a joint": (arm(beyond=FINGER.replace("revolute", "fixed")),
                                                "acceleration limits"),
-    "a base that floats": (arm(l0=WORLD + joint(1, "floating", "", "world", "l0", "free")),
+    "a base that floats": (arm(l0=WORLD_NAME + joint(1, "floating", "", "world", "l0", "free")),
                            "welded to the world, where it may float: l0"),
     "dry friction": (arm(j3=joint(3, inside='<dynamics friction="2"/>')),
                      "no dry friction, which the model has, of j3"),
@@ -303,7 +304,7 @@ def test_start_posture_avoids_joint_limits(tmp_path):
         position = rng.uniform([0.3, -0.2, 0.2], [0.6, 0.2, 0.7])
         first, status = find_posture(other, np.array([0.0, 1.0, 0.0, 0.0, *position]), middle)
         if status == IkStatus.OK:
-            q = home_position(other, position.tolist())
+            q = home_posture(other, position.tolist())
             inside.append([np.abs((x - middle) / half).max() <= 0.9 for x in (first, q)])
     of_first, of_home = np.transpose(inside)
     assert of_home[of_first].all() and of_home.sum() > 1.3 * of_first.sum()
@@ -325,8 +326,8 @@ def test_rounded_inertia_is_preserved(tmp_path):
         ({"sensor_frame": "nose"}, "arm.urdf: no frames are named 'nose'; name one of l0, l1"),
         ({"sensor_frame": "l0"}, "sensor_frame: no moving joint"),
         ({"home": [], "position": [3.0, 0.0, 0.4]}, "slave.position: the arm cannot reach"),
-        ({"home": [3.0, *HOME[1:]]}, "slave.home: j1 at 3 is outside -2.5 to 2.5"),
-        ({"home": HOME[:5]}, "slave.home: 5 joint positions for 6 joints"),
+        ({"home": [3.0, *HOME[1:]]}, "home: joint j1 at 3 is outside its limits, -2.5 to 2.5"),
+        ({"home": HOME[:5]}, "slave.home: 5 joint positions are given for 6 joints"),
         ({"tip": [0.0, 0.1]}, "slave.tip: must be a list"),
         ({"tool": Tool(mass=90.0)}, "slave.tool: the arm cannot hold its 90 kg .* j2 needs"),
         ({"tool": Tool(model="none.sdf")}, "none.sdf: there is no such file"),
@@ -345,7 +346,7 @@ def test_invalid_settings_of_valid_model_raise_error(tmp_path, change, expected)
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (sdf("<link name='a'/><link name='b'/>"), "2 roots: a, b"),
+        (sdf("<link name='a'/><link name='b'/>"), "one root link, but has 2: a, b"),
         (sdf("<link name='a'><inertial><mass>0</mass></inertial></link>"), "no body with a mass"),
         ("", "tool.sdf: is not XML"),
     ],

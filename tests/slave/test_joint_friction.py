@@ -117,7 +117,7 @@ def test_one_friction_value_applies_to_all_joints():
 @pytest.mark.parametrize(
     ("friction", "expected"),
     [
-        ([1.0, 2.0], "slave.friction: has 2 numbers, the arm has 6 joints"),
+        ([1.0, 2.0], "slave.friction: has 2 numbers, but the arm has 6 joints"),
         ([-1.0], "slave.friction: contains a number that is negative or not finite"),
         ([float("nan")], "slave.friction: contains a number that is negative or not finite"),
         ([4.0], "slave.friction: the friction stops a joint within 0.0.. ms, too fast for steps"),

@@ -118,7 +118,7 @@ def test_a_binary_gltf_reads_no_file_outside(folder: Path) -> None:
     head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON")
     (folder / "x.glb").write_bytes(head + text)
     with pytest.raises(DrakeTeleopError, match=OUTSIDE):
-        ModelFiles(write(folder, a_urdf=urdf("x.glb")), ()).check(folder / "x.glb")
+        ModelFiles(write(folder, a_urdf=urdf("x.glb")), ()).check_file(folder / "x.glb")
 
 
 @pytest.mark.parametrize(
@@ -194,23 +194,23 @@ def include_cycle(text: Callable[[str], str], *names: str) -> dict[str, str]:
 
 
 INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
-    "sdf itself": (lambda _: include_cycle(including, "a.sdf"), "names itself"),
+    "sdf itself": (lambda _: include_cycle(including, "a.sdf"), "includes itself"),
     "sdf in a circle": (
         lambda _: include_cycle(including, "a.sdf", "b.sdf", "c.sdf"),
-        "names itself",
+        "includes itself",
     ),
-    "sdf by file": (lambda f: {"a_sdf": including(f"file://{f}/a.sdf")}, "names itself"),
+    "sdf by file": (lambda f: {"a_sdf": including(f"file://{f}/a.sdf")}, "includes itself"),
     "sdf outside": (lambda _: {"a_sdf": including("../other.sdf")}, OUTSIDE),
     "a fifo": (lambda _: {"a_sdf": including("fifo.sdf")}, "which does not exist"),
     "mjcf itself": (
         lambda _: include_cycle(lambda to: mjcf(f'<include file="{to}"/>'), "a.xml"),
-        "names itself",
+        "includes itself",
     ),
     "mjcf in a circle": (
         lambda _: include_cycle(
             lambda to: mjcf(f'<worldbody><include file="{to}"/></worldbody>'), "a.xml", "b.xml"
         ),
-        "names itself",
+        "includes itself",
     ),
     "mjcf mesh": (
         lambda _: {"a_xml": mjcf('<asset><mesh file="../solid.obj"/></asset>')},
@@ -240,17 +240,17 @@ INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
         lambda f: include_cycle(
             lambda to: directive(f"file://{f}/{to}", "add_directives"), "a.yaml"
         ),
-        "names itself",
+        "includes itself",
     ),
     "directives through a folder that is not there": (
         lambda f: {"a_yaml": directive(f"file://{f}/none/../a.yaml", "add_directives")},
-        "names itself",
+        "includes itself",
     ),
     "directives in a circle": (
         lambda f: include_cycle(
             lambda to: directive(f"file://{f}/{to}", "add_directives"), "a.yaml", "b.yaml"
         ),
-        "names itself",
+        "includes itself",
     ),
     "directives outside": (
         lambda f: {"a_yaml": directive(f"file://{f.parent}/other.sdf")},
@@ -277,7 +277,7 @@ INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
             }
             | {"m12_sdf": sdf(LINK)}
         ),
-        "takes more than 2000 files",
+        "exceeds the limit of 2000 files",
     ),
     "a long way": (
         lambda _: (
@@ -333,9 +333,9 @@ def test_file_in_working_folder_is_outside_model(
 def test_too_large_files_are_rejected(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=gltf())
     monkeypatch.setattr(model_references, "_MAX_TEXT", 400)
-    assert any("takes more than" in words for words in parse(path).assumptions)
+    assert any("exceeds the limit" in words for words in parse(path).assumptions)
     monkeypatch.setattr(model_references, "_MAX_TEXT", 100)
-    with pytest.raises(DrakeTeleopError, match=r"a\.urdf: takes more than"):
+    with pytest.raises(DrakeTeleopError, match=r"a\.urdf: exceeds the limit of"):
         parse(path)
 
 

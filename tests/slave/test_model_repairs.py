@@ -197,7 +197,10 @@ def test_hold_frees_chain_from_coupled_joint_and_opens_gripper(tmp_path):
 @pytest.mark.parametrize(
     ("hold", "expected"),
     [
-        ({"torso": 0.1}, r"slave\.hold: no moving joint is named 'torso'; name one of j1, j2, j3"),
+        (
+            {"torso": 0.1},
+            r"slave\.hold: the model has no moving joint 'torso'; name one of j1, j2, j3",
+        ),
         ({"j3": 2.6}, r"slave\.hold: j3 at 2\.6 is outside -2\.5 to 2\.5"),
         ({"j3": float("nan")}, r"slave\.hold\.j3: nan is not a finite position"),
     ],
@@ -318,7 +321,7 @@ def test_all_faults_are_listed_at_once(tmp_path):
     with pytest.raises(DrakeTeleopError) as error:
         read(written(tmp_path, text))
     said = str(error.value)
-    assert said.startswith(f"{tmp_path}/arm.urdf: 6 faults: (1) ")
+    assert said.startswith(f"{tmp_path}/arm.urdf: the model has 6 faults: (1) ")
     for part in ("j3 moves with another joint", "j5 is a ball joint", "'x' is not a number",
                  "origin 1e9 is no", "link l1: mass -4", "link l2: mass -4"):  # fmt: skip
         assert part in said

@@ -10,7 +10,7 @@ from drake_teleop.station.channel_side import MakeChannel
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import inverse_dynamics, jacobian
-from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.slave.home import home_posture
 from drake_teleop.station.slave.joint_control import operational_inertia, servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave
 
@@ -24,7 +24,7 @@ def arm():
 
 @pytest.fixture(scope="module")
 def home(arm):
-    return home_position(arm, SCENARIO.slave.position)
+    return home_posture(arm, SCENARIO.slave.position)
 
 
 def test_operational_inertia_gives_kinetic_energy(arm, home):

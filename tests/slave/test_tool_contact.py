@@ -133,7 +133,7 @@ def test_other_shapes_are_monitored_by_bounding_boxes():
     inspector, from_S = scene_graph.model_inspector(), RigidTransform([0.0, 0.0, 0.2])
     pairs = ContactPairs(plant, inspector, {cube: from_S}, [table], 1e-4)
     assert len(pairs.known) == 0
-    assert "spheres with boxes only, not of a Box on a Sphere" in pairs.unknown
+    assert "spheres on boxes only, not a Box on a Sphere" in pairs.unknown
     np.testing.assert_allclose(pairs.watched[0, :3], [0.0, 0.3, 0.2])
     np.testing.assert_allclose(pairs.watched[0, 16:19], 0.1)
     np.testing.assert_allclose(np.sort(pairs.watched[0, 37:]), [0.5, 1.0, 2.0])

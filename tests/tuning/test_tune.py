@@ -138,7 +138,7 @@ def test_settings_change_method_scales_and_filter_alone():
     base = without_task_and_method(LoadScenario("contact_transition"), "internet")
     stated = stated_set(["light", "firm"], [1.0], "press")
     tuned = Settings("charged_tdpa", 2.0, 0.3, 100.0).apply(base, stated)
-    assert tuned.force_scaling.scales().as_array == (0.3, 0.3, 0.0, 0.0)
+    assert tuned.force_scaling.scales().load_scales == (0.3, 0.3, 0.0, 0.0)
     assert tuned.force_scaling.scales().gamma == 2.0
     assert tuned.wrist_sensor.bandwidth_hz == 100.0
     assert tuned.passivity.charged_tdpa.hand_stiffness[0] == 700.0

@@ -131,7 +131,7 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 def injected_energy(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
     """Return the energy (N,) from hand and environment, plus the method's initial energy [J]."""
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
-    if any(scenario.force_scaling.scales().as_array):
+    if any(scenario.force_scaling.scales().load_scales):
         accounts += load_work(result, scenario)
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 

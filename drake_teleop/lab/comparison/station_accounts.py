@@ -77,7 +77,7 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
     of_gripper = arm.phi_load if held is None else np.asarray(held)
     R_WS = motion[:, np.newaxis, 12:].reshape(-1, 1, 3, 3)
     gravity = arm.table[-1, GRAVITY_COLUMN : GRAVITY_COLUMN + 3] @ R_WS[:, 0]
-    inertias, weights = np.split(np.array(scenario.force_scaling.scales().as_array), 2)
+    inertias, weights = np.split(np.array(scenario.force_scaling.scales().load_scales), 2)
     kept, excess = (
         part[0] * of_gripper + part[1] * (arm.phi_load - of_gripper)
         for part in (inertias, weights - inertias)

@@ -43,7 +43,7 @@ from drake_teleop.station.slave.arm import (
 from drake_teleop.station.slave.home import R_WS_HOME, positions_with_tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.posture_shapes import MIN_DEPTH_M, PostureShapes, overlap_texts
+from drake_teleop.station.slave.posture_shapes import MIN_OVERLAP_M, PostureShapes, overlap_texts
 
 #: Edges of the walls that are tried, the first preferred [m].
 WALL_EDGES_M = (0.4, 0.25, 0.15)
@@ -293,7 +293,7 @@ def _with_largest_wall(shapes: PostureShapes | None, place: Place, region: Regio
                 depths[wall.pop()] -= distance
         else:
             cost -= distance
-            overlaps |= distance < -MIN_DEPTH_M
+            overlaps |= distance < -MIN_OVERLAP_M
     large = sum(edge > _MAX_WALL_SHARE * region.reach for edge in WALL_EDGES_M[:-1])
     free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
     rank = next(free, len(walls) - 1)

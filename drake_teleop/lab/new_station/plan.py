@@ -184,7 +184,7 @@ def _tool_axis(shapes: PostureShapes, load: Array) -> str:
 
 def _reaches_beyond_link(shapes: PostureShapes, axis: str) -> bool:
     own_bodies = shapes.tool_bodies - {shapes.tool_body}
-    link_end = extent_beyond_sensor(shapes, shapes.sensor_link() - shapes.tool_bodies, axis)
+    link_end = extent_beyond_sensor(shapes, shapes.sensor_bodies() - shapes.tool_bodies, axis)
     return extent_beyond_sensor(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
 
 
@@ -204,7 +204,7 @@ def _stand_in_tool(axis: str, length: float) -> Tool:
 
 
 def _rod_length(shapes: PostureShapes, axis: str) -> float:
-    end = extent_beyond_sensor(shapes, shapes.sensor_link() - {shapes.tool_body}, axis)
+    end = extent_beyond_sensor(shapes, shapes.sensor_bodies() - {shapes.tool_body}, axis)
     return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
 
 

@@ -16,7 +16,7 @@ from drake_teleop.station.slave.arm import (
     ArmModel,
 )
 from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
-from drake_teleop.station.slave.posture_shapes import sampled_range
+from drake_teleop.station.slave.posture_shapes import joint_sampling_range
 
 NUM_POSTURES = 20_000
 _MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
@@ -115,7 +115,7 @@ def _rotations_about_z(angle: Array) -> Array:
 
 def random_postures(arm: ArmModel) -> Postures:
     """Return `NUM_POSTURES` random postures."""
-    lower, upper = sampled_range(arm)
+    lower, upper = joint_sampling_range(arm)
     random = np.random.default_rng(0)
     return postures_at(arm, random.uniform(lower, upper, (NUM_POSTURES, arm.num_joints)))
 

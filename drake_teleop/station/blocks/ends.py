@@ -1,4 +1,4 @@
-"""The two ends of a passivity method, for any network between them."""
+"""Blocks for the two ends of a passivity method; any network may connect them."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         period: time between packets [s].
         start: (7,) pose X_WS of the slave at the start.
         R_WB: (3, 3) alignment of the master's base with the world.
-        scales: (2,) scale of translation and rotation, slave over master.
-        force_scale: scale of force, slave to master.
-        timeout: silence that starts the safe state [s].
+        scales: (2,) motion of the slave over motion of the master: translation, rotation.
+        force_scale: force at the master over force at the slave.
+        timeout: time without packets after which the safe state begins [s].
     """
 
     __slots__ = ()
@@ -87,12 +87,12 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
         parts = step.get_mutable_value()
         for part, group in zip(parts, self._groups, strict=False):
             part[:] = context.get_discrete_state(group).value()
-        received = self._received.Eval(context)
+        packet = self._received.Eval(context)
         inputs = [
             port.Eval(context) if port.HasValue(context) else np.zeros(port.size())
             for port in self._ports
         ]
-        self._run(inputs, np.ascontiguousarray(received[:-1]), bool(received[-1] > 0.5), *parts)
+        self._step_method(inputs, np.ascontiguousarray(packet[:-1]), bool(packet[-1] > 0.5), *parts)
 
     def _step_results(self, context: Context) -> list[Any]:
         results: list[Any] = self.get_cache_entry(self._step).Eval(context)
@@ -107,7 +107,7 @@ class _PassivityEndBlock(DoubleOnly, LeafSystem):
 
 
 class PassivityAtMaster(_PassivityEndBlock):
-    """Master's end of a passivity method: renders a wrench, sends pose and energy.
+    """Block for the master's end of a passivity method: renders a wrench, sends pose and energy.
 
     .. pydrake_system::
 
@@ -130,7 +130,7 @@ class PassivityAtMaster(_PassivityEndBlock):
         calculate = weak_callback(self._calc_wrench)
         self.DeclareVectorOutputPort("wrench_to_master", 6, calculate, {step})
 
-    def _run(
+    def _step_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, _: Any, ports: Any, wrench: Any,
         packet: Any,
     ) -> None:  # fmt: skip
@@ -143,7 +143,7 @@ class PassivityAtMaster(_PassivityEndBlock):
 
 
 class PassivityAtSlave(_PassivityEndBlock):
-    """Slave's end of a passivity method: commands a pose, sends wrench and energy.
+    """Block for the slave's end of a passivity method: commands a pose, sends wrench and energy.
 
     .. pydrake_system::
 
@@ -151,7 +151,7 @@ class PassivityAtSlave(_PassivityEndBlock):
         input_ports:
         - received: (39,) newest packet of the master, and 1 if it is new
         - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
-        - load_wrench_B: (6,) part of wrench_B from the load, for `ledger`; 0 if unconnected
+        - load_wrench_B: (6,) part of wrench_B from the load, for method "ledger"; 0 if unconnected
         - pose_slave: (7,) actual X_WS of the slave
         - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
         - contact: (1,) flag of a contact detector; 0 if unconnected
@@ -171,7 +171,7 @@ class PassivityAtSlave(_PassivityEndBlock):
     def _declare_outputs(self, step: Any) -> None:
         self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._groups[1]))
 
-    def _run(
+    def _step_method(
         self, inputs: Any, received: Any, fresh: bool, ends: Any, pose: Any, ports: Any, _: Any,
         packet: Any,
     ) -> None:  # fmt: skip

@@ -1,4 +1,4 @@
-"""Force display of a haptic device: J^T F within the device's limits, for any device model."""
+"""Force display: motor torques J^T F for a wrench F, within the limits of any haptic device."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drake_teleop.station.master.force_display import DISPLAYED, display_into, i
 
 
 class ForceDisplay(DoubleOnly, LeafSystem):
-    """Motor torques of a haptic device for a wrench, with the safe state of the station.
+    """Block that converts a wrench to motor torques of a haptic device, with a safe state.
 
     .. pydrake_system::
 
@@ -31,10 +31,10 @@ class ForceDisplay(DoubleOnly, LeafSystem):
         output_ports:
         - joint_torque: (6,) J^T F + gravity compensation [N m]
         - force_to_master: (6,) displayed wrench F [N, N m]
-        - fault_at_hand: (1,) a `Fault`
+        - fault_at_hand: (1,) code of a `Fault`, 0 without fault
 
     Args:
-        device: such as `Master().device(0.0, 0.0)` (`station.master.device`).
+        device: device model, such as `Master().device(0.0, 0.0)`.
         period: sampling period [s].
         start: (6,) joint positions before the first valid ones.
     """
@@ -71,18 +71,18 @@ class ForceDisplay(DoubleOnly, LeafSystem):
         drive, command = step.get_mutable_value(), self._command.Eval(context)
         display_into(command, device, self._numbers, self._period, self._jacobian, drive)
 
-    def _step_drive(self, context: Context) -> Array:
+    def _display_state(self, context: Context) -> Array:
         drive: Array = self.get_cache_entry(self._step).Eval(context)
         return drive
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_drive(context)[:6])
+        output.SetFromVector(self._display_state(context)[:6])
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_drive(context)[DISPLAYED])
+        output.SetFromVector(self._display_state(context)[DISPLAYED])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._step_drive(context)[DISPLAYED.stop]
+        output[0] = self._display_state(context)[DISPLAYED.stop]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(0, self._step_drive(context))
+        discrete_state.set_value(0, self._display_state(context))

@@ -1,4 +1,4 @@
-"""One direction of a network: delay, jitter, loss and order of packets."""
+"""Block for one direction of a network: delay, jitter, loss and order of packets."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         - packet: (N,) numbers to send
         output_ports:
         - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
-        - arriving: (N + 1,) the same at the next period; depends on the input
+        - arriving: (N + 1,) value of `received` at the next period; depends on the input
 
     Connect `arriving` to a block that updates at the same instants and whose output is a state.
 
     Args:
-        size: N.
+        size: length N of the vector.
         period: time between packets [s].
-        config: default: ideal network.
-        seed: of the random numbers.
-        direction: 0 or 1; other random numbers for the same seed.
+        config: network settings; default: ideal network.
+        seed: seed of the random numbers.
+        direction: 0 or 1; each direction has its own random numbers.
 
     Raises:
-        DrakeTeleopError: for a policy `silence` that needs packets of a passivity method.
+        DrakeTeleopError: if `config.silence` requires packets of a passivity method.
     """
 
     __slots__ = ()
@@ -61,7 +61,8 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         config = NetworkConfig() if config is None else config
         if config.silence != "hold" and size not in (LOAD.start, PACKET_SIZE):
             raise DrakeTeleopError(
-                f"'{config.silence}' requires packets of a passivity method, not of size {size}",
+                f"'{config.silence}' requires packets of a passivity method ({LOAD.start} or"
+                f" {PACKET_SIZE} numbers), but size is {size}",
                 where="NetworkChannel.silence",
                 remedy="set silence: hold, or use a passivity method",
             )
@@ -94,13 +95,13 @@ class NetworkChannel(DoubleOnly, LeafSystem):
         _, fresh = network.receive_packet(self._parameters, line, k + 1, received[:-1])
         count[0], received[-1] = k + 1, fresh
 
-    def _split_state(self, context: Context) -> list[Array]:
+    def _next_state_parts(self, context: Context) -> list[Array]:
         parts: list[Array] = self.get_cache_entry(self._step).Eval(context)
         return parts
 
     def _calc_arriving(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._split_state(context)[-1])
+        output.SetFromVector(self._next_state_parts(context)[-1])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._split_state(context), self._groups, strict=True):
+        for part, group in zip(self._next_state_parts(context), self._groups, strict=True):
             discrete_state.set_value(group, part)

@@ -1,4 +1,4 @@
-"""Wrench of a load and scaling of a measured wrench, for double, AutoDiffXd and Expression."""
+"""Blocks for the wrench of a load and wrench scaling, for double, AutoDiffXd and Expression."""
 
 from __future__ import annotations
 
@@ -22,11 +22,10 @@ from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
 
 _GRAVITY_W = (0.0, 0.0, -9.81)
-_MOTION_PORTS = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+_MOTION_PORT_NAMES = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
 
 
 def _function_for_scalar_type(function: Any, T: Any) -> Callable[..., None]:
-    """Return the compiled function for double, its Python source for other scalar types."""
     return function if T is float else function.py_func
 
 
@@ -37,7 +36,7 @@ def _basic_vector_of_type(T: Any, size: int) -> Any:
 @TemplateSystem.define("NonContactWrench_")
 def NonContactWrench_(T: Any) -> Any:
     class Impl(LeafSystem_[T]):
-        """Wrench V phi of a load's weight and inertia, Eq. (12).
+        """Block that outputs the wrench V phi of a load's weight and inertia, Eq. (12).
 
         .. pydrake_system::
 
@@ -46,12 +45,12 @@ def NonContactWrench_(T: Any) -> Any:
             - specific_force_S: (3,) a - g of the sensor's origin [m/s^2]
             - angular_velocity_S: (3,) [rad/s]
             - angular_acceleration_S: (3,) [rad/s^2]
-            - load: (10,) phi; unconnected: the parameter phi
+            - load: (10,) inertial parameters phi; the argument phi if unconnected
             output_ports:
             - non_contact_wrench_S: (6,) wrench on the load [N, N m]
 
         Args:
-            phi: (10,) load about So in S; a numeric parameter of the context.
+            phi: (10,) inertial parameters of the load about So, in S; a parameter of the context.
         """
 
         __slots__ = ONE_DICT
@@ -60,7 +59,7 @@ def NonContactWrench_(T: Any) -> Any:
             LeafSystem_[T].__init__(self, converter)
             self._phi = np.zeros(10) if phi is None else finite_array("phi", phi, 10)
             self._parameter = self.DeclareNumericParameter(BasicVector_[T](self._phi))
-            self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION_PORTS]
+            self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION_PORT_NAMES]
             self._load = self.DeclareVectorInputPort("load", 10)
             inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
             calculate = weak_callback(self._calc)
@@ -88,7 +87,7 @@ NonContactWrench = NonContactWrench_[float]
 @TemplateSystem.define("WrenchScaling_")
 def WrenchScaling_(T: Any) -> Any:
     class Impl(LeafSystem_[T]):
-        """Contact wrench and scaled wrench of a measured wrench, Eqs. (13) and (T7).
+        """Block that outputs contact wrench F_c (Eq. 13) and scaled wrench F' (Eq. T7).
 
         .. pydrake_system::
 
@@ -99,14 +98,14 @@ def WrenchScaling_(T: Any) -> Any:
             - angular_velocity_S: (3,) [rad/s]
             - angular_acceleration_S: (3,) [rad/s^2]
             - load_estimate: (16,) [offsets; phi]
-            - R_WS: (9,) orientation of S, by rows; for wrench_to_master and separate sigmas only
+            - R_WS: (9,) orientation of S by rows, only for wrench_to_master and separate sigmas
             output_ports:
             - contact_wrench_S: (6,) F_c [N, N m]
             - scaled_wrench_S: (6,) F' [N, N m]
             - wrench_to_master: (6,) F_E_B = -force_scale F', in the master's base B [N, N m]
 
         Args:
-            config: scales; default: contact and load as measured.
+            config: scales; default: contact and load are not scaled.
             R_WB: (3, 3) alignment of the master's base with the world.
             gravity_W: (3,) [m/s^2].
         """
@@ -124,7 +123,7 @@ def WrenchScaling_(T: Any) -> Any:
             self._config = config = ForceScalingConfig() if config is None else config
             self._R_WB = np.eye(3) if R_WB is None else finite_array("R_WB", R_WB, 3, 3)
             self._gravity_W, self._scales = finite_array("gravity_W", gravity_W, 3), config.scales()
-            ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION_PORTS)]
+            ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION_PORT_NAMES)]
             ports += [("load_estimate", 16), ("R_WS", 9)]
             inputs = [self.DeclareVectorInputPort(*port) for port in ports]
             self._inputs, self._orientation = inputs[:-1], inputs[-1]
@@ -176,9 +175,9 @@ def WrenchScaling_(T: Any) -> Any:
         def _calc_to_master(self, context: Any, output: Any) -> None:
             if not self._orientation.HasValue(context):
                 raise DrakeTeleopError(
-                    "R_WS is not connected",
+                    "the input port R_WS, the orientation of the sensor, is not connected",
                     where="WrenchScaling.wrench_to_master",
-                    remedy="connect the orientation of S",
+                    remedy="connect a rotation matrix, by rows",
                 )
             wrench, k = _basic_vector_of_type(T, 6), self._config.force_scale
             scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)

@@ -1,4 +1,4 @@
-"""Base class of all environments, and helpers for their bodies and contacts."""
+"""Base class of objects that the tool can touch, and helpers for their bodies and contacts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloa
 
 
 class FloorStand(NamedTuple):
-    """Box on the floor that a 3D replay shows below an environment: sizes, position [m] in W."""
+    """Box on the floor that 3D replays show below an object: sizes and centre in W [m]."""
 
     along_x: float
     along_y: float
@@ -33,23 +33,23 @@ class FloorStand(NamedTuple):
 class Environment(ABC):
     """Object that the tool can touch; subclasses are dataclasses.
 
-    Its bodies may be fixed or move, with any shape that Drake supports. The wrist sensor's own
-    contact law is faster; it supports boxes and a single `moving_part`.
+    Its bodies may be fixed or move, with any shape that Drake supports. The compiled contact law
+    is faster than Drake's; it supports boxes and one `moving_part`.
     """
 
     @property
     @abstractmethod
     def slip(self) -> float:
-        """Slip speed of full friction [m/s]; the smallest one applies to all objects."""
+        """Sliding speed of full friction [m/s]; the smallest of all objects applies to all."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the object as own model instances to a plant with the tool, before Finalize."""
+        """Add the object to a plant with the tool, as new model instances, before Finalize."""
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Change contact pairs and materials after Finalize, also those of the body `tool`."""
+        """Change contact pairs and contact materials of object and `tool`, after Finalize."""
         return
 
     def check(self, where: str) -> None:
@@ -57,29 +57,29 @@ class Environment(ABC):
 
     @property
     def parts(self) -> tuple[Environment, ...]:
-        """Parts of a composite environment; else only this environment."""
+        """Objects of `SeveralObjects`; otherwise only this one."""
         return (self,)
 
     @property
     def hydroelastic(self) -> bool:
-        """Whether contacts use a pressure field where both shapes support it."""
+        """Whether contacts use Drake's hydroelastic model if both shapes support it."""
         return False
 
     @property
     def moving_part(self) -> tuple[float, float, float] | None:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a sprung joint, or None.
+        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a prismatic spring, or None.
 
-        The joint is prismatic; its position is 0 at rest.
+        The position of its joint is 0 at rest.
         """
         return None
 
     @property
-    def stand(self) -> FloorStand | None:
+    def floor_stand(self) -> FloorStand | None:
         return None
 
 
 class SeveralObjects(Environment):
-    """Environment of several objects."""
+    """Several objects as one `Environment`."""
 
     def __init__(self, parts: Iterable[Environment]) -> None:
         self._parts = tuple(parts)
@@ -115,7 +115,7 @@ def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
 
 
 def AddFreeJoint(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) -> None:
-    """Add a free joint for a body with the initial pose X_WBody, before Finalize."""
+    """Add a joint so that a body floats, with initial pose X_WBody, before Finalize."""
     name, world = f"{body.name()}_floats", plant.world_frame()
     joint = plant.AddJoint(QuaternionFloatingJoint(name, world, body.body_frame()))
     turn = X_WBody.rotation().ToQuaternion().wxyz()
@@ -129,7 +129,7 @@ def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
 def ToolShapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[GeometryId]]:
-    """Return the shapes with contact properties for each body of the tool, also welded ones."""
+    """Return the shapes with contact properties of `tool` and of each body welded to it."""
     properties = scene_graph.model_inspector().GetProximityProperties
     return {
         index: [

@@ -49,15 +49,15 @@ _FIXED_JOINT, _REVOLUTE_JOINT, _PRISMATIC_JOINT, _FREE_JOINT = range(4)
 #: Number of columns of the table of joints.
 NUM_JOINT_COLUMNS = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
-NUM_POSE_AND_TWIST = 13
+BODY_STATE_SIZE = 13
 
 
 def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
     """Return a table (m, 21) of the joints between moving bodies and the world, and their bodies.
 
-    A row contains: 0 row of the parent, or -1 if it is anchored; 1 type of joint; 2 and 3 first
+    Columns: 0 row of the parent body, or -1 if it is anchored; 1 type of joint; 2 and 3 first
     index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an anchored
-    parent) and 14-20 X_MB, a quaternion and a position each. Parents are first.
+    parent) and 14-20 X_MB, a quaternion and a position each. Parents precede children.
     """
     # Indices instead of joints: a stored joint and its plant would keep each other alive.
     above: dict[int, tuple[int, int]] = {}
@@ -79,15 +79,15 @@ def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Arra
     for number in order:
         index, parent = above[number]
         row = order.index(parent) if parent in order else -1
-        rows.append(_joint_row(plant, context, plant.get_joint(JointIndex(index)), row))
+        rows.append(_joint_table_row(plant, context, plant.get_joint(JointIndex(index)), row))
     return np.array(rows).reshape(len(rows), NUM_JOINT_COLUMNS), order
 
 
-def _joint_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
+def _joint_table_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Array:
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-    kind, axis = _joint_kind(joint)
+    kind, axis = _joint_type_and_axis(joint)
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
     return np.array(
         [
@@ -101,7 +101,7 @@ def _joint_row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) 
     )
 
 
-def _joint_kind(joint: Joint) -> tuple[int, Array]:
+def _joint_type_and_axis(joint: Joint) -> tuple[int, Array]:
     if isinstance(joint, RevoluteJoint):
         return _REVOLUTE_JOINT, joint.revolute_axis()
     if isinstance(joint, PrismaticJoint):
@@ -120,7 +120,7 @@ def _quaternion_at(x, i):
 
 @njit(cache=True)
 def poses_and_twists_into(joints, state, out):
-    """Write pose and twist of each body (m, 13) at the plant's state [q; v] into `out`.
+    """Write pose and twist of m bodies at the plant's state [q; v] into `out` (m, 13).
 
     A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `joints` is a `JointTable`.
     """
@@ -186,9 +186,9 @@ def _quaternion_rate(spin, turn):
 
 @njit(cache=True)
 def interpolate_joint_state(joints, h, u, start, end, out):
-    """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`, by cubics.
+    """Write the state [q; v] at the fraction u of a step of h [s] into `out` (Hermite cubics).
 
-    `start` and `end` are the plant's states at both ends of the step.
+    `start` and `end` are the plant's states at both ends of the step, `joints` a `JointTable`.
     """
     for k in range(joints.shape[0]):
         q, v, kind = (

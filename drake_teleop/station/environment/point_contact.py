@@ -1,4 +1,4 @@
-"""Drake's compliant point contact between the tool's spheres and boxes, compiled.
+"""Compiled copy of Drake's compliant point contact, for spheres of the tool on boxes.
 
 With depth x, stiffness k, dissipation d, slip velocity v_t and slip speed v_s of full friction::
 
@@ -39,21 +39,21 @@ STIFFNESS_COLUMN, FRICTION_COLUMNS, BODY_COLUMN = 22, slice(24, 26), 27
 #: Number of columns of `ShapePairs.known` and `ShapePairs.watched`.
 NUM_PAIR_COLUMNS, NUM_MONITORED_COLUMNS = 28, 40
 _STIFFNESS_PROPERTY, _DISSIPATION_PROPERTY = "point_contact_stiffness", "hunt_crossley_dissipation"
-_MIN_SLIP_SPEED = 1e-14  # m/s, as in Drake: a point at rest has a direction
+_MIN_SLIP_SPEED_M_S = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
 class ShapePairs(NamedTuple):
     """Pairs of a shape of the tool and a shape of the environment that may touch.
 
     Attributes:
-        known: (k, 28), pairs of a sphere of the tool and a box: 0-2 centre of the sphere in S [m],
+        known: (k, 28), pairs of a sphere and a box; columns: 0-2 centre of the sphere in S [m],
             3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead of W if
             the body moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
             moves in W (zero if fixed), 22 stiffness [N/m], 23 dissipation [s/m], 24 and 25 static
             and dynamic friction, 26 slip speed [m/s], 27 row of the body in a `JointTable`, or -1.
         watched: (l, 40), bounding boxes of all other pairs. As above, with 0-2 the centre of the
             tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
-        unknown: reason why the first of the other pairs is not in `known`.
+        unknown: reason why the first pair of `watched` is not in `known`.
     """
 
     known: Array
@@ -72,9 +72,9 @@ def ContactPairs(
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
-        tool: shapes of the tool -> poses of their bodies in S.
-        slip: slip speed of full friction [m/s]; the plant's stiction tolerance.
-        moving: indices of the bodies of a `JointTable`, row by row.
+        tool: pose X_SBody of its body, for each shape of the tool.
+        slip: sliding speed of full friction [m/s], the plant's stiction tolerance.
+        moving: body index of each row of a `JointTable`.
 
     Raises:
         DrakeTeleopError: for an unbounded shape.
@@ -87,7 +87,7 @@ def ContactPairs(
     for body in map(plant.get_body, touched):
         row = moving.index(int(body.index())) if int(body.index()) in moving else -1
         X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
-        direction = _motion_direction(plant, context, body)
+        direction = _prismatic_joint_direction_W(plant, context, body)
         for other in plant.GetCollisionGeometriesForBody(body):
             for own, X_SOwn in tool.items():
                 if inspector.CollisionFiltered(own, other):
@@ -95,7 +95,7 @@ def ContactPairs(
                 X_Other = X_Body @ inspector.GetPoseInFrame(other)
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
-                    sphere, edges = _row_of_sphere_and_box(inspector, own, other)
+                    sphere, edges = _require_sphere_and_box(inspector, own, other)
                     law = _combined_contact_law(
                         *map(inspector.GetProximityProperties, (own, other))
                     )
@@ -127,29 +127,29 @@ def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
     box = inspector.GetObbInGeometryFrame(shape)
     if box is None:
         raise DrakeTeleopError(
-            f"a {type(inspector.GetShape(shape)).__name__} has no bounding box",
+            f"a {type(inspector.GetShape(shape)).__name__} is unbounded, so contact with it cannot"
+            " be checked",
             where=inspector.GetName(shape),
             remedy="use a shape of finite size, such as a box",
         )
     return box
 
 
-def _row_of_sphere_and_box(
+def _require_sphere_and_box(
     inspector: SceneGraphInspector, ball: GeometryId, box: GeometryId
 ) -> tuple[Sphere, Box]:
     sphere, edges = inspector.GetShape(ball), inspector.GetShape(box)
     if isinstance(sphere, Sphere) and isinstance(edges, Box):
         return sphere, edges
     raise DrakeTeleopError(
-        "the wrist sensor measures contact of spheres with boxes only, not of a"
+        "the compiled contact law supports spheres on boxes only, not a"
         f" {type(sphere).__name__} on a {type(edges).__name__}",
         where=inspector.GetName(box),
         remedy="build the tool's tip of spheres and the environment of boxes",
     )
 
 
-def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
-    """Return the body's velocity in W for a unit speed of its prismatic joint; 0 without one."""
+def _prismatic_joint_direction_W(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
     plant.SetVelocities(context, np.zeros(plant.num_velocities()))
     direction = np.zeros(3)
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -185,13 +185,13 @@ def _combined_contact_law(ball: ProximityProperties, box: ProximityProperties) -
 def depth_of_sphere_in_box(
     pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal: Array
 ) -> float:
-    """Return the depth of a sphere in its box [m], below 0 if they are apart.
+    """Return the depth of a sphere in a box [m], below 0 if they are apart.
 
     Args:
         pair: (28,) row of `ShapePairs.known`.
         deflection: deflection of the sheet spring [m].
-        normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
-            of contact in W [m] (3).
+        normal: (6,) output, written if they touch: direction out of the box in W (3), point of
+            contact in W [m] (3).
     """
     radius = pair[3]
     # Centre of the sphere relative to the box, in W.
@@ -237,8 +237,8 @@ def min_distance_of_boxes(
 ) -> float:
     """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    `pair` (40,) is a row of `ShapePairs.watched`, for the tool's box; `box` (28,) is it with the
-    present pose of the other box. The bound is the largest gap along an edge of either box.
+    `pair` (40,) is a row of `ShapePairs.watched`; `box` (28,) is its first part with the present
+    pose of the environment's box. The bound is the largest gap along an edge of either box.
     """
     R, between = matrix_as_tuple(R_WS), minus(vector_at(p_WS, 0), vector_at(box, 13))
     between = plus(between, apply_matrix(R, vector_at(pair, 0)))
@@ -271,9 +271,9 @@ def _friction_coefficient(static: float, dynamic: float, slip: float) -> float:
 
 @njit(cache=True)
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
-    """Write the contact force on a sphere in its box into `force` (3,) [N].
+    """Write the contact force on a sphere in a box into `force` (3,) [N], in W.
 
-    `pair` (28,): row of `ShapePairs.known`, `x`: depth [m], `normal`: direction out of the
+    `pair` is a row of `ShapePairs.known`, `x` the depth [m], `normal` the direction out of the
     box, `velocity` that of the sphere at the contact, relative to the box [m/s].
     """
     out = dot(velocity, normal)
@@ -282,7 +282,7 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
     for i in range(3):
         force[i] = velocity[i] - out * normal[i]
         speed += force[i] * force[i]
-    speed = np.sqrt(speed + _MIN_SLIP_SPEED * _MIN_SLIP_SPEED)
+    speed = np.sqrt(speed + _MIN_SLIP_SPEED_M_S * _MIN_SLIP_SPEED_M_S)
     mu = _friction_coefficient(pair[24], pair[25], speed / pair[26])
     for i in range(3):
         force[i] = f_n * (normal[i] - mu * force[i] / speed)

@@ -1,4 +1,4 @@
-"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits."""
+"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool touches."""
 
 from dataclasses import dataclass
 from xml.etree import ElementTree
@@ -19,13 +19,13 @@ from drake_teleop.station.environment.environment import (
     FloorStand,
 )
 
-_BENCH_HEIGHT = 0.15  # from the lower face of the model's bench to the leaf [m]
+_BENCH_HEIGHT_M = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
 @dataclass
 class SheetSpring(Environment):
-    """Position and material of the leaf, in SI units."""
+    """Settings of the sheet spring: position, size and material of its leaf."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, middle of the leaf's top at rest, in W"
@@ -50,7 +50,7 @@ class SheetSpring(Environment):
 
     @property
     def effective_mass(self) -> float:
-        """Mass of the first bending mode, 33/140 of the leaf's mass [kg] (Rayleigh)."""
+        """Effective mass of the first bending mode, 33/140 of the leaf's mass [kg] (Rayleigh)."""
         return 33 / 140 * self.density * self.length * self.width * self.thickness
 
     @property
@@ -59,7 +59,7 @@ class SheetSpring(Environment):
 
     @property
     def largest_small_deflection(self) -> float:
-        """Limit of the linear leaf model, 10 % of the length [m]."""
+        """Largest deflection for which the linear model is valid, 10 % of the length [m]."""
         return 0.1 * self.length
 
     @property
@@ -67,12 +67,12 @@ class SheetSpring(Environment):
         return self.effective_mass, self.stiffness, self.damping
 
     @property
-    def stand(self) -> FloorStand:
+    def floor_stand(self) -> FloorStand:
         x, y, z = self.position
-        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
+        return FloorStand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT_M)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the leaf to a plant; the joint "bending" is its end's deflection along z_W [m]."""
+        """Add the leaf to a plant; its joint "bending" deflects the free end along z_W [m]."""
         tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
         # Drake fixes a body's mass when it parses it, so the mass is written into the text.
         tree.find(".//link[@name='leaf']/inertial/mass").text = repr(self.effective_mass)  # type: ignore[union-attr]

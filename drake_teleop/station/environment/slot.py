@@ -27,15 +27,15 @@ from drake_teleop.station.environment.environment import ContactMaterial, Enviro
 PEG_RADIUS, TIP_BALL_CENTRE_Z, UPPER_BALL_CENTRE_Z = 0.012, 0.188, 0.158
 #: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (E).
 SLOT_LENGTH, _SIDE_WIDTH = 0.10, 0.04
-_FLOOR_THICKNESS = 0.02
-_BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
+_FLOOR_THICKNESS_M = 0.02
+_SLOT_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
 _BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 
 
 @settings
 @dataclass
 class Slot(Environment):
-    """Pose and shape of the slot, and its contact with the balls of the peg."""
+    """Settings of the slot: pose, shape, and contact with the balls of the peg."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of the slot's mouth, in W"
@@ -68,9 +68,9 @@ class Slot(Environment):
         return 1e-3
 
     @property
-    def foot(self) -> float:
+    def floor_bottom_height(self) -> float:
         """Height z_W of the floor's lower face [m]."""
-        return self.position[2] - self.depth - _FLOOR_THICKNESS
+        return self.position[2] - self.depth - _FLOOR_THICKNESS_M
 
     @property
     def X_WM(self) -> RigidTransform:
@@ -78,8 +78,8 @@ class Slot(Environment):
         return RigidTransform(RollPitchYaw(0.0, 0.0, self.yaw), self.position)
 
     @property
-    def stand(self) -> FloorStand:
-        return FloorStand(0.16, 0.16, self.position[0], self.position[1], self.foot)
+    def floor_stand(self) -> FloorStand:
+        return FloorStand(0.16, 0.16, self.position[0], self.position[1], self.floor_bottom_height)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
@@ -92,7 +92,7 @@ class Slot(Environment):
         plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _BALL_COLOUR)
         for name, (X_MBox, box) in _boxes_of_slot(self).items():
             plant.RegisterCollisionGeometry(body, X_MBox, box, name, properties)
-            plant.RegisterVisualGeometry(body, X_MBox, box, name, _BLOCK_COLOUR)
+            plant.RegisterVisualGeometry(body, X_MBox, box, name, _SLOT_COLOUR)
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
@@ -112,7 +112,7 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
-            """Return a box from `inner` outwards and from the height `top` down to the floor."""
+            """Return a box on one side of the slot, from y `inner` outwards and z `top` down."""
             across, height = edge + c + _SIDE_WIDTH - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(SLOT_LENGTH, across, height)
@@ -125,6 +125,6 @@ def _boxes_of_slot(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
         boxes[f"{name}_top"] = block(edge + c, 0.0)
         boxes[f"{name}_chamfer"] = into, Box(SLOT_LENGTH, c * np.sqrt(2), thick)
     across = slot.width + 2 * (c + _SIDE_WIDTH)
-    below = RigidTransform([0.0, 0.0, -depth - _FLOOR_THICKNESS / 2])
-    boxes["floor"] = below, Box(SLOT_LENGTH, across, _FLOOR_THICKNESS)
+    below = RigidTransform([0.0, 0.0, -depth - _FLOOR_THICKNESS_M / 2])
+    boxes["floor"] = below, Box(SLOT_LENGTH, across, _FLOOR_THICKNESS_M)
     return boxes

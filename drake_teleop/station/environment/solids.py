@@ -23,7 +23,7 @@ from drake_teleop.station.environment.environment import (
 )
 
 _BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
-_WALL_THICKNESS = 0.1  # m; deep enough that a tool leaves through the face
+_WALL_THICKNESS_M = 0.1  # m; deep enough that a tool leaves through the face
 _FOOT_RADIUS, _TABLE_THICKNESS = 0.002, 0.05  # m: radius of the balls, thickness of the table
 _BLOCK_NAME, _FOOT_NAME_PREFIX = "block", "foot_of_block_"
 _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
@@ -32,7 +32,7 @@ _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 @settings
 @dataclass
 class Surface(Environment):
-    """Object with a contact surface; Drake combines it with the surface of the other object.
+    """Base class of objects with a contact surface, which Drake combines with that of the tool.
 
     Stiffnesses are springs in series; friction is the harmonic mean. The tool's ball has stiffness
     4e5 N/m and friction 0.2.
@@ -71,7 +71,7 @@ class Surface(Environment):
 @settings
 @dataclass
 class Box(Surface):
-    """Pose, size and surface of a fixed box."""
+    """Fixed box with pose, size and surface."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.1], "m", -2.0, 2.0, "p_WBox, the middle of the box, in W"
@@ -89,7 +89,7 @@ class Box(Surface):
 def AddFixedBox(
     plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
 ) -> None:
-    """Weld a box with edges `size` (3,) [m] to the world; without a scene graph it has no shape."""
+    """Weld a box with edges `size` (3,) [m] to the world; its shape requires a scene graph."""
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
     if plant.geometry_source_is_registered():
@@ -101,7 +101,7 @@ def AddFixedBox(
 @settings
 @dataclass
 class Wall(Surface):
-    """Pose, size and surface of a flat wall."""
+    """Fixed flat wall with position, normal, size and surface."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, the middle of its face, in W"
@@ -124,14 +124,14 @@ class Wall(Surface):
     def AddTo(self, plant: MultibodyPlant) -> None:
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
-        behind = RigidTransform([0.0, 0.0, -_WALL_THICKNESS / 2])
-        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _WALL_THICKNESS], self)
+        behind = RigidTransform([0.0, 0.0, -_WALL_THICKNESS_M / 2])
+        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _WALL_THICKNESS_M], self)
 
 
 @settings
 @dataclass
 class Block(Surface):
-    """Initial pose, size, mass and surface of a block, and the table below it."""
+    """Movable block with initial pose, size, mass and surface, and a table below it."""
 
     position: list[float] = quantity(
         [0.6, 0.0, 0.2], "m", -2.0, 2.0, "the middle of its underside at the start, in W"
@@ -146,13 +146,13 @@ class Block(Surface):
     def check(self, where: str) -> None:
         if 0.0 < min(self.table) < max(self.size[:2]):
             raise DrakeTeleopError(
-                "the table is smaller than the block",
+                "the table is smaller than the block on it",
                 where=f"{where}.table",
                 remedy="give a larger one, or [0, 0] for none, and a !Box to stand on",
             )
 
     @property
-    def stand(self) -> FloorStand | None:
+    def floor_stand(self) -> FloorStand | None:
         x, y, top = self.position
         across = 0.6 * min(self.table)
         return FloorStand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
@@ -184,7 +184,7 @@ class Block(Surface):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Let the tool touch only the block's box, and all other bodies only its balls."""
+        """Let the tool touch only the block's box, and other bodies only its balls at corners."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
         blocks = [body for body in map(plant.get_body, bodies) if body.name() == _BLOCK_NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]

@@ -1,4 +1,4 @@
-"""Contact detection at the slave: the wrench without the load's part exceeds its noise floor."""
+"""Contact detection at the slave: the wrench without the load's part exceeds a noise floor."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -63,10 +63,9 @@ def _update_flag_with_arm(memory, sample, estimate, arm, settings):
 
 @njit(cache=True)
 def update_flag(memory, sample, estimate, acceleration, settings):
-    """Update the detector's memory with a sample; return whether there is contact.
+    """Update the memory of a contact detector with a sample; return whether there is contact.
 
-    `acceleration` (3,) is the acceleration of So, in S [m/s^2]; `settings` are those of a
-    `ContactDetector`.
+    `acceleration` (3,) is that of So, in S [m/s^2]; `settings` is `ContactDetector.settings`.
     """
     if not (all_in_range(sample) and all_in_range(estimate)):
         return memory[FLAG_INDEX] != 0.0
@@ -82,7 +81,7 @@ def update_flag(memory, sample, estimate, acceleration, settings):
 
 
 class ContactDetection(LeafSystem):
-    """Detector of contact between slave and environment, for a noise `floor` fitted at its rate.
+    """Block that detects contact of the tool; `floor` is a noise floor fitted at the block's rate.
 
     The flag keeps its value while the wrist sensor is saturated or the sensor's low-pass recovers.
 
@@ -109,7 +108,7 @@ class ContactDetection(LeafSystem):
             hold=round(config.hold / period),
             following=period / config.drift_time,
         ).settings
-        self._sample = self._declare_sample(arm)
+        self._sample = self._declare_sample_ports(arm)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
@@ -118,7 +117,7 @@ class ContactDetection(LeafSystem):
         self.DeclareStateOutputPort("contact", self._flag)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _declare_sample(self, arm: ArmModel | None) -> Any:
+    def _declare_sample_ports(self, arm: ArmModel | None) -> Any:
         assert arm is not None
         self._arm = arm.table
         return self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)

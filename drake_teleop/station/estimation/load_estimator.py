@@ -24,13 +24,13 @@ from drake_teleop.load.online.watched import (
 from drake_teleop.load.regressor import SATURATION_FLAG_INDEX
 
 # Samples between two checks for settling.
-_SAMPLES_PER_CHECK = 16
+_SAMPLES_PER_SETTLING_CHECK = 16
 
 
 @settings
 @dataclass
 class LoadEstimatorConfig:
-    """Recursive estimation of load and offsets, Eqs. (7)-(8)."""
+    """Settings of the recursive estimation of load and offsets, Eqs. (7)-(8)."""
 
     enabled: bool = plain(
         False,
@@ -61,14 +61,14 @@ class LoadEstimatorConfig:
     def check(self, where: str) -> None:
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
-                f"the covariance of '{self.method}' is too small to detect a change of load",
+                f"the covariance of method '{self.method}' is too small to detect a change of load",
                 where=f"{where}.method",
                 remedy="set method: rtls, or watch: false",
             )
 
 
 class LoadEstimator(LeafSystem):
-    """Estimator of load and offsets: constant, updated with every sample, or monitored (`watch`).
+    """Block with the estimate of load and offsets: constant, updated in every period or monitored.
 
     .. pydrake_system::
 
@@ -114,12 +114,12 @@ class LoadEstimator(LeafSystem):
         start = np.asarray(initial, dtype=float)
         memory = self._estimator.initial_memory(start)
         self._shape, self._watches, self._period = memory.shape, config.watch, period
-        self._sample = self._declare_sample(sample_size)
+        self._sample = self._declare_sample_ports(sample_size)
         estimate = self.DeclareDiscreteState(start)
         self.DeclareDiscreteState(memory.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)
         self.DeclareVectorOutputPort(
-            "load_state", 1, weak_callback(self._calc_state), {self.xd_ticket()}
+            "load_state", 1, weak_callback(self._calc_load_state), {self.xd_ticket()}
         )
         if config.watch:
             unknown = np.zeros(MEMORY_SIZE)
@@ -137,7 +137,7 @@ class LoadEstimator(LeafSystem):
         if config.enabled or config.watch:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _declare_sample(self, size: int) -> Any:
+    def _declare_sample_ports(self, size: int) -> Any:
         return self.DeclareVectorInputPort("sample", size)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -162,7 +162,7 @@ class LoadEstimator(LeafSystem):
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
         # The check for settling takes longer than the update.
-        due = self._watches and round(time / self._period) % _SAMPLES_PER_CHECK == 0
+        due = self._watches and round(time / self._period) % _SAMPLES_PER_SETTLING_CHECK == 0
         if due and self._estimator.is_settled_at(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, initial_monitor_memory(estimate, covariance))
@@ -170,7 +170,7 @@ class LoadEstimator(LeafSystem):
     def _load_state_index(self, discrete_state: DiscreteValues) -> int:
         return current_monitor_state(discrete_state.value(2)) if self._watches else STATE_LEARNING
 
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
+    def _calc_load_state(self, context: Context, output: BasicVector) -> None:
         state = context.get_discrete_state()
         output[0] = self._load_state_index(state)
         if not self._watches:

@@ -213,10 +213,10 @@ class Master:
         )
         return dataclasses.replace(self, figures=figures)
 
-    def found_from(self, folder: Path) -> "Master":
+    def with_absolute_paths(self, folder: Path) -> "Master":
         if self.leader is None:
             return self
-        return dataclasses.replace(self, leader=self.leader.found_from(folder))
+        return dataclasses.replace(self, leader=self.leader.with_absolute_paths(folder))
 
     def _data_sheet(self) -> DeviceFigures:
         return self.figures or FIGURES.get(self.model, DeviceFigures())

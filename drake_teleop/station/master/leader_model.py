@@ -89,7 +89,7 @@ class Leader:
                     remedy=f"give finite numbers{least}",
                 )
 
-    def found_from(self, folder: Path) -> "Leader":
+    def with_absolute_paths(self, folder: Path) -> "Leader":
         return dataclasses.replace(
             self,
             file=str((folder / self.file).resolve()) if self.file else "",

@@ -1,4 +1,4 @@
-"""Scaling of contact wrench and load's wrench from slave to master (Figs. 2 and 4 of the paper)."""
+"""Force scaling, slave to master, of contact and load's wrench (Figs. 2 and 4 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -41,18 +41,18 @@ from drake_teleop.load.regressor import (
 from drake_teleop.station.slave.arm import ArmModel, acceleration_into, forward_kinematics
 
 #: Scales of the contact wrench alone, Eq. (13); see `blend_scales_at`.
-_SCALES_OF_ELIMINATION = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+_CONTACT_ONLY_SCALES = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 _NUM_SCALES = 6
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
-MAX_SAMPLE_AGE = 0.05
+MAX_SAMPLE_AGE_S = 0.05
 _NO_FAULT, _STALE_FAULT, _READING_FAULT, _JOINTS_FAULT, _LOAD_FAULT = map(
     int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
 )
 
 
 class Scales(NamedTuple):
-    """Factors of the wrench's parts: sigma for inertia, weight for weight, gamma for contact."""
+    """Scales of parts of the wrench: sigma_ for inertia, weight_ for weight, gamma for contact."""
 
     sigma_gripper: float
     sigma_object: float
@@ -61,14 +61,14 @@ class Scales(NamedTuple):
     weight_object: float
 
     @property
-    def as_array(self) -> tuple[float, float, float, float]:
+    def load_scales(self) -> tuple[float, float, float, float]:
         return self.sigma_gripper, self.sigma_object, self.weight_gripper, self.weight_object
 
 
 @settings
 @dataclass
 class ForceScalingConfig:
-    """Scales sigma, gamma, eta of the paper, and force scale from slave to master."""
+    """Settings of the force scaling: sigma, gamma, eta of the paper, scale from slave to master."""
 
     sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
@@ -89,7 +89,10 @@ class ForceScalingConfig:
     )
 
     def scales(self, where: str = "force_scaling") -> Scales:
-        """Return the scales of gripper, object and contact; raise for an eta that does not fit."""
+        """Return the scales of gripper, object and contact.
+
+        A DrakeTeleopError is raised if eta is combined with other scales, or gripper_phi is None.
+        """
         separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
             weights, inertias = weight_and_inertia_scales(self.sigma, self.sigma, *separate)
@@ -97,7 +100,7 @@ class ForceScalingConfig:
         alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
         if not alone or self.gripper_phi is None:
             raise DrakeTeleopError(
-                "eta cannot be combined with these fields, because it scales the object alone",
+                "eta scales the object alone: it requires gripper_phi and excludes other scales",
                 where=f"{where}.eta",
                 remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper), and leave "
                 "sigma_weight and sigma_inertia out",
@@ -123,9 +126,9 @@ def wrench_to_master(
     force_scale: float,
     torque_scale: float,
 ) -> NDArray[np.float64]:
-    """Return the wrench to render (..., 6): the scaled reaction to the sensor's wrench.
+    """Return the wrench to render (..., 6), the scaled reaction to the sensor's wrench: F_E_B.
 
-    It is F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
+    It is [f; tau] on the hand at the grip E, in B [N, N m].
 
     Args:
         wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
@@ -141,9 +144,10 @@ def wrench_to_master(
 
 @njit(cache=True)
 def blend_scales_at(change, time, scales):
-    """Write the six scales at `time` [s]: a minimum-jerk blend from old to new scales.
+    """Write the scales at `time` [s] to `scales` (6,): a minimum-jerk blend from old to new ones.
 
     `change` (14,) contains old scales (6), new scales (6), start of the change [s], duration [s].
+    Scales are sigma of gripper and object, gamma, force scale, weights of gripper and object.
     """
     u = min(max((time - change[12]) / change[13], 0.0), 1.0) if change[13] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
@@ -174,7 +178,7 @@ def _scaled_wrench_into(sample, estimate, gripper, arm, scales, out):
 def find_fault(sample, estimate, time, valid_range):
     """Return the code (`Fault`) of the first fault in a sample and a load estimate at `time` [s].
 
-    `valid_range` (7,) contains the largest wrench [N, N m] and age [s].
+    `valid_range` (7,) contains the largest wrench [N, N m] and the largest age of a sample [s].
     """
     if not abs(time - sample[SAMPLE_TIME_INDEX]) <= valid_range[6]:
         return _STALE_FAULT
@@ -191,7 +195,7 @@ def find_fault(sample, estimate, time, valid_range):
 
 
 @njit(cache=True)
-def _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out):
+def _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out):
     scales = np.empty(_NUM_SCALES)
     blend_scales_at(change, time, scales)
     _scaled_wrench_into(sample, estimate, gripper, arm, scales, out)
@@ -199,7 +203,7 @@ def _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out):
 
 @njit(cache=True, borrows=True)
 def _log_row_into(sample, estimate, gripper, change, time, arm, elimination, valid_range, out):
-    _scaled_wrench_now_into(sample, estimate, gripper, change, time, arm, out[:6])
+    _scaled_wrench_at_time_into(sample, estimate, gripper, change, time, arm, out[:6])
     _scaled_wrench_into(sample, estimate, gripper, arm, elimination, out[6:12])
     out[12] = find_fault(sample, estimate, time, valid_range)
 
@@ -220,7 +224,7 @@ def _rendered_wrench_into(
 
 
 class ForceScaling(LeafSystem):
-    """Scaling of contact wrench and load's wrench, and transformation to the hand.
+    """Block that scales contact wrench and load's wrench, and transforms them to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj) has contact wrench F_c, regressor V,
     and inertial parameters phi of gripper and object.
@@ -234,7 +238,7 @@ class ForceScaling(LeafSystem):
         output_ports:
         - scaled_wrench_S: scaled wrench F' of Fig. 2
         - contact_wrench_S: contact wrench F_c of Eq. (13)
-        - fault: `Fault` of sample or estimate
+        - fault: code of a `Fault` of sample or estimate, 0 without fault
         - scaled_contact_and_fault: the three above in one vector
         - non_contact_wrench_S: wrench of the load (weight and inertia), Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
@@ -255,7 +259,7 @@ class ForceScaling(LeafSystem):
         arm: ArmModel,
         R_WB: NDArray[np.float64],
         largest_wrench: NDArray[np.float64] | None = None,
-        oldest: float = MAX_SAMPLE_AGE,
+        oldest: float = MAX_SAMPLE_AGE_S,
     ) -> None:
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
@@ -298,15 +302,14 @@ class ForceScaling(LeafSystem):
     ) -> None:
         """Change the scales, beginning now, on a minimum-jerk ramp of `duration` [s].
 
-        `sigma_weight` is the share of the weight of both parts; without it the other sigmas scale
-        weight and inertia.
+        `sigma_weight` scales the weight of gripper and object; None: the other sigmas do.
         """
         both = sigma_gripper, sigma_object
         weights = both if sigma_weight is None else (sigma_weight, sigma_weight)
         requested = np.array([*both, gamma, force_scale, *weights, duration], dtype=float)
         if not (requested >= 0.0).all() or not np.isfinite(requested).all():
             raise DrakeTeleopError(
-                "a scale or the duration is negative or not finite",
+                "a scale or the duration of the change is negative or not finite",
                 where="SetScales",
                 remedy="give finite numbers of 0 or more",
             )
@@ -316,13 +319,13 @@ class ForceScaling(LeafSystem):
         parameter.SetFromVector(np.concatenate([now, requested[:-1], [start, requested[-1]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        _scaled_wrench_now_into(
+        _scaled_wrench_at_time_into(
             *self._evaluate_inputs(context), self._arm, output.get_mutable_value()
         )
 
     def _calc_log_row(self, context: Context, output: BasicVector) -> None:
         inputs = self._evaluate_inputs(context)
-        constants = self._arm, _SCALES_OF_ELIMINATION, self._valid_range
+        constants = self._arm, _CONTACT_ONLY_SCALES, self._valid_range
         _log_row_into(*inputs, *constants, output.get_mutable_value())
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
@@ -330,7 +333,7 @@ class ForceScaling(LeafSystem):
         output[0] = find_fault(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        constants = self._arm, _SCALES_OF_ELIMINATION
+        constants = self._arm, _CONTACT_ONLY_SCALES
         _scaled_wrench_into(
             *self._evaluate_inputs(context)[:3], *constants, output.get_mutable_value()
         )

@@ -1,4 +1,4 @@
-"""Joint-by-joint command of the slave by a leader arm: q_slave = q_start + (q_leader - q_home)."""
+"""Command of the slave joint by joint by a leader arm: q_slave = q_start + (q_leader - q_home)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 
 
 class JointCoupling(LeafSystem):
-    """Coupling of the slave's joint positions to those of the leader arm, with a clutch.
+    """Block that couples the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open the commanded joints are constant. When it closes they follow the
-    leader again with a jump.
+    While the clutch is open the commanded joints are constant. When it closes they jump to the
+    leader's joints and follow them.
 
     .. pydrake_system::
 
@@ -29,7 +29,7 @@ class JointCoupling(LeafSystem):
         - leader_joints: (n,) commanded joint positions of the slave [rad]
         - pose_command: (7,) X_WS for these joints
 
-    The slave has the joints `start` when the leader is at `home`, (n,) [rad].
+    The command is `start` (n,) [rad] when the leader is at `home` (n,) [rad].
     """
 
     __slots__ = ONE_DICT
@@ -38,7 +38,7 @@ class JointCoupling(LeafSystem):
         super().__init__()
         if len(home) != len(start):
             raise DrakeTeleopError(
-                f"the leader has {len(home)} joints, the slave {len(start)}",
+                f"the leader has {len(home)} joints, but the slave {len(start)} (they must agree)",
                 where="master.leader.leads",
                 remedy="lead by the pose, or give arms of the same kinematics",
             )

@@ -25,7 +25,7 @@ from drake_teleop.common.vectors import (
 @settings
 @dataclass
 class KinematicScalingConfig:
-    """Scales of the master's motion, and alignment of its base with the world."""
+    """Settings of the kinematic scaling: scales, alignment of the master's base with the world."""
 
     translation_scale: float = quantity(1.0, "1", 0.0, 100.0, "slave over master translation")
     rotation_scale: float = quantity(1.0, "1", 0.0, 10.0, "slave over master angle")
@@ -48,8 +48,8 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
         p_WS = p_command + translation_scale R_WB (p_BE - p_master)
         R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
 
-    `pose` is the present X_BE of the master, `master` and `command` are X_BE and X_WS when the
-    clutch was closed, `alignment` is the quaternion of R_WB.
+    `pose` is X_BE of the master now, `master` and `command` are X_BE and X_WS at the closing of
+    the clutch, `alignment` is the quaternion of R_WB.
     """
     R_WB = (alignment[0], alignment[1], alignment[2], alignment[3])
     offset = rotate_vector(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
@@ -71,7 +71,7 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
 
 
 @njit(cache=True, borrows=True)
-def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
+def _pose_command_into(pose, references, alignment, translation_scale, rotation_scale, out):
     if references[14] > 0.5:
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
@@ -80,7 +80,7 @@ def _command_into(pose, references, alignment, translation_scale, rotation_scale
 
 
 class KinematicScaling(DoubleOnly, LeafSystem):
-    """Scaling of the master's motion into the slave's commanded pose, with a clutch.
+    """Block that scales the master's motion into the slave's commanded pose, with a clutch.
 
     While the clutch is open the command is constant. When it closes, the master's present pose is
     the new reference, so the command does not jump. The clutch keeps its state while the
@@ -119,7 +119,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         # The command follows from the first sample on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
-    def Open(self, context: Context, command: NDArray[np.float64]) -> None:
+    def OpenClutch(self, context: Context, command: NDArray[np.float64]) -> None:
         """Open the clutch; the slave's commanded pose X_WS stays at `command` (7,)."""
         references = context.get_discrete_state(0).CopyToVector()
         references[:7], references[14] = command, 0.0
@@ -127,7 +127,7 @@ class KinematicScaling(DoubleOnly, LeafSystem):
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
         pose, references = self._pose.Eval(context), context.get_discrete_state(0).value()
-        _command_into(pose, references, *self._scaling, output.get_mutable_value())
+        _pose_command_into(pose, references, *self._scaling, output.get_mutable_value())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         references = discrete_state.get_mutable_value(0)
@@ -137,6 +137,6 @@ class KinematicScaling(DoubleOnly, LeafSystem):
         pose = self._pose.Eval(context)
         if not np.isfinite(pose).all():  # the reference must be finite
             return
-        _command_into(pose, references, *self._scaling, references[:7])
+        _pose_command_into(pose, references, *self._scaling, references[:7])
         references[7:14] = pose
         references[14] = float(engage)

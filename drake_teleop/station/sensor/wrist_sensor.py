@@ -81,7 +81,7 @@ from drake_teleop.station.slave.plant_dynamics import (
     PROXIMITY_FAR,
     PROXIMITY_NEAR_MONITORED,
     PROXIMITY_TOUCHING,
-    assemble_state,
+    assemble_plant_state,
     environment_wrench,
     plant_rates,
     plant_rates_under_wrench,
@@ -182,7 +182,7 @@ def append_step_to_queue(tail, time, state, around):
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
-    assemble_state(state, around, entry[1:])
+    assemble_plant_state(state, around, entry[1:])
     tail[1] += 1.0
 
 
@@ -238,7 +238,7 @@ def take_due_samples(
     now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
     start_dot, end_dot = scratch[4, : 2 * half], now_dot
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
-    assemble_state(state, around, now)
+    assemble_plant_state(state, around, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
     _torque_after_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
@@ -359,7 +359,7 @@ class WristSensor(LeafSystem):
         self._acceleration = self.DeclareVectorInputPort("slave_acceleration", n)
         self._applied = self.DeclareVectorInputPort("applied_wrench_W", 6)
         self._sheet = self._contacts = self._noise = self._plant = None
-        if slave.sensed_sheet is not None:
+        if slave.sheet_in_compiled_law is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         if contact.plant_size:
             self._plant = self.DeclareVectorInputPort("plant_state", contact.plant_size)
@@ -542,7 +542,7 @@ class WristSensor(LeafSystem):
         n = self._n
         state, around = self._arm_state_and_surroundings(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
-        assemble_state(state, around, x)
+        assemble_plant_state(state, around, x)
         if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
@@ -604,9 +604,9 @@ def AddCompiledWristSensor(
             ),
         )
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
-    if slave.sensed_sheet is not None:
+    if slave.sheet_in_compiled_law is not None:
         builder.Connect(
-            slave.plant.get_state_output_port(slave.sensed_sheet),
+            slave.plant.get_state_output_port(slave.sheet_in_compiled_law),
             sensor.GetInputPort("sheet_state"),
         )
     if slave.contact.plant_size:

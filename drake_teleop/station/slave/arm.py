@@ -53,7 +53,7 @@ FRAME_STATE_SIZE = 21
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """Serial chain of n joints from the world to the sensor frame S, as arrays.
+    """Serial arm of n joints from the world to the sensor frame S, as numeric arrays.
 
     Link frame L_j moves about or along its z axis and coincides with joint frame J_j at q_j = 0;
     L_0 is the world. Welded bodies belong to their link; bodies beyond S belong to the load.
@@ -87,7 +87,7 @@ class ArmModel:
 
     @property
     def middle_positions(self) -> Array:
-        """Middles (n,) of the joint ranges; without both limits the position nearest to 0."""
+        """Middles (n,) of the joint ranges; for open ranges the permitted position nearest 0."""
         bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
         with np.errstate(invalid="ignore"):  # inf - inf
             return np.where(
@@ -100,7 +100,7 @@ class ArmModel:
 
     @property
     def load(self) -> Array:
-        """Inertial parameters phi (10,) of the load about So, in S; a view of `table`."""
+        """Inertial parameters phi (10,) of the load about So, in S; changes also change `table`."""
         return self.table[-1, PHI_COLUMN:ROTOR_COLUMN]
 
     def with_load(self, phi: Array) -> ArmModel:
@@ -111,7 +111,7 @@ class ArmModel:
 
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
-    """Replace the previous link's pose in the state x by that of link `row`; return p_PL_W [m]."""
+    """Replace the pose of the previous link P in the state x by that of link L; return p_PL_W."""
     joint = table[row]
     p_PL_P = vector_at(joint, TRANSLATION_COLUMN)
     if joint[IS_PRISMATIC_COLUMN] != 0.0:
@@ -129,7 +129,7 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 
 @njit(cache=True, inline="always")
-def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
+def _advance_motion(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = vector_at(x, 3), vector_at(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, add_cross_product(cross(alpha, r), omega, cross(omega, r)))
@@ -141,7 +141,7 @@ def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: A
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
-    """Return accelerations s + g (N, 3) of So for specific forces s (N, 3), in S, at q (N, n)."""
+    """Return accelerations s + g (N, 3) of So from specific forces s (N, 3), in S, at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
         acceleration_into(arm.table, q[k], s[k], out[k])
@@ -182,7 +182,7 @@ def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None
 
 @njit(cache=True)
 def jacobian(table: Array, q: Array, J_out: Array) -> None:
-    """Write the Jacobian (6, n) at So, ``[v_WS; omega_WS] = J v``, in W, to J_out."""
+    """Write the Jacobian J (6, n) at So, in W, to J_out: ``[v_WS; omega_WS] = J v``."""
     jacobian_and_pose(table, q, J_out, np.empty(21))
 
 
@@ -211,12 +211,12 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 
 @njit(cache=True)
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write s [m/s^2], omega_WS, alpha_WS in S, then p_WS [m], R_WS by rows, to out (21,)."""
+    """Write specific force s, omega_WS, alpha_WS in S, then p_WS, R_WS by rows, to out (21,)."""
     n = table.shape[0] - 1
     _set_world_at_rest(table, out)
     for row in range(n):
-        _advance_state(table, row, q[row], v[row], vdot[row], out)
-    _advance_state(table, n, 0.0, 0.0, 0.0, out)
+        _advance_motion(table, row, q[row], v[row], vdot[row], out)
+    _advance_motion(table, n, 0.0, 0.0, 0.0, out)
     R_SW = transposed(matrix_at(out, 12))
     for i in range(0, 9, 3):
         out[i], out[i + 1], out[i + 2] = apply_matrix(R_SW, vector_at(out, i))
@@ -224,20 +224,20 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 @njit(cache=True)
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Write [s, omega, alpha, p_WL, R_WL] in W of each link, and of S, to out (n+1, 21)."""
+    """Write the state [s, omega, alpha, p_WL, R_WL] of each link, and of S, to out (n+1, 21)."""
     n = table.shape[0] - 1
     _set_world_at_rest(table, out[0])
     for row in range(n):
         if row > 0:
             out[row] = out[row - 1]
-        _advance_state(table, row, q[row], v[row], vdot[row], out[row])
+        _advance_motion(table, row, q[row], v[row], vdot[row], out[row])
     out[n] = out[n - 1]
-    _advance_state(table, n, 0.0, 0.0, 0.0, out[n])
+    _advance_motion(table, n, 0.0, 0.0, 0.0, out[n])
 
 
 @njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Write a link's z axis, origin, inertial force and moment about Wo, in W, to `link[row]`."""
+    """Write z axis, origin, inertial force and moment about Wo of a link, in W, to `link[row]`."""
     phi, wrench, R_WL, p_WL = table[row, PHI_COLUMN:], link[row], matrix_at(x, 12), vector_at(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], vector_at(phi, 1), symmetric_at(phi, 4)
     s, omega, alpha = (
@@ -280,7 +280,7 @@ def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
 def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Array) -> None:
     """Write joint torques (n,) [N m] by recursive Newton-Euler (Luh, Walker, Paul 1980).
 
-    They include rotors, joint damping, gravity and load, not contact and dry friction.
+    They include rotors, joint damping, gravity and load, but neither contact nor dry friction.
     """
     n = table.shape[0] - 1
     x = np.empty(21)
@@ -288,9 +288,9 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance_state(table, row, q[row], v[row], vdot[row], x)
+            _advance_motion(table, row, q[row], v[row], vdot[row], x)
         else:
-            _advance_state(table, row, 0.0, 0.0, 0.0, x)
+            _advance_motion(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
     _project_on_joints(table, link, tau_out)
     for row in range(n):
@@ -305,7 +305,7 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
-    """Add a link's inertial parameters phi (10,) about Wo, in W, to `inertia`."""
+    """Add inertial parameters phi (10,) of a link about Wo, in W, to `inertia` (10,)."""
     phi, p = table[row, PHI_COLUMN:], vector_at(x, 9)
     m, h, about_Lo = phi[0], apply_matrix(matrix_at(x, 12), vector_at(phi, 1)), symmetric_at(phi, 4)
     inertia[0] += m
@@ -326,9 +326,9 @@ def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None
 
 @njit(cache=True)
 def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
-    """Write the lower half of the mass matrix M (n, n) by composite rigid bodies; overwrite `link`.
+    """Write the lower half of the mass matrix to M (n, n) and overwrite `link`.
 
-    Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
+    Composite rigid bodies: Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
     """
     n = M.shape[0]
     for row in range(n):
@@ -379,7 +379,7 @@ def solve_positive_definite(M: Array, x: Array) -> None:
 def forward_dynamics(
     table: Array, q: Array, v: Array, tau: Array, wrench_W: Array, vdot_out: Array
 ) -> None:
-    """Write joint accelerations vdot: M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
+    """Write joint accelerations vdot of M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
     F is the wrench `wrench_W` on the load, about the world's origin [N, N m].
     """
@@ -391,9 +391,9 @@ def forward_dynamics(
     _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance_state(table, row, q[row], v[row], 0.0, x)
+            _advance_motion(table, row, q[row], v[row], 0.0, x)
         else:
-            _advance_state(table, row, 0.0, 0.0, 0.0, x)
+            _advance_motion(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
         _composite_inertia(table, row, x, inertia[row])
     for k in range(6):
@@ -409,7 +409,7 @@ def forward_dynamics(
 
 @njit(cache=True)
 def pose_into(arm, q, pose):
-    """Write the pose X_WS (7,) [qw qx qy qz px py pz] of an arm table at q (n,) [rad]."""
+    """Write X_WS [qw qx qy qz px py pz] at q (n,) [rad] to `pose`; `arm` is `ArmModel.table`."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm, q, R, p)
     orientation = quaternion_of_matrix(R)

@@ -1,4 +1,4 @@
-"""Conversion of a finalized MultibodyPlant to an `ArmModel`, and defaults for its limits."""
+"""Conversion of a finalized MultibodyPlant to an `ArmModel`, and defaults for joint limits."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def ArmModelFromPlant(
     model_instance: ModelInstanceIndex,
     sensor_frame_name: str = "sensor",
 ) -> ArmModel:
-    """Return the chain from the world to the sensor frame of a finalized plant.
+    """Return the arm between the world and the sensor frame of a finalized plant.
 
-    A DrakeTeleopError is raised unless it consists of welds, revolute and prismatic joints without
-    branches that move.
+    A DrakeTeleopError is raised unless all its joints are revolute, prismatic or welds, and no
+    other joint moves on it.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -94,11 +94,11 @@ def ArmModelFromPlant(
     rows = {joint.child_body().index(): row for row, joint in enumerate(joints)}
     for index in inboard_joints:
         body = plant.get_body(index)
-        body_row = _table_row(body, inboard_joints, rows, frame_S.body())
+        body_row = _table_row_of_body(body, inboard_joints, rows, frame_S.body())
         if body_row is not None:
             X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
-            table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_of_body(M_B, X_LB)
+            table[body_row, PHI_COLUMN:ROTOR_COLUMN] += _phi_about_link_origin(M_B, X_LB)
     lower, upper = np.array([_joint_limits(j) for j in joints]).T.copy()
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
@@ -144,21 +144,21 @@ def _joint_chain(
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
             raise DrakeTeleopError(
-                f"the chain to the sensor contains a {joint.type_name()} joint",
+                f"the arm up to the sensor contains an unsupported {joint.type_name()} joint",
                 where=joint.name(),
                 remedy="weld the arm's base to the world; up to the sensor, use joints of one axis",
             )
         body = joint.parent_body()
     if not joints:
         raise DrakeTeleopError(
-            f"no moving joint between the world and {frame_S.name()}",
+            f"no moving joint is between the world and {frame_S.name()}",
             where="sensor_frame",
             remedy="name a frame or link that the arm moves",
         )
     return joints[::-1]
 
 
-def _table_row(
+def _table_row_of_body(
     body: RigidBody,
     inboard_joints: dict[BodyIndex, Joint],
     rows: dict[BodyIndex, int],
@@ -179,38 +179,37 @@ def _table_row(
         body = joint.parent_body()
     if moving is not None:
         raise DrakeTeleopError(
-            f"link {body.name()} carries a moving part beside the chain to the sensor",
+            f"the joint moves on link {body.name()}, but is not between the world and the sensor",
             where=moving.name(),
             remedy="weld that joint",
         )
     return rows[body.index()]
 
 
-def _phi_of_body(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
-    """Return the inertial parameters phi (10,) of a body B about the origin of L, in L."""
+def _phi_about_link_origin(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
     return np.array([M_BLo_L.get_mass(), *M_BLo_L.CalcComMoment(), *I_BLo_L[np.triu_indices(3)]])
 
 
-def _actuators(plant: MultibodyPlant, joint: Joint) -> list[JointActuator]:
+def _actuators_of_joint(plant: MultibodyPlant, joint: Joint) -> list[JointActuator]:
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     return [a for a in actuators if a.joint().index() == joint.index()]
 
 
 def _reflected_inertia(plant: MultibodyPlant, joint: Joint) -> float:
-    return sum(a.default_reflected_inertia() for a in _actuators(plant, joint))
+    return sum(a.default_reflected_inertia() for a in _actuators_of_joint(plant, joint))
 
 
 def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
-    return min((a.effort_limit() for a in _actuators(plant, joint)), default=np.inf)
+    return min((a.effort_limit() for a in _actuators_of_joint(plant, joint)), default=np.inf)
 
 
 def with_all_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
-    """Return the arm with defaults for missing limits, and one text per assumption.
+    """Return the arm with defaults for missing joint limits, and one text per assumed default.
 
     `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is added to the text
     about accelerations.
@@ -238,13 +237,13 @@ def with_all_limits(
         np.where(half_limited & np.isinf(upper), lower + width, upper),
     )
     speed = np.where(slides, slide_speed, _DEFAULT_SPEED_RAD_S)
-    velocity = np.where(_is_specified(arm.velocity_limit), arm.velocity_limit, speed)
-    effort = np.where(_is_specified(arm.effort_limit), arm.effort_limit, np.inf)
+    velocity = np.where(_is_positive_and_finite(arm.velocity_limit), arm.velocity_limit, speed)
+    effort = np.where(_is_positive_and_finite(arm.effort_limit), arm.effort_limit, np.inf)
     specified = arm.acceleration_limit
     if acceleration:
         if len(acceleration) not in (1, n):
             raise DrakeTeleopError(
-                f"{len(acceleration)} acceleration limits for {n} joints",
+                f"{len(acceleration)} acceleration limits, but {n} joints",
                 where=where,
                 remedy="give one for all joints or one for each",
             )
@@ -255,7 +254,7 @@ def with_all_limits(
         upper=upper,
         velocity_limit=velocity,
         acceleration_limit=np.where(
-            _is_specified(specified), specified, velocity / _TIME_TO_FULL_SPEED_S
+            _is_positive_and_finite(specified), specified, velocity / _TIME_TO_FULL_SPEED_S
         ),
         effort_limit=effort,
     )
@@ -267,11 +266,11 @@ def with_all_limits(
         (unlimited, "turns without end", f"a range of +-{reach:g} m"),
         (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
         (
-            ~_is_specified(arm.velocity_limit),
+            ~_is_positive_and_finite(arm.velocity_limit),
             f"a speed limit of {_DEFAULT_SPEED_RAD_S:.4g} rad/s",
             f"a speed limit of {_DEFAULT_PRISMATIC[1]:g} m/s",
         ),
-        (~_is_specified(specified), acceleration_text, acceleration_text),
+        (~_is_positive_and_finite(specified), acceleration_text, acceleration_text),
         (~np.isfinite(effort), "no torque limit", "no force limit"),
         (~plausible, f"limits in rad, though more than {_MAX_PLAUSIBLE_RANGE_RAD:.4g} apart,", ""),
     ):
@@ -283,8 +282,7 @@ def with_all_limits(
     return completed, assumptions
 
 
-def _is_specified(limits: Array) -> NDArray[np.bool_]:
-    """Return (n,) booleans: True for finite limits above 0; exporters write 0 for unknown ones."""
+def _is_positive_and_finite(limits: Array) -> NDArray[np.bool_]:
     return np.isfinite(limits) & (limits > 0)
 
 

@@ -1,4 +1,4 @@
-"""Joints of a parsed plant: welds of base and other joints, motors of the chain to the sensor."""
+"""Edits of a parsed plant: welds of base and held joints, motors of the joints up to the sensor."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from pydrake.multibody.tree import (
 )
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.model.model_tree import WORLD
+from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import join_names
 
 # Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
 # 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
 _ROTOR_MASS_KG = 0.14
-_SLIDING_MOTOR_KG = 5.0  # mass that moves with a prismatic joint instead
+_SLIDER_MASS_KG = 5.0  # mass that moves with a prismatic joint instead
 
 
 def is_joint_moving(plant: MultibodyPlant, index: JointIndex) -> bool:
@@ -44,7 +44,7 @@ def check_tree(plant: MultibodyPlant, where: str) -> None:
             other = parents.get(child.index())
             on = joint.name() if other is None else f"two joints, {other.name()} and {joint.name()}"
             raise DrakeTeleopError(
-                f"{child.name()} is the child of {on}",
+                f"link {child.name()} is the child of {on}",
                 where=where,
                 remedy="an arm is a tree: each link is the child of one joint, the world of none",
             )
@@ -55,7 +55,7 @@ def check_tree(plant: MultibodyPlant, where: str) -> None:
             index = parents[index].parent_body().index()
             if index in passed:
                 raise DrakeTeleopError(
-                    f"its joints form a circle through {plant.get_body(index).name()}",
+                    f"its joints form a loop through {plant.get_body(index).name()}",
                     where=where,
                     remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
                 )
@@ -65,7 +65,7 @@ def check_tree(plant: MultibodyPlant, where: str) -> None:
 def weld_base(
     plant: MultibodyPlant, frame: Frame, X_WBase: RigidTransform | None, where: str
 ) -> list[JointIndex]:
-    """Weld a free base to the world; return the joints up to S, from the base outwards.
+    """Weld a free base to the world at `X_WBase`; return the joints from the base to `frame`.
 
     A DrakeTeleopError is raised if the model fixes its base and `X_WBase` is not the identity.
     """
@@ -79,7 +79,7 @@ def weld_base(
         plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
     elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
         raise DrakeTeleopError(
-            f"the model welds {chain[-1].child_body().name()} to the world itself",
+            f"the model already welds its base {chain[-1].child_body().name()} to the world",
             where=where,
             remedy="leave slave.base_pose out, or remove that joint from the model",
         )
@@ -92,7 +92,7 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
     free = [body for body in bodies if body.index() not in held]
     for body in free:
         plant.WeldFrames(plant.world_frame(), body.body_frame())
-    names = [body.name() for body in free if body.name() != WORLD]
+    names = [body.name() for body in free if body.name() != WORLD_NAME]
     return (
         [f"not connected to the arm and welded to the world: {join_names(names)}"] if names else []
     )
@@ -101,7 +101,7 @@ def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceInd
 def check_chain(
     plant: MultibodyPlant, chain: list[JointIndex], dependent: dict[str, str], where: str
 ) -> None:
-    """Raise DrakeTeleopError for joints of the chain that are coupled or have several axes."""
+    """Raise DrakeTeleopError if a joint of the chain has several axes or is in `dependent`."""
     for joint in (plant.get_joint(index) for index in chain):
         for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
             if name in dependent:
@@ -113,7 +113,7 @@ def check_chain(
         one_axis = isinstance(joint, (RevoluteJoint, PrismaticJoint))
         if joint.num_velocities() > 0 and not one_axis:
             raise DrakeTeleopError(
-                f"{joint.name()} is a {joint.type_name()} joint",
+                f"{joint.name()} is a {joint.type_name()} joint, which has several axes",
                 where=where,
                 remedy="up to the sensor, use joints that turn about one axis or slide along it",
             )
@@ -122,7 +122,7 @@ def check_chain(
 def weld_joints_at(
     plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
 ) -> list[str]:
-    """Weld joints, by name, at the positions `hold` [rad, m]; return notes for the user."""
+    """Weld the joints named in `hold` at its positions [rad, m]; return notes for the user."""
     known = {
         plant.get_joint(k).name(): plant.get_joint(k) for k in joints if is_joint_moving(plant, k)
     }
@@ -130,7 +130,7 @@ def weld_joints_at(
         joint = known.get(name)
         if joint is None:
             raise DrakeTeleopError(
-                f"no moving joint is named {name!r}",
+                f"the model has no moving joint {name!r}",
                 where="slave.hold",
                 remedy=f"name one of {', '.join(sorted(known))}",
             )
@@ -149,7 +149,7 @@ def weld_joints_at(
 def weld_other_joints(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
-    """Weld moving joints outside the chain at their defaults; return notes for the user."""
+    """Weld moving joints that are in neither `before` nor `chain`; return notes for the user."""
     for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     added = set(plant.GetJointIndices()) - before - set(chain)
@@ -185,7 +185,8 @@ def add_actuators(
 ) -> None:
     """Give each moving joint of the chain one actuator, in the order of the chain.
 
-    `limits`: effort limits by joint, without an entry unlimited; None keeps Drake's.
+    `limits` contains effort limits by joint; joints without an entry are unlimited. None keeps
+    the limits of existing actuators.
     """
     moving = [index for index in chain if is_joint_moving(plant, index)]
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
@@ -225,12 +226,12 @@ def set_torque_limits(
 def assume_rotor_inertias(
     plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
 ) -> list[str]:
-    """Give joints a rotor inertia if the links that they move have none; return notes for the user.
+    """Give a joint a rotor inertia if its links have no inertia; return notes for the user.
 
-    The links of a joint at an `auxiliary` body include those of the next joint.
+    Beyond an `auxiliary` body, which the model does not have, the next joint's links count too.
     """
     joints = [plant.get_joint(index) for index in chain]
-    inertia = _ROTOR_MASS_KG * _chain_length(joints, frame) ** 2
+    inertia = _ROTOR_MASS_KG * _length_of_moving_chain_m(joints, frame) ** 2
     actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
@@ -241,13 +242,13 @@ def assume_rotor_inertias(
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())
-        motor[joint.index()].set_default_rotor_inertia(_SLIDING_MOTOR_KG if slides else inertia)
+        motor[joint.index()].set_default_rotor_inertia(_SLIDER_MASS_KG if slides else inertia)
         motor[joint.index()].set_default_gear_ratio(1.0)
     return [
         f"{what}, as the model has no inertia there, for {join_names(names)}"
         for what, names in (
             (f"a rotor inertia of {inertia:.3g} kg m^2", turning),
-            (f"a moved mass of {_SLIDING_MOTOR_KG:g} kg", sliding),
+            (f"a moved mass of {_SLIDER_MASS_KG:g} kg", sliding),
         )
         if names
     ]
@@ -266,8 +267,7 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str])
     return False
 
 
-def _chain_length(chain: list[Joint], frame: Frame) -> float:
-    """Return the length [m] of the chain from its first moving joint to `frame`."""
+def _length_of_moving_chain_m(chain: list[Joint], frame: Frame) -> float:
     while chain and chain[0].num_velocities() == 0:
         chain = chain[1:]
     ends = [*(joint.frame_on_parent() for joint in chain[1:]), frame][: len(chain)]

@@ -1,4 +1,4 @@
-"""Contact wrench from Drake's contact results, for meshes, cylinders and hydroelastic contact."""
+"""Contact wrench on the tool from Drake's contact results, for all shapes and contact models."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def contact_wrench_W(
 
 
 class DrakeContact(LeafSystem):
-    """Block with the contact wrench on the tool, for the log, from the plant's contact results."""
+    """Block that outputs the contact wrench on the tool from the plant's contact results."""
 
     __slots__ = ONE_DICT
 
@@ -62,7 +62,7 @@ Array = NDArray[np.float64]
 
 
 class ContactTwin:
-    """Copy of the plant that computes contact at states other than the simulated plant's."""
+    """Copy of the slave's plant that computes contact at any state, beside the simulated plant."""
 
     def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
         builder = DiagramBuilder()

@@ -1,4 +1,4 @@
-"""Translation of Drake's errors about model files."""
+"""Conversion of Drake's errors about model files to DrakeTeleopErrors."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from typing import TypeAlias
 from drake_teleop.common.errors import MAX_LINE_LENGTH, DrakeTeleopError, silent_stderr
 
 #: Expected kind of file, and the remedy for missing packages.
-Description: TypeAlias = tuple[str, str]
-ROBOT_DESCRIPTION: Description = ("robot", "with --package-path for package://")
-SCENE_DESCRIPTION: Description = ("scene", "its package:// addresses in folders around it")
+ModelDescription: TypeAlias = tuple[str, str]
+ROBOT_DESCRIPTION: ModelDescription = ("robot", "with --package-path for package://")
+SCENE_DESCRIPTION: ModelDescription = ("scene", "its package:// addresses in folders around it")
 # Places in Drake's source and in repaired texts, which the user does not have.
 _FAILURE_PREFIX = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
 _REPAIRED_TEXT = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
 _REPAIRED_COPY_PATTERN = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
-_NUM_CHARS_OF_PLACE = 30  # " ... " and separators of the error line
+_NUM_SEPARATOR_CHARS = 30  # " ... " and separators of the error line
 
 
 @contextmanager
 def translate_drake_errors(
-    path: Path, expected: Description = ROBOT_DESCRIPTION, folder: str = ""
+    path: Path, expected: ModelDescription = ROBOT_DESCRIPTION, folder: str = ""
 ) -> Iterator[None]:
     """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
 
-    `folder` contains repaired copies of files; messages omit it.
+    Messages name the original files instead of repaired copies in `folder`.
     """
     try:
         yield
@@ -41,7 +41,7 @@ def translate_drake_errors(
             reason = re.sub(_REPAIRED_COPY_PATTERN.format(folder=re.escape(folder)), r"\2", reason)
         what = f"cannot be read as a {expected[0]}"
         remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
-        room = MAX_LINE_LENGTH - len(f"{path}{what}{remedy}") - _NUM_CHARS_OF_PLACE
+        room = MAX_LINE_LENGTH - len(f"{path}{what}{remedy}") - _NUM_SEPARATOR_CHARS
         if len(reason) > room:
             reason = f"{reason[:room]} ..."
         raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None
@@ -49,7 +49,7 @@ def translate_drake_errors(
 
 @contextmanager
 def raise_logged_errors() -> Iterator[None]:
-    """Raise RuntimeError for errors that Drake only logs, and for replaced inertias."""
+    """Raise RuntimeError if Drake logs an error, or a warning about an inertia."""
     errors: list[str] = []
 
     def keep_record(record: logging.LogRecord) -> bool:

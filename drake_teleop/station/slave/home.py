@@ -16,7 +16,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.slave_config import Slave
 
 # Smallest eigenvalue of a valid mass matrix [kg m^2]: a grain of sand at an arm's length.
-_MIN_INERTIA = 1e-9
+_MIN_INERTIA_KG_M2 = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 # Shares of the joint ranges, about their middles, that are searched in this order.
@@ -28,7 +28,7 @@ _Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 def positions_with_tool_down(
     arm: ArmModel, position: NDArray[np.float64], R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[NDArray[np.float64], IkStatus]:
-    """Return joint positions (n,) [rad] for S at `position` [m, in W] and `R_WS`, and status."""
+    """Return joint positions (n,) [rad] for S at `position` (W) [m] and `R_WS`, and `IkStatus`."""
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
@@ -42,7 +42,7 @@ def positions_with_tool_down(
     return q, status
 
 
-def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
+def home_posture(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
     q, status = positions_with_tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
@@ -59,10 +59,10 @@ def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
 
 def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
     if not slave.home:
-        return home_position(arm, slave.position)
+        return home_posture(arm, slave.position)
     if len(slave.home) != arm.num_joints:
         raise DrakeTeleopError(
-            f"{len(slave.home)} joint positions for {arm.num_joints} joints",
+            f"{len(slave.home)} joint positions are given for {arm.num_joints} joints",
             where="slave.home",
             remedy=f"give one for each of {', '.join(arm.joint_names)}",
         )
@@ -71,16 +71,17 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
     if outside.any():
         k = int(outside.argmax())
         raise DrakeTeleopError(
-            f"{arm.joint_names[k]} at {q[k]:g} is outside {arm.lower[k]:.4g} to {arm.upper[k]:.4g}",
+            f"joint {arm.joint_names[k]} at {q[k]:g} is outside its limits, {arm.lower[k]:.4g} to"
+            f" {arm.upper[k]:.4g}",
             where="slave.home",
             remedy="give a position within these limits",
         )
     return q
 
 
-def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
-    """Raise DrakeTeleopError for a joint without inertia or with a motor too weak to hold q."""
-    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA:
+def check_motor_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
+    """Raise DrakeTeleopError if a joint moves no inertia, or its motor cannot hold posture q."""
+    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA_KG_M2:
         raise DrakeTeleopError(
             "the mass matrix is singular: the links have too little inertia",
             where="slave.model",
@@ -93,7 +94,7 @@ def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
         unit = "N" if arm.table[k, IS_PRISMATIC_COLUMN] else "N m"
         raise DrakeTeleopError(
             f"the arm cannot hold its {arm.phi_load[0]:.3g} kg at the start: {arm.joint_names[k]} "
-            f"needs {abs(torque[k]):.3g} of its {arm.effort_limit[k]:.3g} {unit}",
+            f"needs {abs(torque[k]):.3g} {unit}, but its limit is {arm.effort_limit[k]:.3g} {unit}",
             where="slave.tool",
             remedy="give a lighter tool or payload, start nearer to the base, or set"
             " slave.torque_limits if the model's limits are wrong",

@@ -37,7 +37,7 @@ _LIMIT_TOLERANCE_RAD = 1e-9
 
 
 class IkStatus(IntEnum):
-    """Status of an inverse kinematics; the reference is the posture where the search starts.
+    """Status of an inverse kinematics, whose search starts at the reference posture.
 
     The numeric method reports WRIST_SINGULAR if the last three axes are nearly coplanar, and
     SHOULDER_SINGULAR at other singularities.
@@ -46,9 +46,9 @@ class IkStatus(IntEnum):
     OK = 0
     """The pose is met."""
     WRIST_SINGULAR = 1
-    """The pose is met; axes 4 and 6 are aligned: q4 is kept and q6 completes the rotation."""
+    """The pose is met; axes 4 and 6 are aligned: q4 is that of the reference, q6 adds the rest."""
     SHOULDER_SINGULAR = 2
-    """The pose is met; the wrist centre is on the first axis: q1 is kept."""
+    """The pose is met; the wrist centre is on the first axis: q1 is that of the reference."""
     OUT_OF_REACH = 3
     """The orientation is met; the wrist centre moves towards the shoulder into reach."""
     JOINT_LIMIT = 4
@@ -70,7 +70,10 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 def _all_solutions_into(
     R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array
 ) -> int:
-    """Write all eight solutions to q (8, 6), nan if out of reach; `clamp` moves p into reach."""
+    """Write all eight solutions to q (8, 6); return the `IkStatus`.
+
+    Out of reach they are nan, or with `clamp` those of the nearest reachable wrist centre.
+    """
     status = _OK
     x = p[0] - FLANGE_OFFSET_M * R[0, 2]
     y = p[1] - FLANGE_OFFSET_M * R[1, 2]
@@ -132,7 +135,7 @@ def _all_solutions_into(
 
 @njit(cache=True)
 def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> float:
-    """Return angle + 2 pi k within the limits, nearest to `near`; nan if none exists."""
+    """Return the angle plus full turns that is nearest to `near` within the limits, or nan."""
     full_turn = 2.0 * np.pi
     angle += full_turn * np.round((near - angle) / full_turn)
     if angle > upper + _LIMIT_TOLERANCE_RAD:
@@ -145,7 +148,7 @@ def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> fl
 
 
 @njit(cache=True)
-def _nearest_branch(
+def _nearest_branch_into(
     R: Array, p: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
     if not np.isfinite(reference.sum()):
@@ -189,11 +192,11 @@ def solve_pose_command(
     R[0, 0], R[0, 1], R[0, 2] = 1 - k * (y * y + z * z), k * (x * y - w * z), k * (x * z + w * y)
     R[1, 0], R[1, 1], R[1, 2] = k * (x * y + w * z), 1 - k * (x * x + z * z), k * (y * z - w * x)
     R[2, 0], R[2, 1], R[2, 2] = k * (x * z - w * y), k * (y * z + w * x), 1 - k * (x * x + y * y)
-    return _nearest_branch(R, pose[4:7], reference, lower, upper, max_step, q)
+    return _nearest_branch_into(R, pose[4:7], reference, lower, upper, max_step, q)
 
 
 def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
-    """Return all joint positions (8, 6) for a pose, in (-pi, pi] [rad], nan if out of reach.
+    """Return the eight solutions (8, 6) for a pose, in (-pi, pi] [rad], nan if out of reach.
 
     Row ``4 a + 2 b + c``: a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has
     q5 <= 0. Joint limits are ignored; an undetermined joint is 0.
@@ -213,13 +216,13 @@ def nearest_branch(
 ) -> tuple[Array, IkStatus]:
     """Return the solution within the limits nearest to a reference (6,) [rad], and the `IkStatus`.
 
-    Each joint moves by `max_step` [rad] at most. Out of reach, the wrist centre moves towards the
-    shoulder onto the boundary. Without a solution the reference is returned, within the limits.
+    Each joint moves by `max_step` [rad] at most. Out of reach, the wrist centre is the nearest one
+    in reach. Without a solution the reference is returned, within the limits.
     """
     q = np.empty(6)
     # Drake's matrices are stored by columns; one layout avoids a second compilation.
     R = np.ascontiguousarray(R_WS)
-    status = _nearest_branch(R, p_WS, q_reference, lower, upper, max_step, q)
+    status = _nearest_branch_into(R, p_WS, q_reference, lower, upper, max_step, q)
     return q, IkStatus(status)
 
 
@@ -236,9 +239,9 @@ def has_closed_form(arm: ArmModel) -> bool:
 
 
 class InverseKinematics(LeafSystem):
-    """Block that converts a commanded pose to joint positions in closed form, without state.
+    """Block that converts a commanded pose to joint positions in closed form.
 
-    At a joint limit the arm waits instead of changing its configuration, see `MAX_STEP`.
+    At a joint limit the command stays instead of jumping to another solution, see `MAX_STEP`.
 
     .. pydrake_system::
 

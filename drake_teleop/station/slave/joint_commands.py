@@ -37,16 +37,16 @@ IK_METHODS: Registry[Callable[[ArmModel, Array, float], LeafSystem]] = Registry(
 
 # Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
 # mechanical stops of commercial arms are farther out.
-_RANGE_TOLERANCE = 0.01
+_RANGE_TOLERANCE_SHARE = 0.01
 
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
-    """Return the key in `IK_METHODS` for the scenario's setting, or raise DrakeTeleopError."""
+    """Return the key in `IK_METHODS` for setting `name`; DrakeTeleopError if the arm has none."""
     if name == AUTOMATIC_METHOD:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
         raise DrakeTeleopError(
-            "the closed form is that of an RX90 whose base stands at the world's origin",
+            "the closed form requires the geometry of an RX90 with its base at the world's origin",
             where="slave.inverse_kinematics",
             remedy=f"set it to {AUTOMATIC_METHOD} or numeric",
         )
@@ -91,7 +91,7 @@ class JointFollower(LeafSystem):
 
 
 class JointTrajectory(LeafSystem):
-    """Block that plays one period of an excitation trajectory from `start` [s], else rests."""
+    """Block that commands one period of an excitation trajectory from `start` [s], else rest."""
 
     __slots__ = ONE_DICT
 
@@ -106,21 +106,21 @@ class JointTrajectory(LeafSystem):
 
 
 class SlaveMonitor(LeafSystem):
-    """Block that raises DrakeTeleopError if a joint leaves its range by more than 1 % of it."""
+    """Block that raises DrakeTeleopError if a joint leaves its range by over 1 % of the range."""
 
     __slots__ = ONE_DICT
 
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()
         self._arm = arm
-        tolerance = _RANGE_TOLERANCE * (arm.upper - arm.lower)
+        tolerance = _RANGE_TOLERANCE_SHARE * (arm.upper - arm.lower)
         self._lower, self._upper = arm.lower - tolerance, arm.upper + tolerance
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check_joint_ranges)
 
-    def _check(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _check_joint_ranges(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]

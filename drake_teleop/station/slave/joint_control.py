@@ -1,4 +1,4 @@
-"""Joint position control of the slave: computed torque in a position and a velocity loop (VI-A)."""
+"""Joint control of the slave: computed torque with position and velocity loop (paper, VI-A)."""
 
 import copy
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ COMPUTED_TORQUE_NAME = "computed_torque"
 @settings
 @dataclass
 class JointControlConfig:
-    """Joint control of the slave: computed torque or a position interface."""
+    """Settings of the slave's joint control: computed torque or a position interface."""
 
     position_bandwidth_hz: float = quantity(
         12.0, "Hz", 0.1, 1e4, "bandwidth of the position loop (E)"
@@ -59,7 +59,7 @@ class JointControlConfig:
 
     @property
     def tracking_delay_s(self) -> float:
-        """Approximate delay of the joints behind a steadily moving command [s]."""
+        """Approximate delay of the joints behind a command of constant speed [s]."""
         interface = self.position_interface
         if interface is not None:
             return interface.lookahead + interface.dead_time + 1 / interface.command_hz
@@ -79,7 +79,7 @@ class JointControlConfig:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE_NAME and self.interface is not None:
             raise DrakeTeleopError(
-                "computed torque uses bandwidths, not an interface",
+                "the servo computed_torque has bandwidths, but no position interface",
                 where=f"{where}.interface",
                 remedy="leave it out, or choose another servo, such as position",
             )
@@ -103,10 +103,10 @@ class JointControlConfig:
 def joint_control_torque(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
-    """Write tau = ID(q, v, kv (clip(kp (q_command - q)) - v)) (n,) [N m], within the torque limits.
+    """Write the computed torque (n,) [N m], tau = ID(q, v, kv (clip(kp (q_command - q)) - v)).
 
-    ID is the inverse dynamics, `state` [q; v]. Invalid encoder readings give gravity compensation
-    at the commanded posture, an invalid command the last torque.
+    ID is the inverse dynamics, `state` [q; v]; tau is limited. Invalid encoder readings give
+    gravity compensation at the commanded posture; an invalid command keeps the last torque.
     """
     if not all_in_range(command):
         return
@@ -128,7 +128,7 @@ def joint_control_torque(
 def servo_gains_and_limits(
     arm: ArmModel, config: JointControlConfig
 ) -> tuple[float, float, Array, Array]:
-    """Return gains kp, kv [1/s] and (n,) limits of joint speed and torque."""
+    """Return position and velocity gain [1/s] and (n,) limits of joint speed and torque."""
     return (
         2 * np.pi * config.position_bandwidth_hz,
         2 * np.pi * config.velocity_bandwidth_hz,
@@ -138,7 +138,7 @@ def servo_gains_and_limits(
 
 
 class JointControl(LeafSystem):
-    """Sampled joint position controller (computed torque).
+    """Block that controls joint positions by computed torque, at a fixed period.
 
     While encoder readings are invalid, the motors only compensate gravity. `q_start` is the posture
     held before the first sample.
@@ -183,9 +183,9 @@ class JointControl(LeafSystem):
 
 
 class HeldTorque(LeafSystem):
-    """Motors that hold a requested torque for a period, within their limits.
+    """Block that holds a requested motor torque for a period, within the limits.
 
-    An invalid request keeps the last torque; `q_start` is the posture held before the first.
+    An invalid request keeps the last torque; the first torque holds the posture `q_start`.
     """
 
     __slots__ = ONE_DICT
@@ -215,12 +215,12 @@ def MakeJointControl(
 
 
 def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """Return the position interface that `servo` of a `joint_control` block names, or None."""
+    """Return the position interface that `servo` in a `joint_control` block names, or None."""
     return copy.deepcopy(POSITION_INTERFACES.get(str((block or {}).get("servo"))))
 
 
 def mass_matrix(arm: ArmModel, q: Array) -> Array:
-    """Return the mass matrix M(q) (n, n) with rotors and tool, from unit joint accelerations."""
+    """Return the mass matrix M(q) (n, n) of the arm with rotors and tool."""
     zeros, weight = np.zeros(len(q)), holding_torque(arm, q)
     columns = np.empty((len(q), len(q)))
     for unit, column in zip(np.eye(len(q)), columns, strict=True):
@@ -247,11 +247,11 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
 
 
 class ServoAtTool(NamedTuple):
-    """Joint servo as a wrench at the tool, K (x_command - x) - D v, for translation and rotation.
+    """Joint servo as an equivalent wrench at the tool, K (x_command - x) - D v.
 
     Attributes:
-        stiffness: (2,) K [N/m, N m/rad].
-        damping: (2,) D [N s/m, N m s/rad].
+        stiffness: (2,) K of translation and rotation [N/m, N m/rad].
+        damping: (2,) D of translation and rotation [N s/m, N m s/rad].
         mass: (2,) mass and inertia of arm and tool [kg, kg m^2].
     """
 
@@ -261,10 +261,10 @@ class ServoAtTool(NamedTuple):
 
 
 def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoAtTool:
-    """Return stiffness, damping and mass of the slave for the passivity methods.
+    """Return stiffness, damping and mass of the slave at the tool, for the passivity methods.
 
-    Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
-    blocks of the inertia Lambda with diag(m, m, m, J, J, J) >= Lambda.
+    Mass m and inertia J bound the inertia Lambda: diag(m, m, m, J, J, J) >= Lambda. Their ratio is
+    that of the largest eigenvalues of its two blocks, their size the smallest possible.
     """
     config.check_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)

@@ -39,7 +39,7 @@ def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
     n = len(joints)
     if len(values) not in (0, 1, n):
         raise DrakeTeleopError(
-            f"has {len(values)} numbers, the arm has {n} joints",
+            f"has {len(values)} numbers, but the arm has {n} joints",
             where="slave.friction",
             remedy=f"give one for all, or {n}, for {', '.join(joints)}",
         )

@@ -31,16 +31,17 @@ from drake_teleop.station.slave.model.repair_report import RepairedModel
 from drake_teleop.station.slave.model.sdf_repair import repair_sdf
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose, repair_urdf
 
+_XACRO_FAULT = "is a xacro file, not a model"
 _XACRO_REMEDY = "run it through xacro first, and give the URDF that comes out"
-_REPAIR_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
+_REPAIR_FUNCTION_OF_SUFFIX = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 
 
 class ModelInPlant(NamedTuple):
-    """Content of a model file in a plant.
+    """Content of a model file that was added to a plant.
 
     Attributes:
-        effort_limits: by joint, unlimited without an entry; None: those of Drake's actuators.
-        folder: converted meshes, which Drake reads later.
+        effort_limits: limits by joint, unlimited without an entry; None: those of the actuators.
+        folder: folder of converted meshes, which Drake reads later.
     """
 
     instances: list[ModelInstanceIndex]
@@ -54,12 +55,12 @@ class ModelInPlant(NamedTuple):
 def read_model(
     plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: ModelPurpose
 ) -> ModelInPlant:
-    """Repair a model's text and parse it into a plant."""
+    """Repair the text of a model file and parse it into a plant."""
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path), remedy="correct the path")
     kind = path.suffix.lower()
     if kind == ".xacro":
-        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO_REMEDY)
+        raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=_XACRO_REMEDY)
     if kind == ".xml":
         read_text(path)  # raises an error for invalid encoding
     if kind == ".yaml":
@@ -68,8 +69,8 @@ def read_model(
     purpose = purpose._replace(has_geometry=plant.geometry_source_is_registered())
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
-    files.share_packages(parser.package_map())
-    files.check(path)
+    files.merge_packages(parser.package_map())
+    files.check_file(path)
     folder = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
     expected = SCENE_DESCRIPTION if purpose.is_scene else ROBOT_DESCRIPTION
@@ -79,7 +80,7 @@ def read_model(
         check_tree(plant, str(path))
     if not purpose.is_scene and plant.num_force_elements() > forces:
         raise DrakeTeleopError(
-            "has springs or other force elements",
+            "the model has springs or other force elements, which are not supported",
             where=str(path),
             remedy="remove them; only motors, gravity and contact move the arm",
         )
@@ -140,9 +141,9 @@ def _repair_file(
     path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
     kind = path.suffix.lower()
-    if kind not in _REPAIR_OF_SUFFIX:
+    if kind not in _REPAIR_FUNCTION_OF_SUFFIX:
         return RepairedModel("", [], {})
     root = read_xml(path)
     if any(element.tag.startswith("xacro:") for element in root.iter()):
-        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO_REMEDY)
-    return _REPAIR_OF_SUFFIX[kind](root, path, files, purpose, folder)
+        raise DrakeTeleopError(_XACRO_FAULT, where=str(path), remedy=_XACRO_REMEDY)
+    return _REPAIR_FUNCTION_OF_SUFFIX[kind](root, path, files, purpose, folder)

@@ -1,4 +1,4 @@
-"""Arms, tools and surroundings from model files, with only the joints up to the sensor moving."""
+"""Parsing of arms, tools and surroundings; only the arm's joints up to the sensor move."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 from drake_teleop.station.slave.model_files import read_model
 
-_MAX_NAMES = 12  # names of frames in an error: the most similar ones
+_MAX_LISTED_NAMES = 12  # names of frames in an error: the most similar ones
 
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """Arm in a plant; `folder` contains converted meshes, which Drake reads later."""
+    """Arm that was parsed into a plant; `folder` contains meshes, which Drake reads later."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
@@ -41,7 +41,7 @@ class ParsedModel:
 
 @dataclass(frozen=True)
 class ParsedTool:
-    """Tool in a plant; `body` is welded to the sensor frame."""
+    """Tool that was parsed into a plant; `body` is welded to the sensor frame."""
 
     body: RigidBody
     assumptions: list[str]
@@ -78,7 +78,7 @@ def ParseModel(
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
         raise DrakeTeleopError(
-            f"its joints belong to several models, {', '.join(names)}",
+            f"the joints up to the sensor belong to several models, {', '.join(names)}",
             where=where,
             remedy="write the chain up to the sensor as one model",
         )
@@ -90,7 +90,7 @@ def ParseModel(
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Parse a tool with one root link, weld the root to S ("sensor_weld"), weld other joints."""
+    """Parse a tool, weld its root link to S by the joint "sensor_weld", and weld its own joints."""
     before = set(plant.GetJointIndices())
     read = read_model(plant, path, package_paths, ModelPurpose(is_tool=True))
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
@@ -99,7 +99,7 @@ def ParseTool(
     if len(roots) != 1:
         names = ", ".join(body.name() for body in roots) or "none"
         raise DrakeTeleopError(
-            f"the tool has {len(roots)} roots: {names}",
+            f"the tool must have one root link, but has {len(roots)}: {names}",
             where=str(path),
             remedy="give one tree of links; its root is welded to the sensor frame",
         )
@@ -132,7 +132,7 @@ def _sensor_frame(
     # Without names that Drake creates for joints.
     ends = ("_parent", "_child", "__model__")
     named = sorted(each for each in names if not each.endswith(ends))
-    nearest = difflib.get_close_matches(name, named, n=_MAX_NAMES, cutoff=0.0)
+    nearest = difflib.get_close_matches(name, named, n=_MAX_LISTED_NAMES, cutoff=0.0)
     known = ", ".join(sorted(nearest))
     raise DrakeTeleopError(
         f"{len(with_frame) or 'no'} frames are named {name!r}",

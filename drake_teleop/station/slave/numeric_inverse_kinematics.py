@@ -50,7 +50,7 @@ _MIN_DAMPING = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
 _INITIAL_DAMPING, _SEARCH_STEPS, _SEARCH_STARTS = 1e-3, 100, 100
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_ZERO_GRADIENT = 1e-3
+_MAX_ZERO_GRADIENT_M = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
 _REACH_TOLERANCE_M = 5e-6
 # The same tolerance for `find_posture`, which stops the search earlier [m].
@@ -73,7 +73,7 @@ _MAX_COPLANAR_VOLUME = 0.1
 
 @njit(cache=True)
 def _jacobian_and_error(table, L, pose, q, x, J, e):
-    """Write Jacobian J (6, n) and pose error e (6,) at q, rotations times L; return |e|^2."""
+    """Write Jacobian J (6, n) and pose error e (6,) at q, with rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
     a = normalized_quaternion((pose[0], pose[1], pose[2], pose[3]))
     R = np.empty((3, 3))
@@ -137,9 +137,9 @@ def _is_held_at_limit(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _damped_step(H, g, damping, q, lower, upper, trial):
-    """Write q plus a damped step within the limits to trial (n,); return the largest component.
+    """Write q plus a damped step to trial (n,); return the largest joint displacement.
 
-    Joints that would pass a limit are fixed there and the others solved again.
+    Joints that would pass a limit are fixed there, and the step of the others is solved again.
     """
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
@@ -169,7 +169,6 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
 
 @njit(cache=True)
 def _best_step_of_joint(J, e, i):
-    """Return the displacement of joint i alone that reduces the error e (6,) most."""
     slope, square = 0.0, 0.0
     for k in range(6):
         slope += J[k, i] * e[k]
@@ -197,11 +196,11 @@ def follow_pose(
         pose: (7,) X_WS.
         reference: (n,) joint positions, normally the last command.
         lower, upper: (n,) joint limits.
-        max_step: (n,) largest distance from the reference.
+        max_step: (n,) largest displacement from the reference.
         posture: (n,) joint positions that a redundant arm approaches.
-        pull: fraction of the distance to the posture.
-        singular: singular value below which the motion is damped [m].
-        steps: maximum number of steps.
+        pull: share of the distance to the posture that is covered by this call.
+        singular: singular value of the Jacobian below which the motion is damped [m].
+        steps: maximum number of Levenberg-Marquardt steps.
     """
     n = q.shape[0]
     low, high = np.empty(n), np.empty(n)
@@ -292,7 +291,7 @@ def follow_pose(
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        if singular > 0.0 and free > _ZERO_GRADIENT * _ZERO_GRADIENT * squared:
+        if singular > 0.0 and free > _MAX_ZERO_GRADIENT_M * _MAX_ZERO_GRADIENT_M * squared:
             return _singularity_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
@@ -317,7 +316,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     """Return joint positions (n,) that meet the pose X_WS (7,), and the `IkStatus`.
 
     The search starts at the reference (n,). Without a solution, the positions nearest to the pose
-    are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
+    are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the status of a singularity.
     """
     n, lower, upper = arm.num_joints, arm.lower, arm.upper
     first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts
@@ -335,7 +334,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
             _SEARCH_STEPS, q,
         )  # fmt: skip
         if found in (_STATUS_OK, _BAD_POSE):
-            return _nearest_turns(arm, q, reference), IkStatus(found)
+            return _nearest_equivalent_joints(arm, q, reference), IkStatus(found)
         squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
@@ -344,17 +343,17 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
                 status = _singularity_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = first + part * width
-    return _nearest_turns(arm, nearest, reference), IkStatus(status)
+    return _nearest_equivalent_joints(arm, nearest, reference), IkStatus(status)
 
 
-def _nearest_turns(arm: ArmModel, q: Array, reference: Array) -> Array:
+def _nearest_equivalent_joints(arm: ArmModel, q: Array, reference: Array) -> Array:
     turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
     nearer = q + np.where(arm.table[:-1, IS_PRISMATIC_COLUMN] == 0, turns, 0.0)
     return np.where((arm.lower <= nearer) & (nearer <= arm.upper), nearer, q)
 
 
 def orientation_length(arm: ArmModel) -> float:
-    """Return the length [m] that weights orientation against position error: reach / 5."""
+    """Return the length [m] that weights orientation against position error: arm length / 5."""
     return float(np.linalg.norm(arm.table[:, TRANSLATION_COLUMN:PHI_COLUMN], axis=1).sum()) / 5.0
 
 
@@ -362,10 +361,10 @@ def orientation_length(arm: ArmModel) -> float:
 def _follow_command(
     table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
 ):  # fmt: skip
-    """Write joint positions q (n,) from the last command towards the pose; return the `IkStatus`.
+    """Write the next command q (n,), from the last one towards the pose; return the `IkStatus`.
 
-    `speed` (n,) contains speed limits; `last` (n + 1,) is the last command and its time [s], which
-    is held if the encoder readings `position` (n,) are invalid.
+    `speed` (n,) contains speed limits, `last` (n + 1,) the last command and its time [s]. Invalid
+    encoder readings `position` (n,) hold the last command.
     """
     n = q.shape[0]
     copy_into(q, 0, last, 0, n)
@@ -411,7 +410,7 @@ class NumericInverseKinematics(LeafSystem):
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _solve(self, context: Context, q: Array) -> int:
+    def _solve_command(self, context: Context, q: Array) -> int:
         last = context.get_discrete_state_vector().value()
         time, pose, position = context.get_time(), self._pose, self._position
         status: int = _follow_command(
@@ -420,10 +419,10 @@ class NumericInverseKinematics(LeafSystem):
         return status
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:
-        self._solve(context, output.get_mutable_value())
+        self._solve_command(context, output.get_mutable_value())
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._solve(context, np.empty(self._joints))
+        output[0] = self._solve_command(context, np.empty(self._joints))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         next_state = discrete_state.get_mutable_value(0)

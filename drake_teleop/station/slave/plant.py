@@ -1,4 +1,4 @@
-"""Plant of the slave: arm, tool and environment."""
+"""Plant of the slave: MultibodyPlant with arm, tool and environment."""
 
 from __future__ import annotations
 
@@ -27,37 +27,37 @@ from drake_teleop.station.slave.arm import FRICTION_COLUMN, ArmModel, forward_ki
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, check_size, with_all_limits
 from drake_teleop.station.slave.chain_joints import set_torque_limits
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
-from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
+from drake_teleop.station.slave.home import R_WS_HOME, check_motor_strength, start_posture
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import (
     AddEnvironment,
-    ContactWith,
+    MakeToolContactModel,
     ToolContactModel,
-    make_no_contact,
+    make_empty_contact_model,
 )
-from drake_teleop.station.slave.tool import AddTool, end_of_shapes
+from drake_teleop.station.slave.tool import AddTool, end_of_tool_shapes
 
 # Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
-_SAME_REACH_M = 1e-3
+_TIP_TOLERANCE_M = 1e-3
 #: Name of the arm's model instance in every plant.
 ARM_INSTANCE_NAME = "arm"
 
 
 @dataclass(frozen=True)
 class SlavePlant:
-    """Plant of the slave, and data for the blocks around it.
+    """Plant of the slave, with the data that other blocks need.
 
     Attributes:
         plant: continuous MultibodyPlant, finalized.
         instance: model instance of the arm's joints.
         tool: index of the tool's body on the sensor.
-        arm: chain up to S, with all bodies beyond S as its load.
+        arm: arm up to S, with all bodies beyond S as its load.
         start: (n,) joint positions at the start [rad].
         X_WS_start: (7,) pose at the start [qw qx qy qz px py pz].
         tip: (3,) p_STip, contact point of the tool [m].
-        assumptions: texts about data missing in the models.
+        assumptions: texts about data that the models do not have.
     """
 
     plant: MultibodyPlant
@@ -75,14 +75,15 @@ class SlavePlant:
 
     @property
     def contact_pairs(self) -> NDArray[np.float64]:
-        """Pairs (k, 28) of shapes for the compiled contact law."""
+        """Pairs of shapes (k, 28) that the compiled contact law covers, `ShapePairs.known`."""
         return self.contact.pairs
 
     @cached_property
     def physics_of_plant(self) -> tuple[NDArray[np.float64], ...]:
-        """Argument of `plant_rates`: arm table, view of its load, pairs, leaf, joints, wrenches.
+        """Argument `physics` of `plant_rates`.
 
-        The table is a copy with dry friction, and with the load that a grasp may change.
+        It contains the arm's table with dry friction, a view of its load (for grasps), pairs of
+        shapes, leaf, joints of moving bodies, and no given wrenches.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION_COLUMN] = self.joint_friction
@@ -95,7 +96,7 @@ class SlavePlant:
 
     @property
     def sheet_instance(self) -> ModelInstanceIndex | None:
-        """Model instance of the leaf, or of another `moving_part`; None without one."""
+        """Model instance of the sheet spring's leaf or another `moving_part`, or None."""
         return self.contact.sheet
 
     @property
@@ -103,8 +104,8 @@ class SlavePlant:
         return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
 
     @property
-    def sensed_sheet(self) -> ModelInstanceIndex | None:
-        """Model instance of the sheet if the compiled contact law moves it, else None."""
+    def sheet_in_compiled_law(self) -> ModelInstanceIndex | None:
+        """`sheet_instance` if the compiled contact law computes its contact, else None."""
         return None if self.contact.beyond else self.sheet_instance
 
     @property
@@ -116,7 +117,7 @@ class SlavePlant:
 
 
 def start_pose(slave: Slave) -> NDArray[np.float64]:
-    """Return the pose X_WS (7,) [qw qx qy qz px py pz] at the start, from `home` or `position`."""
+    """Return X_WS [qw qx qy qz px py pz] at the start, from `slave.home` or `slave.position`."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
     return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
@@ -124,11 +125,11 @@ def start_pose(slave: Slave) -> NDArray[np.float64]:
 
 def NominalSlave(slave: Slave) -> SlavePlant:
     written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _nominal_slave(HashableByValue(slave), written)
+    return _cached_nominal_slave(HashableByValue(slave), written)
 
 
 class HashableByValue:
-    """Hashable copy of settings, compared by all values."""
+    """Hashable copy of settings, equal to copies with equal values."""
 
     def __init__(self, value: Any) -> None:
         self.value, self._values = copy.deepcopy(value), repr(value)
@@ -141,7 +142,7 @@ class HashableByValue:
 
 
 @lru_cache(maxsize=4)  # parsing takes longer than building a station
-def _nominal_slave(key: HashableByValue, _: tuple[int, ...]) -> SlavePlant:
+def _cached_nominal_slave(key: HashableByValue, _: tuple[int, ...]) -> SlavePlant:
     return AddSlavePlant(DiagramBuilder(), key.value, None)
 
 
@@ -151,7 +152,7 @@ def AddSlavePlant(
     environment: Environment | None,
     q_start: NDArray[np.float64] | None = None,
 ) -> SlavePlant:
-    """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the configured start.
+    """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the start of `slave`.
 
     A DrakeTeleopError is raised if the arm cannot reach the start or hold its load.
     """
@@ -168,16 +169,16 @@ def AddSlavePlant(
     surroundings = None if environment is None else AddEnvironment(plant, environment)
     with translate_drake_errors(slave.path):
         finalize_plant(plant)
-    contact = make_no_contact()
+    contact = make_empty_contact_model()
     if environment is not None and surroundings is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
-        _remove_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
-        contact = ContactWith(plant, scene_graph, frame, tool, environment, surroundings)
+        _remove_arm_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
+        contact = MakeToolContactModel(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
     start = start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
-        check_strength(arm, start)
+        check_motor_strength(arm, start)
     friction = friction_of_joints(slave.friction, arm.joint_names)
     if friction.any():
         AddJointFriction(builder, plant, instance, friction, arm.velocity_index)
@@ -203,7 +204,7 @@ def AddSlavePlant(
 
 @dataclass(frozen=True)
 class ParsedSlave:
-    """Arm and tool in a plant that is not finalized; attributes as of `SlavePlant`."""
+    """Arm and tool in a plant that is not finalized; attributes as in `SlavePlant`."""
 
     slave: Slave
     plant: MultibodyPlant
@@ -214,7 +215,7 @@ class ParsedSlave:
     folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
-        """Return the arm of the finalized plant, and the assumptions about its limits."""
+        """Return the arm, after the plant is finalized, and the assumptions about its limits."""
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
@@ -234,7 +235,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     """Parse arm, tool and payload into a plant; rename the arm's model instance to "arm"."""
     slave = Slave() if slave is None else slave
     model = ParseModel(
-        plant, slave.path, slave.sensor_frame, slave.packages, slave.X_WBase, slave.hold
+        plant, slave.path, slave.sensor_frame, slave.package_folders, slave.X_WBase, slave.hold
     )
     if plant.HasModelInstanceNamed(ARM_INSTANCE_NAME):
         plant.RenameModelInstance(
@@ -245,7 +246,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
     assumptions, folders = [*model.assumptions], [model.folder]
     if slave.tool is not None:
-        tool = AddTool(plant, slave.tool, frame, slave.packages)
+        tool = AddTool(plant, slave.tool, frame, slave.package_folders)
         assumptions += tool.assumptions
         folders += [tool.folder] if tool.folder is not None else []
         if model_bodies:
@@ -261,7 +262,7 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
 
 
 def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
-    """Return the bodies outboard of a body, the nearest first."""
+    """Return the bodies that a body carries through joints, the nearest first."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
     return near + [far for each in near for far in bodies_beyond(plant, each)]
@@ -284,7 +285,7 @@ def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
             scene_graph.RemoveGeometry(plant.get_source_id(), shape)
 
 
-def _remove_shapes(
+def _remove_arm_shapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
 ) -> None:
     carried = {body.index() for body in load}
@@ -294,8 +295,7 @@ def _remove_shapes(
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
 
 
-def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
-    """Return the corners (k, 3) in S [m] of the convex hull or box of each shape on the sensor."""
+def _hull_corners_on_sensor_S(slave: Slave) -> list[NDArray[np.float64]]:
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize_plant(plant)
@@ -316,10 +316,9 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
     return hulls
 
 
-def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the point p_S (3,) [m] in the middle of the shapes that reach farthest along z_S."""
+def _farthest_point_along_z(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     reach = max(float(hull[:, 2].max()) for hull in hulls)
-    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SAME_REACH_M]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _TIP_TOLERANCE_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
@@ -339,9 +338,9 @@ def _tip_of_tool(
             for frame in (parsed.sensor_frame, tip)
         )
         return X_WS.InvertAndCompose(X_WTip).translation()
-    reach = None if slave.tool is None else end_of_shapes(slave.tool)
-    if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
-        return _end_of_hulls(hulls)
+    reach = None if slave.tool is None else end_of_tool_shapes(slave.tool)
+    if slave.tool is None and (hulls := _hull_corners_on_sensor_S(slave)):
+        return _farthest_point_along_z(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
 
 

@@ -1,4 +1,4 @@
-"""Compiled dynamics of arm, leaf and contact inside one step, for tools of balls on boxes.
+"""Compiled dynamics of arm, leaf and contact of spheres on boxes, for use inside a time step.
 
 The state is x = [q, leaf deflection, v, its rate], then the plant's [q; v] if other bodies move."""
 
@@ -18,7 +18,7 @@ from drake_teleop.common.vectors import (
     rotate_vector,
     vector_at,
 )
-from drake_teleop.station.environment.moving_bodies import NUM_POSE_AND_TWIST, poses_and_twists_into
+from drake_teleop.station.environment.moving_bodies import BODY_STATE_SIZE, poses_and_twists_into
 from drake_teleop.station.environment.point_contact import (
     BODY_COLUMN,
     NUM_PAIR_COLUMNS,
@@ -31,7 +31,7 @@ from drake_teleop.station.slave.surroundings import ToolContactModel
 
 #: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
 PROXIMITY_FAR, PROXIMITY_TOUCHING, PROXIMITY_NEAR_MONITORED = range(3)
-_WATCHED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
+_MONITORED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
 _TOUCH_TOLERANCE_M = 1e-9  # m
 
 
@@ -43,7 +43,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         arm: `ArmModel.table`.
         pairs: (k, 28) pairs of shapes, `ShapePairs.known`.
         joints: (m, 21) joints of moving bodies, `JointTable`.
-        applied_W: (6,) additional [f; tau] about So, in W [N, N m].
+        applied_W: (6,) wrench [f; tau] that is added, about So, in W [N, N m].
         sheet: (2,) deflection of the leaf and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
     """
@@ -55,7 +55,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False
-    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
@@ -85,7 +85,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
 @njit(cache=True)
 def _place_box_at_body(pair, bodies, placed):
-    """Write the pair, with its box at the pose of its body, to `placed` (28,); return `placed`."""
+    """Write a pair, with its box at the present pose of the body, to `placed` (28,); return it."""
     body = bodies[int(pair[BODY_COLUMN])]
     copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
     turn = (body[0], body[1], body[2], body[3])
@@ -100,9 +100,9 @@ def _place_box_at_body(pair, bodies, placed):
 
 @njit(cache=True)
 def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
-    """Return `PROXIMITY_FAR`, or that of a nearer tool; `watched` is `ShapePairs.watched`."""
+    """Return a code PROXIMITY_ for the tool; `pairs`, `watched`: `ShapePairs.known`, `.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
-    bodies, placed = np.empty((joints.shape[0], NUM_POSE_AND_TWIST)), np.empty(NUM_PAIR_COLUMNS)
+    bodies, placed = np.empty((joints.shape[0], BODY_STATE_SIZE)), np.empty(NUM_PAIR_COLUMNS)
     poses_and_twists_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
@@ -110,7 +110,7 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
             _place_box_at_body(pair, bodies, placed)
         else:
             copy_into(placed, 0, pair, 0, NUM_PAIR_COLUMNS)
-        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
+        if min_distance_of_boxes(pair, placed, p_WS, R_WS, sheet[0]) < _MONITORED_DISTANCE_M:
             return PROXIMITY_NEAR_MONITORED
     for pair in pairs:
         box = _place_box_at_body(pair, bodies, placed) if pair[BODY_COLUMN] >= 0.0 else pair
@@ -121,13 +121,13 @@ def tool_proximity(arm, pairs, watched, joints, q, sheet, state):
 
 @njit(cache=True)
 def add_force_to_wrench(wrench_W, p_WC, force_W):
-    """Add a force (3,) [N] at point C to a wrench (6,) about the world's origin, in W."""
+    """Add a force (3,) at the point C to a wrench (6,) about the world's origin, in W."""
     add_into(wrench_W, 0, force_W)
     add_into(wrench_W, 3, cross(p_WC, force_W))
 
 
 class ToolContact(LeafSystem):
-    """Block with the environment's wrench (6,) on the tool about the world's origin, for the log.
+    """Block that outputs the environment's wrench (6,) on the tool about the world's origin.
 
     Its ports sheet_state [z; v_z] and plant_state [q; v] exist only with a leaf or other moving
     bodies.
@@ -161,8 +161,8 @@ class ToolContact(LeafSystem):
 
 
 @njit(cache=True)
-def assemble_state(state, around, x):
-    """Write the plant's state x from the arm's [q; v] and `around` [deflection, rate, others]."""
+def assemble_plant_state(state, around, x):
+    """Write x from the arm's `state` [q; v] and `around` [leaf deflection, rate, plant's q; v]."""
     n = state.shape[0] // 2
     copy_into(x, 0, state, 0, n)
     copy_into(x, n + 1, state, n, n)
@@ -172,7 +172,7 @@ def assemble_state(state, around, x):
 
 @njit(cache=True)
 def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot (2 n + 2,) of the plant's state x, and the contact wrench.
+    """Write the time derivative xdot (2 n + 2,) of the state x, and the contact wrench.
 
     `physics` is `SlavePlant.physics_of_plant`, `tau` (n,) the motor torques [N m].
     """
@@ -184,7 +184,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
         x[half - 1 : 2 * half : half],
         x[2 * half :],
     )
-    if not _take_given_wrench(given, x, wrench_W):
+    if not _take_or_request_wrench(given, x, wrench_W):
         environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
     else:
         applied = np.empty(6)
@@ -194,10 +194,10 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _take_given_wrench(given, x, wrench_W):
-    """Copy the next given contact wrench to `wrench_W` and return True; if missing, request it.
+def _take_or_request_wrench(given, x, wrench_W):
+    """Copy the next wrench of `given` to `wrench_W` and return True; without one write a request.
 
-    `given` is empty, or has row 0 [number given, number used, x of the request] and then wrenches.
+    `given` is empty, or has a row [number given, number used, x of the request] and then wrenches.
     """
     if given.shape[0] == 0:
         return False
@@ -213,7 +213,7 @@ def _take_given_wrench(given, x, wrench_W):
 
 @njit(cache=True)
 def plant_rates_under_wrench(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot of the plant's state x under the contact wrench `wrench_W`."""
+    """Write the time derivative xdot of the state x under the contact wrench `wrench_W`."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]

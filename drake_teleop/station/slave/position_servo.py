@@ -1,6 +1,6 @@
-"""Commercial arm with a position interface (docs/station.md).
+"""Joint control of a commercial arm with a position interface (docs/station.md).
 
-command --[dead time, held]--> target --[generator]--> r, dr/dt --[drives]--> torque
+command --[dead time, held]--> target --[generator]--> reference r --[drives]--> torque
 
 d2r/dt2 = gain (target - (r + lookahead dr/dt))
 d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz"""
@@ -29,7 +29,7 @@ _BRAKING_FACTOR = 2 * 0.8
 @settings
 @dataclass
 class PositionInterface:
-    """Position interface of an arm, see `position_servo`; m/s for prismatic joints."""
+    """Settings of the position interface of an arm; m instead of rad for prismatic joints."""
 
     command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
     dead_time: float = quantity(
@@ -52,20 +52,22 @@ class PositionInterface:
         periods = rate / self.command_hz
         if periods < 1.0 or abs(periods - round(periods)) > 1e-6 * periods:
             raise DrakeTeleopError(
-                f"{self.command_hz:g} Hz do not divide rates.joint_control_hz, {rate:g} Hz",
+                f"rates.joint_control_hz, {rate:g} Hz, is no multiple of command_hz,"
+                f" {self.command_hz:g} Hz",
                 where=f"{where}.command_hz",
                 remedy="choose a rate of the joint control that is a multiple of it",
             )
         damping = self.gain * self.lookahead / rate
         if damping + 0.5 * self.gain / rate**2 > 1.5:  # unstable from 2
             raise DrakeTeleopError(
-                f"a gain of {self.gain:g} 1/s^2 is too fast for steps of {1e3 / rate:g} ms",
+                f"a gain of {self.gain:g} 1/s^2 is too high for control steps of {1e3 / rate:g} ms",
                 where=f"{where}.gain",
                 remedy="lower gain or lookahead, or raise rates.joint_control_hz",
             )
         if self.drive_bandwidth_hz > 0.1 * rate:
             raise DrakeTeleopError(
-                f"drives of {self.drive_bandwidth_hz:g} Hz are too fast for {rate:g} Hz",
+                f"the bandwidth, {self.drive_bandwidth_hz:g} Hz, is too high for joint control at"
+                f" {rate:g} Hz",
                 where=f"{where}.drive_bandwidth_hz",
                 remedy="choose at most a tenth of rates.joint_control_hz",
             )
@@ -88,14 +90,14 @@ POSITION_INTERFACES: dict[str, PositionInterface] = {
 
 @njit(cache=True)
 def _generate_reference(command, interface, limits, memory, reference):
-    """Accept the command (n,) [rad] if due, and advance the reference r by one period.
+    """Accept the command (n,) [rad] if one is due, and advance the reference by one period.
 
     Args:
-        interface: (6,) period [s], gain [1/s^2], lookahead [s], w [rad/s], periods per command,
-            queue length.
+        interface: (6,) period [s], gain [1/s^2], lookahead [s], drive bandwidth [rad/s], periods
+            per command, length of the command queue.
         limits: (2, n) speed and acceleration limits.
-        memory: see `_COUNT`; updated.
-        reference: (3, n) output: r and its two derivatives.
+        memory: memory of `PositionServo`, see `_COUNT_INDEX`; updated.
+        reference: (3, n) output: reference position, velocity, acceleration.
     """
     period, gain, lookahead, _, every, queued = interface
     n = command.shape[0]
@@ -150,7 +152,7 @@ def position_servo_torque(
 
 
 class PositionServo(LeafSystem):
-    """Block with the position interface of an arm; its ports are those of `JointControl`.
+    """Block that controls joints as an arm's position interface; ports as `JointControl`.
 
     `period` is the drives' period [s], `q_start` the posture held before the first command.
     """

@@ -1,8 +1,8 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
-Collision shapes count; of a body without them, its visual shapes; of meshes, their convex hulls.
-Bodies that a joint or a telescope connects, or that overlap in nearly all random postures, may
-overlap, as in MoveIt's setup assistant; an assumption names the latter.
+Collision shapes count, or visual shapes of a body without them; meshes count as convex hulls.
+As in MoveIt's setup assistant, bodies may overlap that a joint or a telescope connects, or that
+overlap in nearly all random postures; an assumption lists the latter.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
 #: Larger overlaps are reported [m]; smaller ones are rounding of models.
-MIN_DEPTH_M = 1e-3
-_MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
+MIN_OVERLAP_M = 1e-3
+_MAX_SHAPE_SIZE_M = 1e3  # m; at 1e4 Drake's distance query aborts or hangs
 # Pairs that overlap in this share of random postures overlap by design.
 _NUM_POSTURES, _OVERLAP_BY_DESIGN_SHARE = 200, 0.95
-_SAME_DIRECTION = 0.999  # cosine of the angle between the axes of a telescope
+_MIN_COSINE_OF_PARALLEL_AXES = 0.999  # cosine of the angle between the axes of a telescope
 _NUM_POLYHEDRON_SIDES = 24  # points on a circumference of a round shape
 
 
 class Overlap(NamedTuple):
-    """Two bodies and the distance of their nearest shapes [m], negative if they overlap."""
+    """Two overlapping bodies and the distance of their shapes [m], negative by the depth."""
 
     first: RigidBody
     second: RigidBody
@@ -68,10 +68,13 @@ class Overlap(NamedTuple):
 
 
 class PostureShapes:
-    """Plant with the shapes of a slave and its surroundings; `sticks` replaces missing shapes.
+    """Shapes of a slave and its surroundings in a plant, for overlaps at any joint positions.
+
+    Args:
+        sticks: whether an arm without shapes gets sticks.
 
     Attributes:
-        assumptions: texts about data missing in the models.
+        assumptions: texts about data that the models do not have.
         tool_bodies: indices of the bodies beyond the sensor.
         surroundings: indices of the bodies of the environment.
     """
@@ -90,11 +93,11 @@ class PostureShapes:
         self.tool_bodies = {body.index() for body in beyond}
         if sticks and not any(map(self._has_shapes, self.moving_bodies() - self.tool_bodies)):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
-        _make_solid(self.plant, self._scene_graph)
+        _prepare_collision_shapes(self.plant, self._scene_graph)
         finalize_plant(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
-        self._exclude_joined()
+        self._exclude_joined_bodies()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
         self.context = self.plant.GetMyMutableContextFromRoot(self._root)
@@ -129,8 +132,7 @@ class PostureShapes:
     def tool_body(self) -> BodyIndex:
         return self._parsed.tool
 
-    def sensor_link(self) -> set[BodyIndex]:
-        """Return the indices of the bodies that are fixed to the sensor, with the tool."""
+    def sensor_bodies(self) -> set[BodyIndex]:
         body = self._parsed.sensor_frame.body()
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
@@ -148,7 +150,7 @@ class PostureShapes:
         )
 
     def hulls(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
-        """Return points (k, 3) on the hulls of a body's collision, or visual, shapes, in W [m]."""
+        """Return, for each shape of a body, points (k, 3) on its convex hull in W [m]."""
         body, hulls = self.plant.get_body(index), self._points[index]
         if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
             hulls = [surface_points(self._scene_graph.model_inspector(), each) for each in shapes]
@@ -180,7 +182,7 @@ class PostureShapes:
             found[first, second] = min(each.distance, found.get((first, second), np.inf))
         return found
 
-    def _exclude_joined(self) -> None:
+    def _exclude_joined_bodies(self) -> None:
         plant, manager = self.plant, self._scene_graph.collision_filter_manager()
 
         def bodies_of_link(body: RigidBody) -> set[BodyIndex]:
@@ -200,7 +202,7 @@ class PostureShapes:
                 axis, others = R_WF @ joint.translation_axis(), telescopes
                 telescopes = []
                 for other, bodies in others:
-                    if bodies & joined and abs(axis @ other) > _SAME_DIRECTION:
+                    if bodies & joined and abs(axis @ other) > _MIN_COSINE_OF_PARALLEL_AXES:
                         joined |= bodies
                     else:
                         telescopes.append((other, bodies))
@@ -212,7 +214,7 @@ class PostureShapes:
     def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), Counter[tuple[BodyIndex, BodyIndex]]()
         least = int(np.ceil(_OVERLAP_BY_DESIGN_SHARE * _NUM_POSTURES))
-        limits = sampled_range(self.arm)
+        limits = joint_sampling_range(self.arm)
         for left in range(_NUM_POSTURES, 0, -1):
             self.move_to(random.uniform(*limits))
             counts.update(p for p in self._distances_of_bodies() if not self.surroundings & set(p))
@@ -221,8 +223,8 @@ class PostureShapes:
         return {pair for pair, count in counts.items() if count >= least}
 
 
-def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
-    """Return lower and upper ends (n,) for random joint positions: limits, at most one rotation."""
+def joint_sampling_range(arm: ArmModel) -> tuple[Array, Array]:
+    """Return lower and upper ends (n,) of random joint positions: limits, at most one turn wide."""
     wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
     around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
     finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
@@ -233,14 +235,14 @@ def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
 def start_overlaps(
     slave: Slave, environment: Environment | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return sentences about pairs of bodies that overlap at the start, and the assumptions."""
+    """Return warnings about bodies that overlap at the start, and assumptions about shapes."""
     parts = [] if environment is None else list(environment.parts)
     written = tuple(path.stat().st_mtime_ns for path in slave.model_files())
-    return _start_overlaps(HashableByValue((slave, parts)), written)
+    return _cached_start_overlaps(HashableByValue((slave, parts)), written)
 
 
 @lru_cache(maxsize=4)
-def _start_overlaps(
+def _cached_start_overlaps(
     key: HashableByValue, _: tuple[int, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     slave, parts = key.value
@@ -250,11 +252,11 @@ def _start_overlaps(
 
 
 def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
-    """Return one sentence for each overlapping pair; `of_arm` leaves out the surroundings."""
+    """Return a warning for each pair of overlapping bodies, with `of_arm` only of slave bodies."""
     found = []
     for first, second, distance in shapes.overlaps():
         with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
-        if distance > -MIN_DEPTH_M or (of_arm and with_surroundings):
+        if distance > -MIN_OVERLAP_M or (of_arm and with_surroundings):
             continue
         remedy = "give another start in slave.home, or correct the shapes of the model"
         if with_surroundings:
@@ -266,8 +268,8 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
     return found
 
 
-def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Give bodies without collision shapes their visual ones; drop unlimited shapes.
+def _prepare_collision_shapes(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Use visual shapes of bodies without collision shapes; remove unbounded collision shapes.
 
     Polyhedra replace curved shapes, because Drake's distance query may hang for capsules.
     """
@@ -278,7 +280,7 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
             shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
             is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
-            is_limited = box is not None and max(box.half_width()) < _MAX_SIZE_M
+            is_limited = box is not None and max(box.half_width()) < _MAX_SHAPE_SIZE_M
             here, name = RigidTransform(inspector.GetPoseInFrame(geometry)), f"solid_{k}"
             if is_curved:
                 shape = Convex(here.inverse() @ surface_points(inspector, geometry).T, name)
@@ -291,7 +293,7 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
 
 
 def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
-    """Return points (k, 3) on the convex hull of a shape, in the frame of its body [m]."""
+    """Return points (k, 3) on the convex hull of a shape, in its body's frame [m]."""
     shape = inspector.GetShape(geometry)
     if isinstance(shape, (Mesh, Convex)):
         hull = shape.GetConvexHull()

@@ -1,11 +1,10 @@
-"""Joint control that samples faster than the simulation's events.
+"""Joint control with a period T shorter than the interval h = m T of the simulation's events.
 
 Each event predicts the motion, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
-The plant receives the line a + b (t - h/2) over h = m T with the area and first moment of these
-steps."""
+The plant receives the torque a + b (t - h/2), with the area and first moment of these steps."""
 
 from __future__ import annotations
 
@@ -23,30 +22,30 @@ from drake_teleop.station.slave.joint_control import (
     servo_gains_and_limits,
 )
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_dynamics import assemble_state, plant_rates
+from drake_teleop.station.slave.plant_dynamics import assemble_plant_state, plant_rates
 
 Array = NDArray[np.float64]
 
 #: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
-_EVENT_HZ = 2000.0
+_MIN_EVENT_HZ = 2000.0
 
 
 def samples_per_event(control_hz: float, hand_hz: float) -> int:
-    """Return the largest number of servo samples per event with events at 2 kHz or more.
+    """Return how many servo samples an event may contain, with events at 2 kHz or more.
 
-    Each operator-side sample remains an event. Arguments are rates [Hz].
+    Each sample of the haptic device remains an event. Arguments are rates [Hz].
     """
     ratio = control_hz / hand_hz
     whole = round(ratio)
     if whole < 1 or abs(ratio - whole) > 1e-9 * whole:
         return 1
-    most = max(int(control_hz / _EVENT_HZ), 1)
+    most = max(int(control_hz / _MIN_EVENT_HZ), 1)
     return next(m for m in range(min(most, whole), 0, -1) if whole % m == 0)
 
 
 @njit(cache=True)
 def torque_line_into(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
-    """Write the torque over the next `samples` as a line in time.
+    """Write the motor torque over the next `samples` of the servo as a linear function of time.
 
     Args:
         arm: `ArmModel.table` of the controller.
@@ -55,14 +54,14 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
         sheet: (2,) deflection of the leaf and its rate.
         servo: gains and limits from `servo_gains_and_limits`.
         physics: `SlavePlant.physics_of_plant`.
-        period: of the servo [s].
-        line: (3 n,) output: torque [N m], its rate [N m/s], last sample [N m].
+        period: period of the servo [s].
+        line: (3 n,) output: torque now [N m], its rate [N m/s], torque of the last sample [N m].
     """
     n = command.shape[0]
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
     predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
-    assemble_state(state, sheet, x)
+    assemble_plant_state(state, sheet, x)
     now[:] = 0.0
     rate[:] = 0.0
     for k in range(samples):
@@ -91,18 +90,18 @@ def torque_line_into(arm, command, state, sheet, servo, physics, samples, period
 
 
 @njit(cache=True)
-def _evaluate_line(state, time, torque):
-    """Write the torque (n,) at `time` [s]; `state` is the line, then its start time [s]."""
+def _evaluate_torque_line(state, time, torque):
+    """Write the torque (n,) at `time` [s]; `state` is a `line`, then its start time [s]."""
     n = torque.shape[0]
     for i in range(n):
         torque[i] = state[i] + (time - state[-1]) * state[n + i]
 
 
 class SampledServo(LeafSystem):
-    """Computed torque with several servo samples per event, given to the plant as a line in time.
+    """Block that controls joints by computed torque, with several servo samples per event.
 
-    Outputs are the torque (n,) now [N m] and the slope (n,) of the line [N m/s]. `period` is the
-    servo's period [s], `q_start` the posture held before the first sample.
+    Outputs are the torque (n,) now [N m] and its rate (n,) [N m/s]. `period` is the servo's period
+    [s], `samples` their number per event, `q_start` the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT
@@ -126,21 +125,21 @@ class SampledServo(LeafSystem):
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._at_rest, self._sheet = np.zeros(2), None
-        if slave.sensed_sheet is not None:
+        if slave.sheet_in_compiled_law is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
         holding = holding_torque(arm, q_start)
         self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
-        torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_rate)
+        torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_torque_rate)
         self.DeclareVectorOutputPort("joint_torque", n, torque, when)
         self.DeclareVectorOutputPort("torque_rate", n, rate, {self.xd_ticket()})
         self.DeclarePeriodicDiscreteUpdateEvent(samples * period, 0.0, self._update)
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         line = context.get_discrete_state_vector().value()
-        _evaluate_line(line, context.get_time(), output.get_mutable_value())
+        _evaluate_torque_line(line, context.get_time(), output.get_mutable_value())
 
-    def _calc_rate(self, context: Context, output: BasicVector) -> None:
+    def _calc_torque_rate(self, context: Context, output: BasicVector) -> None:
         n = self._n
         output.SetFromVector(context.get_discrete_state_vector().value()[n : 2 * n])
 

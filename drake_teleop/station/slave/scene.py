@@ -21,18 +21,18 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import AddFreeJoint, Environment, ToolShapes
 from drake_teleop.station.slave.models import ParseScene
-from drake_teleop.station.slave.surroundings import supports_pose
+from drake_teleop.station.slave.surroundings import supports_pose_conversion
 
 #: Folders of converted meshes, kept while the process runs.
 _MESH_FOLDERS: list[TemporaryDirectory[str]] = []
-_RESERVED_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
+_RESERVED_BODY_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
 _MESH_RESOLUTION_M = 0.005  # m, edge length of the mesh of the tool's ball
 
 
 @settings
 @dataclass
 class Scene(Environment):
-    """File of the surroundings, its pose, and point or hydroelastic contact."""
+    """Surroundings from a file, with pose, and point or hydroelastic contact."""
 
     file: str = plain(
         "door.sdf",
@@ -64,8 +64,8 @@ class Scene(Environment):
     def hydroelastic(self) -> bool:
         return self.contact == "hydroelastic"
 
-    def found_from(self, folder: Path) -> "Scene":
-        """Return a copy with `file` resolved from `folder`, if it exists there."""
+    def with_absolute_paths(self, folder: Path) -> "Scene":
+        """Return a copy with the absolute path of `file`, if it exists in `folder`."""
         path = (folder / self.file).resolve()
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
@@ -76,7 +76,7 @@ class Scene(Environment):
             _MESH_FOLDERS.append(folder)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
-            if body.name() in _RESERVED_NAMES:
+            if body.name() in _RESERVED_BODY_NAMES:
                 raise DrakeTeleopError(
                     f"the body name {body.name()} is reserved for the station",
                     where=str(path),
@@ -84,9 +84,9 @@ class Scene(Environment):
                 )
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
-            if not supports_pose(joint):
+            if not supports_pose_conversion(joint):
                 raise DrakeTeleopError(
-                    f"{joint.name()} has the unsupported type {joint.type_name()}",
+                    f"the joint {joint.name()} has the unsupported type {joint.type_name()}",
                     where=str(path),
                     remedy="use revolute, prismatic, fixed or free joints",
                 )
@@ -109,7 +109,7 @@ class Scene(Environment):
         others = set(inspector.GetAllGeometryIds(Role.kProximity)) - set(own)
         if not any(is_hydroelastic(inspector.GetProximityProperties(shape)) for shape in others):
             raise DrakeTeleopError(
-                "no shape in it is hydroelastic",
+                "contact is hydroelastic, but no shape in the file is",
                 where=str(self.path),
                 remedy="give one drake:compliant_hydroelastic or drake:rigid_hydroelastic in its"
                 " drake:proximity_properties, or set contact: point",

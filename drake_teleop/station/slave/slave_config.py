@@ -19,7 +19,7 @@ from drake_teleop.station.slave.tool import Tool, steel_ball_radius
 @settings
 @dataclass
 class Payload:
-    """A ball of steel, welded to the tool, without a collision shape; part of the load."""
+    """Payload: a ball of steel, welded to the tool, without a collision shape; part of the load."""
 
     mass: float = quantity(0.0, "kg", 0.0, 10.0, "mass of the payload; 0: none")
     com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "centre of mass, p_SoBcm_S")
@@ -28,7 +28,7 @@ class Payload:
 @settings
 @dataclass
 class Slave:
-    """The arm, by default the paper's, with its tool."""
+    """Slave: the arm, by default the paper's, with its tool."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.45], "m", -5.0, 5.0, "p_WS at the start, with z_S down; unless home is given"
@@ -84,8 +84,7 @@ class Slave:
         return Path(self.model) if self.model else models_dir() / "rx90.sdf"
 
     @property
-    def packages(self) -> tuple[Path, ...]:
-        """Folders in which package:// addresses are searched."""
+    def package_folders(self) -> tuple[Path, ...]:
         return tuple(Path(folder) for folder in self.package_paths)
 
     @property
@@ -120,15 +119,15 @@ class Slave:
         for joint, limit in self.torque_limits.items():
             if not limit > 0.0:
                 raise DrakeTeleopError(
-                    f"{limit:g} is no limit",
+                    f"{limit:g} is not a valid limit (it must be above 0)",
                     where=f"{where}.torque_limits.{joint}",
                     remedy="give a torque [N m] or force [N] above 0, or .inf",
                 )
         if self.tool is not None:
             self.tool.check(f"{where}.tool")
 
-    def found_from(self, folder: Path) -> "Slave":
-        """Return a copy with relative file paths resolved from `folder`."""
+    def with_absolute_paths(self, folder: Path) -> "Slave":
+        """Return a copy with absolute paths; relative ones are relative to `folder`."""
 
         def resolved_path(name: str) -> str:
             return str((folder / name).resolve()) if name else ""
@@ -145,7 +144,7 @@ class Slave:
 
 
 def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
-    """Weld the payload, if it has mass, to a frame that coincides with S."""
+    """Weld the payload, if it has mass, to `holder`, a frame that coincides with S."""
     if payload.mass == 0.0:
         return
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))

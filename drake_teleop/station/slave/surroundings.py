@@ -1,4 +1,4 @@
-"""Environment in the slave's plant: moving bodies, and the choice of the contact law."""
+"""Environment in the slave's plant: its moving bodies, and the choice of the contact law."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
+    BODY_STATE_SIZE,
     NUM_JOINT_COLUMNS,
-    NUM_POSE_AND_TWIST,
     JointTable,
     poses_and_twists_into,
 )
@@ -39,11 +39,11 @@ from drake_teleop.station.environment.point_contact import (
 )
 
 _FRAME_TOLERANCE = 1e-12  # rounding of frames
-_MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
+_MIN_MASS_MATRIX_EIGENVALUE = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
 
 
 class AddedEnvironment(NamedTuple):
-    """Model instances of an added environment, and the leaf's model instance or None."""
+    """Model instances of an environment in a plant; `sheet` is that of the leaf, or None."""
 
     instances: Collection[ModelInstanceIndex]
     sheet: ModelInstanceIndex | None
@@ -55,13 +55,13 @@ class ToolContactModel(NamedTuple):
     Attributes:
         pairs: (k, 28) `ShapePairs.known`; empty if `beyond` is set.
         watched: (l, 40) `ShapePairs.watched`, pairs that Drake computes at close range.
-        joints: (m, 21) joints of `JointTable`, which move the boxes of `pairs`.
+        joints: (m, 21) `JointTable` of the boxes in `pairs`.
         plant_size: size of the plant's state, 0 without joints.
         beyond: reason for using Drake's contact results instead of the compiled law, or empty.
-        bodies, shapes: identifiers of the tool's bodies, and of their collision shapes.
+        bodies, shapes: indices of the tool's bodies, and identifiers of their collision shapes.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] and gravity [m/s^2] of the leaf.
         sheet: model instance of the leaf, or of another `moving_part`; None without one.
-        moving: other moving bodies, by name.
+        moving: indices of other moving bodies, by name.
     """
 
     pairs: NDArray[np.float64]
@@ -80,7 +80,7 @@ class ToolContactModel(NamedTuple):
         return self.pairs, self.joints
 
 
-def make_no_contact() -> ToolContactModel:
+def make_empty_contact_model() -> ToolContactModel:
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, NUM_PAIR_COLUMNS)), np.zeros((0, NUM_JOINT_COLUMNS))
     watched = np.zeros((0, NUM_MONITORED_COLUMNS))
@@ -97,7 +97,7 @@ def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> AddedEnvi
     return AddedEnvironment([ModelInstanceIndex(index) for index in added], sheet)
 
 
-def ContactWith(
+def MakeToolContactModel(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
     sensor_frame: Frame,
@@ -105,14 +105,14 @@ def ContactWith(
     environment: Environment,
     touched: AddedEnvironment,
 ) -> ToolContactModel:
-    """Return the contact of the tool with the environment, in a finalized plant.
+    """Return the contact model of tool and environment, in a finalized plant.
 
     `scene_graph` contains the shapes of tool and environment only. A DrakeTeleopError is raised for
-    an impossible contact model, or a moving body without mass.
+    a hydroelastic model without such shapes, or a moving body without mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
-    contact = make_no_contact()._replace(
+    contact = make_empty_contact_model()._replace(
         # Integers, because Drake's identifiers would keep the plant alive.
         bodies=frozenset(int(index) for index in shapes),
         shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
@@ -125,7 +125,7 @@ def ContactWith(
             contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_masses(plant, context, contact)
-    if beyond := _unmodelled_contact(environment, contact):
+    if beyond := _reason_for_drake_contact(environment, contact):
         return contact._replace(beyond=beyond)
     joints, order = contact.joints, list[int]()
     if contact.moving:
@@ -142,7 +142,7 @@ def ContactWith(
         return contact._replace(beyond=str(error))
     known, watched, unknown = found
     if not len(known):
-        return contact._replace(beyond=unknown or "nothing has a shape")
+        return contact._replace(beyond=unknown or "no shapes can touch")
     size = plant.num_multibody_states() if len(joints) else 0
     return contact._replace(pairs=known, watched=watched, joints=joints, plant_size=size)
 
@@ -159,26 +159,26 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: ToolContactM
     if not contact.moving:
         return
     inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
-    if not inertia.min() > _MIN_INERTIA:
+    if not inertia.min() > _MIN_MASS_MATRIX_EIGENVALUE:
         bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         raise DrakeTeleopError(
-            f"{' and '.join(names or bodies)} can move, and has no mass or no inertia",
+            f"the body {' or '.join(names or bodies)} can move, but has no mass or no inertia",
             where="environment",
             remedy="give it both, or fix it",
         )
 
 
-def _unmodelled_contact(environment: Environment, contact: ToolContactModel) -> str:
+def _reason_for_drake_contact(environment: Environment, contact: ToolContactModel) -> str:
     if environment.hydroelastic:
-        return "contacts have areas"
+        return "contact is hydroelastic"
     if contact.sheet is not None and len(environment.parts) > 1:
-        return "the leaf is not alone"
+        return "the sheet spring is not the only object"
     return ""
 
 
 def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, BodyIndex]:
-    """Return the moving bodies of a finalized plant, except the leaf, by unique name."""
+    """Return the moving bodies of the environment, except the leaf, by unique name."""
     bodies = [
         plant.get_body(index)
         for instance in touched.instances
@@ -188,19 +188,19 @@ def MovingBodies(plant: MultibodyPlant, touched: AddedEnvironment) -> dict[str, 
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     names = [body.name() for body in moving]
     return {
-        _unique_signal_name(
+        _name_as_identifier(
             body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()
         ): (body.index())
         for body in moving
     }
 
 
-def _unique_signal_name(name: str) -> str:
+def _name_as_identifier(name: str) -> str:
     return re.sub(r"\W+", "_", name)
 
 
-def supports_pose(joint: Joint) -> bool:
-    """Return whether the joint's positions follow from the pose of its child frame."""
+def supports_pose_conversion(joint: Joint) -> bool:
+    """Return whether `joint_positions_of_pose` supports the type of the joint."""
     kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
@@ -215,7 +215,7 @@ def joint_positions_of_pose(joint: Joint, X_FM: RigidTransform) -> NDArray[np.fl
     return np.concatenate([turned, X_FM.translation()])[: joint.num_positions()]
 
 
-class MovingPose(LeafSystem):
+class MovingBodyPose(LeafSystem):
     """Block that outputs the pose X_WB (7,) of a moving body from the whole plant's [q; v]."""
 
     __slots__ = ONE_DICT
@@ -223,7 +223,7 @@ class MovingPose(LeafSystem):
     def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
         super().__init__()
         self._joints, order = JointTable(plant, [body])
-        self._bodies = np.empty((len(order), NUM_POSE_AND_TWIST))
+        self._bodies = np.empty((len(order), BODY_STATE_SIZE))
         self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
         self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))
 

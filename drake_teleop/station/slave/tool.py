@@ -21,17 +21,17 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
-_STEEL_DENSITY = 7850.0  # kg/m^3
+_STEEL_DENSITY_KG_M3 = 7850.0  # kg/m^3
 # Contact material of the shapes, as for the ball of tool.sdf.
 _TOOL_STIFFNESS, _TOOL_DISSIPATION, _TOOL_FRICTION = 4e5, 1.0, 0.2
 _ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
-_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
+_TOOL_COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
 
 @settings
 @dataclass
 class Ball:
-    """Ball of the tool that can make contact."""
+    """Ball of the tool, with contact."""
 
     radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
@@ -48,7 +48,7 @@ class Ball:
 @settings
 @dataclass
 class Block:
-    """Box of the tool that can make contact."""
+    """Box of the tool, with contact."""
 
     edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
@@ -60,7 +60,7 @@ class Block:
 
     @property
     def half_height(self) -> float:
-        """Distance from the centre to the farthest corner along z_S [m]."""
+        """Distance along z_S from the centre to the farthest corner [m]."""
         return float(np.abs(self.pose.rotation().matrix()[2]) @ self.edges) / 2
 
     @property
@@ -71,7 +71,7 @@ class Block:
 @settings
 @dataclass
 class Tool:
-    """The tool, by default the paper's; a file or a mass replaces it."""
+    """Tool, by default the paper's; a model file or a mass replaces it."""
 
     model: str = plain("", "file of a tool: its root link is put on S")
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
@@ -92,7 +92,7 @@ class Tool:
     def check(self, where: str) -> None:
         if self.model and self.mass:
             raise DrakeTeleopError(
-                "both a file and a mass define the tool",
+                "a model file and a mass both define the tool",
                 where=f"{where}.mass",
                 remedy="leave one of them out",
             )
@@ -110,8 +110,8 @@ class Tool:
             )
 
 
-def end_of_shapes(tool: Tool) -> list[float] | None:
-    """Return the end p_STip (3,) [m] of the shape that reaches farthest along z_S, or None."""
+def end_of_tool_shapes(tool: Tool) -> list[float] | None:
+    """Return the end p_STip [m] of the shape that reaches farthest along z_S, if there are any."""
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
         for each in tool.shapes
@@ -140,16 +140,16 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     AddContactMaterial(surface, _TOOL_DISSIPATION, _TOOL_STIFFNESS, friction)
     if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
-        plant.RegisterVisualGeometry(body, *seen, "tool", _COLOUR)
+        plant.RegisterVisualGeometry(body, *seen, "tool", _TOOL_COLOUR)
     for k, each in enumerate(tool.shapes):
         name = f"tool_{k}"
         plant.RegisterCollisionGeometry(body, each.pose, each.shape, name, surface)
-        plant.RegisterVisualGeometry(body, each.pose, each.shape, name, _COLOUR)
+        plant.RegisterVisualGeometry(body, each.pose, each.shape, name, _TOOL_COLOUR)
         if (length := float(np.linalg.norm(each.position))) > 0.0:  # a rod from S, without contact
             along = RotationMatrix.MakeFromOneVector(np.array(each.position), 2)
             middle = RigidTransform(along, np.array(each.position) / 2)
             rod = Cylinder(_ROD_RADIUS_M, length)
-            plant.RegisterVisualGeometry(body, middle, rod, f"{name}_rod", _COLOUR)
+            plant.RegisterVisualGeometry(body, middle, rod, f"{name}_rod", _TOOL_COLOUR)
 
 
 def _spatial_inertia_of(tool: Tool) -> SpatialInertia:
@@ -164,4 +164,4 @@ def _spatial_inertia_of(tool: Tool) -> SpatialInertia:
 
 
 def steel_ball_radius(mass: float) -> float:
-    return float((mass / _STEEL_DENSITY * 3 / (4 * np.pi)) ** (1 / 3))
+    return float((mass / _STEEL_DENSITY_KG_M3 * 3 / (4 * np.pi)) ** (1 / 3))

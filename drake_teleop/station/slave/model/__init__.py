@@ -1,1 +1,1 @@
-"""Model files of arms, tools and scenes: their repair, so that Drake reads them."""
+"""Repair of the model files of arms, tools and scenes, so that Drake reads them."""

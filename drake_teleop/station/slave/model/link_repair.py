@@ -1,4 +1,4 @@
-"""Repair of masses and inertias of links."""
+"""Repair of masses and inertias of links in model files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.station.slave.model.model_numbers import MAX_VALUE, parse_number
-from drake_teleop.station.slave.model.model_tree import WORLD
+from drake_teleop.station.slave.model.model_tree import WORLD_NAME
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
 _INERTIA_ENTRIES = {
@@ -21,16 +21,16 @@ _INERTIA_ENTRIES = {
 }
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _ROUNDING_SHARE, _SUSPICIOUS_SHARE = 1e-3, 0.05
-_NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
+_MIN_CHANGE_KG_M2 = 1e-15  # changes below this are rounding
 # Margin of corrected moments against rounding in Drake's check, relative to the largest one.
 _TRIANGLE_INEQUALITY_MARGIN = 1e-9
 
 
 def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
-    """Replace impossible mass and inertia of a link by possible ones; state the change.
+    """Replace physically impossible inertia of a link by the nearest possible one.
 
-    Links fixed to the world (`at_rest`) lose impossible values, because nothing depends on them.
-    Return True if the file has neither mass nor inertia of the link.
+    `report` receives changes and faults. A link that no joint moves (`at_rest`) loses impossible
+    values. Return True if a link that joints may move has no inertia.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     if inertial is None or inertial.find("mass") is None:
@@ -39,7 +39,7 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
         elif inertial is not None:
             link.remove(inertial)
         return not is_sdf
-    if name == WORLD:
+    if name == WORLD_NAME:
         link.remove(inertial)
         return False
     text = _mass_text(inertial)
@@ -86,9 +86,9 @@ def _inertia_tensor_of(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64
 def possible_inertia(
     inertia: NDArray[np.float64], name: str, report: RepairReport
 ) -> NDArray[np.float64]:
-    """Return the nearest inertia tensor (3, 3) that the link `name` can have; state a change."""
+    """Return the nearest possible inertia tensor (3, 3); report a change for the link `name`."""
     nearest, change = nearest_possible_inertia(inertia)
-    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
+    if 0.0 < change <= _ROUNDING_SHARE or 0.0 < change * np.abs(inertia).max() <= _MIN_CHANGE_KG_M2:
         report.state_assumption("an inertia corrected for rounding of", name)
     elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
@@ -122,12 +122,11 @@ def _write_inertial(
 def nearest_possible_inertia(
     inertia: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the nearest possible tensor (3, 3) about the centre of mass, and its distance.
+    """Return the nearest possible inertia tensor (3, 3) about the centre of mass, and the change.
 
     Negative principal moments become 0. Then a deficit of p3 <= p1 + p2 is distributed in equal
-    parts, which is nearest in the Frobenius norm. The distance is the largest change of a
-    principal moment, relative to the largest moment; it is 0 for a possible tensor, which is
-    returned unchanged.
+    parts, which is nearest in the Frobenius norm. The change is the largest of a principal moment,
+    relative to the largest moment; it is 0 for a possible tensor.
     """
     given, axes = np.linalg.eigh((inertia + inertia.T) / 2.0)
     moments = np.maximum(given, 0.0)

@@ -1,4 +1,4 @@
-"""Removal of unusable meshes of a robot model, and sticks in place of missing visuals."""
+"""Removal of unusable shapes from a robot model, and sticks in place of missing visuals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.triangles import convex_hull, obj_text, read_triangles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
-_READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
+_COLLISION_MESH_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Numbers of each dimension of a shape.
 _DIMENSIONS_OF_SHAPE = {
     "box": {"size": 3},
@@ -30,7 +30,7 @@ _DIMENSIONS_OF_SHAPE = {
     "mesh": {},
     "plane": {},
 }
-_MIN_CORNERS = 3  # of a mesh
+_MIN_MESH_VERTICES = 3  # of a mesh
 _STICK_RADIUS_M = 0.035
 _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -40,10 +40,10 @@ def remove_unusable_shapes(
 ) -> dict[str, list[str]]:
     """Remove shapes that Drake cannot read; return the names of the affected links by fault.
 
-    Relative addresses start at the folder of the file `model` and become absolute. STL files become
-    convex hulls in `folder`, because Drake does not read STL. Without a folder all shapes are
-    removed, for a plant without geometry. A lost visual is reported only for links without shapes,
-    a lost collision shape only for links without a visual or with other collision shapes.
+    Addresses relative to the file `model` become absolute. STL meshes are converted to convex hulls
+    in `folder`, because Drake does not read STL. Without `folder` all shapes are removed. A lost
+    visual is reported only for links without shapes, a lost collision shape only for links without
+    a visual or with other collision shapes.
     """
     lost: dict[str, list[str]] = {}
     for link in root.iter("link"):
@@ -105,17 +105,17 @@ def _mesh_fault(
             " (name their folder: --package-path, slave.package_paths)"
         )
     try:
-        files.check(file)
+        files.check_file(file)
     except DrakeTeleopError as error:
         return str(error)
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
-    if suffix not in (".stl", *_READABLE_SUFFIXES):
+    if suffix not in (".stl", *_COLLISION_MESH_SUFFIXES):
         return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
-    if (suffix == ".stl" or shape.tag == "collision") and not _is_readable(file, written):
+    if (suffix == ".stl" or shape.tag == "collision") and not _is_mesh_readable(file, written):
         return f"{Path(address).suffix} meshes are empty or damaged"
     if suffix == ".stl" and folder is not None:
         target = folder / f"{len(list(folder.iterdir()))}_{file.stem}.obj"
-        target.write_text(_obj_of_stl(file, written))
+        target.write_text(_obj_text_of_stl(file, written))
         file = target
     if mesh.get("filename"):
         mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
@@ -125,11 +125,11 @@ def _mesh_fault(
 
 
 @lru_cache(maxsize=1024)
-def _is_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
+def _is_mesh_readable(path: Path, _: int) -> bool:  # the time: an edited file is read again
     if path.suffix.lower() in (".gltf", ".vtk"):
         try:
             with silent_stderr():
-                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_CORNERS
+                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_MESH_VERTICES
         except RuntimeError:
             return False
     try:
@@ -140,7 +140,7 @@ def _is_readable(path: Path, _: int) -> bool:  # the time: an edited file is rea
 
 
 @lru_cache(maxsize=1024)
-def _obj_of_stl(path: Path, _: int) -> str:
+def _obj_text_of_stl(path: Path, _: int) -> str:
     triangles = read_triangles(path)
     with suppress(ValueError):
         triangles = convex_hull(triangles.vertices)
@@ -148,7 +148,7 @@ def _obj_of_stl(path: Path, _: int) -> str:
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
-    """Add sticks to links without visuals, each from its joint to the next, or to S."""
+    """Add a stick as visual shape to links without visuals, from joint to joint or to S."""
     joints = map(plant.get_joint, plant.GetJointIndices())
     inboard = {joint.child_body().index(): joint for joint in joints}
     end, body = sensor_frame, sensor_frame.body()
@@ -165,7 +165,6 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
 
 
 def _pose_in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
-    """Return the pose X_BodyFrame of a frame on the body, or on a body welded to it."""
     pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
     while on.index() != body.index():
         weld = inboard[on.index()]

@@ -14,16 +14,16 @@ from pydrake.math import RigidTransform, RotationMatrix
 from drake_teleop.station.slave.model.link_repair import nearest_possible_inertia
 from drake_teleop.station.slave.model.mjcf_elements import (
     MAX_VALUE,
-    MIN_LENGTH,
+    MIN_VECTOR_LENGTH,
     Attributes,
     Mjcf,
-    rotation_to,
+    smallest_rotation_of_z_to,
 )
 from drake_teleop.station.slave.model.mjcf_masses import (
     NO_MASS,
     MassProperties,
     combine_properties,
-    fitted_shape,
+    fit_primitive,
     mesh_properties,
     primitive_properties,
 )
@@ -31,7 +31,7 @@ from drake_teleop.station.slave.model.mjcf_meshes import Mesh, MeshLibrary
 
 # Elements that generate bodies or joints.
 _GENERATOR_TAGS = ("replicate", "attach", "composite", "flexcomp")
-_DEFAULT_DENSITY = 1000.0  # kg/m^3, default of MuJoCo
+_DEFAULT_DENSITY_KG_M3 = 1000.0  # kg/m^3, default of MuJoCo
 _UNSUPPORTED_SHAPES = ("hfield", "sdf")
 _NUM_SIZES_OF_SHAPE = {
     "sphere": 1,
@@ -41,13 +41,13 @@ _NUM_SIZES_OF_SHAPE = {
     "box": 3,
 }  # numbers in size
 _ROUND_SHAPES = ("capsule", "cylinder")
-_MAX_VISIBLE_GROUP = 2  # as in MuJoCo and Drake
+_MAX_VISIBLE_GEOM_GROUP = 2  # as in MuJoCo and Drake
 _Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)
 class Joint:
-    """Joint of a body: `kind` hinge, slide, ball or free; `anchor` (3,) and `axis` (3,)."""
+    """Joint of kind hinge, slide, ball or free; `anchor`, `axis` (3,) are in the body's axes."""
 
     name: str
     kind: str
@@ -58,14 +58,14 @@ class Joint:
     ref: float
 
     def pose(self, q: float) -> RigidTransform:
-        """Return the motion of the body from the drawn pose to position `q` [rad, m]."""
+        """Return the displacement of the body from its pose in the file to position q [rad, m]."""
         if self.kind == "slide":
             return RigidTransform((q - self.ref) * self.axis)
         turn = RotationMatrix(AngleAxis(q - self.ref, self.axis))
         return RigidTransform(turn, self.anchor - turn @ self.anchor)
 
-    def in_other_axes(self, X: RigidTransform) -> Joint:
-        """Return the joint with anchor and axis in other axes."""
+    def transformed_by(self, X: RigidTransform) -> Joint:
+        """Return a copy whose anchor and axis are transformed by X."""
         anchor, axis = X @ self.anchor, X.rotation() @ self.axis
         limits, ref = self.limits, self.ref
         return Joint(self.name, self.kind, anchor, axis, self.attributes, limits, ref)
@@ -73,7 +73,7 @@ class Joint:
 
 @dataclass(eq=False)
 class Geom:
-    """Shape of a body; `mesh` is set for shapes of type mesh."""
+    """Shape of a body, with pose X_BG and, for type mesh, its `mesh`."""
 
     kind: str
     X_BG: RigidTransform
@@ -83,23 +83,20 @@ class Geom:
 
     @property
     def takes_part_in_contacts(self) -> bool:
-        """Whether the shape takes part in contacts."""
         return takes_part_in_contacts(self.attributes)
 
     @property
     def is_visible(self) -> bool:
-        """Whether MuJoCo shows the shape by default."""
-        return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GROUP
+        return self.attributes.number("group", 0.0) <= _MAX_VISIBLE_GEOM_GROUP
 
 
 def takes_part_in_contacts(shape: Attributes) -> bool:
-    """Return whether a shape takes part in contacts."""
     return any(shape.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
 
 
 @dataclass(eq=False)
 class Body:
-    """Body with its pose X_PB in the parent; `generators` are elements that cannot be read."""
+    """Body with pose X_PB in its parent; `generators` are tags that this package cannot read."""
 
     name: str
     X_PB: RigidTransform
@@ -112,11 +109,10 @@ class Body:
     is_auxiliary: bool = False  # a body that the file does not have
 
     def with_descendants(self) -> list[Body]:
-        """Return the body and all bodies on it."""
         return [self, *(body for child in self.children for body in child.with_descendants())]
 
     def path_to(self, name: str) -> list[Body]:
-        """Return the bodies from this one to a body, or an empty list."""
+        """Return the bodies from this one to the carried body `name`, or an empty list."""
         if self.name == name:
             return [self]
         paths = (child.path_to(name) for child in self.children)
@@ -124,7 +120,7 @@ class Body:
 
 
 class BodyReader:
-    """Reader of bodies; joints and bodies without names get one."""
+    """Reader of the bodies in an MJCF file; joints and bodies without names get one."""
 
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf, self.meshes = mjcf, MeshLibrary(mjcf)
@@ -133,7 +129,7 @@ class BodyReader:
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
     def take_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
-        """Remove the bodies from the world; return them with `childclass` and pose of the frame."""
+        """Remove the bodies on the world; return each with `childclass` and pose of its frame."""
         found = []
 
         def collect_bodies(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
@@ -144,66 +140,66 @@ class BodyReader:
                     parent.remove(child)
                 elif child.tag == "frame":
                     attributes = Attributes(child.attrib, "frame", self._mjcf.report)
-                    collect_bodies(child, childclass, X_WF @ self._mjcf.pose(attributes))
+                    collect_bodies(child, childclass, X_WF @ self._mjcf.read_pose(attributes))
 
         for element in self._mjcf.root.findall("worldbody"):
             collect_bodies(element, "", RigidTransform())
         return found
 
     def read_world(self) -> Body:
-        """Return the world with everything on it."""
+        """Return the world with its shapes and all bodies."""
         world = Body("world", RigidTransform())
         for element in self._mjcf.root.findall("worldbody"):
-            self._read_content(world, element, element.get("childclass", ""), RigidTransform())
+            self._read_children(world, element, element.get("childclass", ""), RigidTransform())
         return world
 
     def read_body(self, element: Element, childclass: str, X_PF: RigidTransform) -> Body:
-        """Return a body, in a frame of its parent, with all bodies on it."""
-        name = element.get("name") or self._invent_name("body")
+        """Return the body in `element`, with all bodies on it; X_PF is its frame in the parent."""
+        name = element.get("name") or self._make_unused_name("body")
         attributes = Attributes(element.attrib, f"body {name}", self._mjcf.report)
-        body = Body(name, X_PF @ self._mjcf.pose(attributes))
+        body = Body(name, X_PF @ self._mjcf.read_pose(attributes))
         childclass = element.get("childclass") or childclass
-        self._read_content(body, element, childclass, RigidTransform())
+        self._read_children(body, element, childclass, RigidTransform())
         return body
 
-    def _invent_name(self, stem: str) -> str:
+    def _make_unused_name(self, stem: str) -> str:
         for number in self._counters.setdefault(stem, count(1)):
             if (name := f"{stem}_{number}") not in self._names:
                 break
         return name
 
-    def _read_content(
+    def _read_children(
         self, body: Body, element: Element, childclass: str, X_BF: RigidTransform
     ) -> None:
         for child in element:
-            attributes = self._mjcf.attributes(child, childclass, f"{child.tag} of {body.name}")
+            attributes = self._mjcf.attributes_of(child, childclass, f"{child.tag} of {body.name}")
             if child.tag == "frame":
                 inner = child.get("childclass") or childclass
-                self._read_content(body, child, inner, X_BF @ self._mjcf.pose(attributes))
+                self._read_children(body, child, inner, X_BF @ self._mjcf.read_pose(attributes))
             elif child.tag == "body":
                 body.children.append(self.read_body(child, childclass, X_BF))
             elif child.tag in ("joint", "freejoint"):
                 body.joints.append(
-                    self._read_joint(body, attributes, child.tag).in_other_axes(X_BF)
+                    self._read_joint(body, attributes, child.tag).transformed_by(X_BF)
                 )
             elif child.tag == "geom":
                 self._add_geom(body, attributes, X_BF)
             elif child.tag == "site":
-                body.sites[child.get("name", "")] = X_BF @ self._mjcf.pose(attributes)
+                body.sites[child.get("name", "")] = X_BF @ self._mjcf.read_pose(attributes)
             elif child.tag == "inertial":
                 body.inertial = self._read_inertial(body, attributes).in_frame(X_BF)
             elif child.tag in _GENERATOR_TAGS:
                 body.generators.append(child.tag)
 
     def _read_joint(self, body: Body, given: Attributes, tag: str) -> Joint:
-        name = given.get("name") or self._invent_name(f"{body.name}_joint")
+        name = given.get("name") or self._make_unused_name(f"{body.name}_joint")
         given.label = f"joint {name}"
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
-        if np.linalg.norm(axis) < MIN_LENGTH:
+        if np.linalg.norm(axis) < MIN_VECTOR_LENGTH:
             self._mjcf.report.add_fault(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
-        limits = given.limits("range", "limited", automatic=self._mjcf.autolimits)
+        limits = given.read_range("range", "limited", automatic=self._mjcf.autolimits)
         ref = given.number("ref", 0.0)
         if kind == "hinge":
             limits = limits and (
@@ -216,10 +212,10 @@ class BodyReader:
 
     def _add_geom(self, body: Body, given: Attributes, X_BF: RigidTransform) -> None:
         kind, name = given.get("type", "sphere"), given.get("mesh", "")
-        X_FG, size = self._mjcf.pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
+        X_FG, size = self._mjcf.read_pose(given), given.numbers("size", (0.0, 0.0, 0.0), MAX_VALUE)
         if "fromto" in given and kind in (*_ROUND_SHAPES, "box", "ellipsoid"):
             ends = given.vector("fromto", (0.0,) * 5 + (1.0,)).reshape(2, 3)
-            X_FG = RigidTransform(rotation_to(ends[0] - ends[1]), ends.mean(axis=0))
+            X_FG = RigidTransform(smallest_rotation_of_z_to(ends[0] - ends[1]), ends.mean(axis=0))
             half = float(np.linalg.norm(ends[0] - ends[1])) / 2
             size = [size[0], half, 0.0] if kind in _ROUND_SHAPES else [size[0], size[0], half]
         found = self.meshes.find(name) if name else None
@@ -238,9 +234,9 @@ class BodyReader:
         if mesh is not None and kind != "mesh":
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
-                X_GM, size = fitted_shape(mesh, kind, by_box=by_box)
+                X_GM, size = fit_primitive(mesh, kind, by_box=by_box)
             except ValueError as error:
-                self.lost.setdefault(f"a mesh has {error}", []).append((body, given))
+                self.lost.setdefault(str(error), []).append((body, given))
                 return
             X_FG, mesh = X_FG @ X_GM, None
         if given.get("shellinertia") == "true":
@@ -256,14 +252,14 @@ class BodyReader:
         if "fullinertia" in given:
             xx, yy, zz, xy, xz, yz = given.vector("fullinertia", (0.0,) * 6)
             inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.pose(given))
+        return MassProperties(mass, np.zeros(3), inertia).in_frame(self._mjcf.read_pose(given))
 
-    def mass(self, body: Body) -> MassProperties:
-        """Return the body's mass properties, by its `inertial` or its shapes."""
+    def mass_properties(self, body: Body) -> MassProperties:
+        """Return the body's mass properties from its `inertial` element, or from its shapes."""
         compiler, given = self._mjcf.compiler, body.inertial
         source = compiler.get("inertiafromgeom", "auto")
         if source == "true" or (source == "auto" and given is None):
-            given = combine_properties([self._geom_mass(geom) for geom in body.geoms])
+            given = combine_properties([self._mass_of_geom(geom) for geom in body.geoms])
         mass, centre, inertia = given or NO_MASS
         bound = compiler.number("boundinertia", 0.0)
         if bound > 0.0:
@@ -273,7 +269,7 @@ class BodyReader:
             inertia = np.eye(3) * np.trace(inertia) / 3
         return MassProperties(max(mass, compiler.number("boundmass", 0.0)), centre, inertia)
 
-    def _geom_mass(self, geom: Geom) -> MassProperties:
+    def _mass_of_geom(self, geom: Geom) -> MassProperties:
         groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
             return NO_MASS
@@ -284,8 +280,8 @@ class BodyReader:
                 else primitive_properties(geom.kind, geom.size)
             )
         except ValueError as error:
-            self._mjcf.report.state_repair(f"no mass of a mesh ({error}) of", geom.attributes.label)
+            self._mjcf.report.state_repair(f"no mass, because {error}, of", geom.attributes.label)
             return NO_MASS
         mass = geom.attributes.number("mass", -1.0)
-        density = geom.attributes.number("density", _DEFAULT_DENSITY)
+        density = geom.attributes.number("density", _DEFAULT_DENSITY_KG_M3)
         return shape.with_mass(mass if mass >= 0.0 else density * shape.mass).in_frame(geom.X_BG)

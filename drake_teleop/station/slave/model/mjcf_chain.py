@@ -1,4 +1,4 @@
-"""Chain of joints from the world to the sensor frame of an MJCF arm, and their effort limits."""
+"""Joints from the world to the sensor of an MJCF arm: held joints, couplings, effort limits."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pydrake.math import RigidTransform
 from drake_teleop.station.slave.model.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.model.mjcf_elements import Attributes, Mjcf
 
-_MAX_NAMES = 12  # names of frames in an error: the most similar ones
+_MAX_LISTED_NAMES = 12  # names of frames in an error: the most similar ones
 _LOOP_TAGS = ("connect", "weld", "distance")
-_DYNAMICS_WITH_STATE = (
+_UNBOUNDED_DYNAMICS_TYPES = (
     "integrator",
     "muscle",
     "user",
@@ -23,7 +23,7 @@ _DYNAMICS_WITH_STATE = (
 
 
 def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
-    """Return the world's shapes and the body that carries the sensor; state the other bodies."""
+    """Return the world with only the tree of bodies that carries the sensor; report the others."""
     tops = reader.take_top_bodies()
     kind = "body" if any(sensor in _names_of_elements(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names_of_elements(top[0], kind)]
@@ -34,7 +34,7 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
             for top, *_ in tops
             for name in _names_of_elements(top, tag)
         }
-        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_NAMES, cutoff=0.0)
+        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_LISTED_NAMES, cutoff=0.0)
         remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies"
         what = f"{len(carriers) or 'no'} frames are named {sensor!r}; {remedy}"
         for fault in (what, *reader.meshes.inaccessible):
@@ -47,26 +47,25 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     for name in (*others, *world.generators):
         mjcf.report.state_assumption("left out, because the arm does not carry it:", name)
     world.generators.clear()
-    arm = _separate_joints(reader.read_body(*carriers[0]))
+    arm = _split_into_one_joint_bodies(reader.read_body(*carriers[0]))
     if kind == "site":
-        measured = {site for each in mjcf.children("sensor") if (site := _force_site(each))}
-        arm = _insert_site(arm, sensor, is_measured=sensor in measured)
+        measured = {site for each in mjcf.elements_in("sensor") if (site := _measured_site(each))}
+        arm = _insert_body_at_site(arm, sensor, is_measured=sensor in measured)
         mjcf.report.state_assumption("a frame of the model in place of the site", sensor)
     world.children = [arm]
     return world
 
 
 def read_world_and_bodies(reader: BodyReader) -> Body:
-    """Return the world with everything on it."""
-    return _separate_joints(reader.read_world())
+    return _split_into_one_joint_bodies(reader.read_world())
 
 
 def hold_joints(
     world: Body, chain: list[Body], hold: dict[str, float], mjcf: Mjcf
 ) -> list[tuple[Body, Joint]]:
-    """Weld free bases and joints outside the chain; return the moving joints with their bodies.
+    """Weld free bodies and joints outside the chain; return the moving joints with their bodies.
 
-    The joints of `hold` remain, because they are welded after the parsing.
+    The joints of `hold` remain in the file, because they are welded after the parsing.
     """
     moving = list[tuple[Body, Joint]]()
     for body in world.with_descendants():
@@ -92,22 +91,22 @@ def hold_joints(
 
 
 def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjcf) -> None:
-    """Refuse couplings between joints of the chain; state the other ones that are left out."""
+    """Report couplings between `joints` as faults; report other couplings as left out."""
     report, moving = mjcf.report, {joint.name for joint in joints}
     carriers = _moving_body_of_each_body(arm, {id(body) for body in chain})
-    for element in mjcf.children("equality"):
-        given = mjcf.attributes(element, "", element.tag)
+    for element in mjcf.elements_in("equality"):
+        given = mjcf.attributes_of(element, "", element.tag)
         ends = [given.get(name, "") for name in ("joint1", "joint2")]
         if given.get("active") == "false":
             continue
         if element.tag == "joint" and moving.issuperset(filter(None, ends)):
             report.add_fault(f"{ends[0]} moves with another joint (equality); hold one of them")
-        elif element.tag in _LOOP_TAGS and _is_loop(given, carriers):
+        elif element.tag in _LOOP_TAGS and _closes_loop(given, carriers):
             report.add_fault(f"its links form a loop, by {element.tag}; cut it")
         else:
             name = given.get("name") or " and ".join(filter(None, ends)) or element.tag
             report.state_assumption("no effect on the arm of the equality", name)
-    for element in mjcf.children("tendon"):
+    for element in mjcf.elements_in("tendon"):
         for name in (each.get("joint", "") for each in element.iter("joint")):
             if name in moving:
                 report.state_assumption("no tendon, which the model has, of", name)
@@ -119,8 +118,8 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
 
 
 def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
-    """Report couplings and springs of a complete file, which Drake ignores."""
-    for element in (*mjcf.children("equality"), *mjcf.children("tendon")):
+    """Report all couplings and springs, which Drake does not read from MJCF."""
+    for element in (*mjcf.elements_in("equality"), *mjcf.elements_in("tendon")):
         if element.get("active") != "false":
             name = f"{element.tag} {element.get('name', '')}".rstrip()
             mjcf.report.state_repair("no coupling, which Drake does not read from MJCF, by", name)
@@ -135,13 +134,13 @@ def _names_of_elements(top: Element, tag: str) -> set[str]:
     return {each.get("name", "") for each in top.iter(tag)}
 
 
-def _force_site(sensor: Element) -> str:
+def _measured_site(sensor: Element) -> str:
     is_wrench = sensor.tag in ("force", "torque")
     return sensor.get("site", "") if is_wrench else ""
 
 
-def _separate_joints(body: Body) -> Body:
-    body.children = [_separate_joints(child) for child in body.children]
+def _split_into_one_joint_bodies(body: Body) -> Body:
+    body.children = [_split_into_one_joint_bodies(child) for child in body.children]
     outer, innermost = None, body
     for joint in body.joints[:-1]:
         part = Body(f"{body.name}_{joint.name}", body.X_PB, [joint], is_auxiliary=True)
@@ -157,15 +156,15 @@ def _separate_joints(body: Body) -> Body:
     return outer
 
 
-def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
-    """Add a massless body in place of a site.
+def _insert_body_at_site(body: Body, site: str, *, is_measured: bool) -> Body:
+    """Add a massless body at the pose of a site, as sensor frame.
 
-    The sensor of a `force` or `torque` element measures the whole body with the site: the frame
-    then carries that body. Another site is carried by its body.
+    The new body carries the site's body if a `force` or `torque` sensor measures there
+    (`is_measured`). Otherwise the site's body carries it.
     """
     if site not in body.sites:
         body.children = [
-            _insert_site(child, site, is_measured=is_measured) for child in body.children
+            _insert_body_at_site(child, site, is_measured=is_measured) for child in body.children
         ]
         return body
     X_BS = body.sites.pop(site)
@@ -173,7 +172,7 @@ def _insert_site(body: Body, site: str, *, is_measured: bool) -> Body:
         body.children.append(Body(site, X_BS, is_auxiliary=True))
         return body
     X_SB = X_BS.inverse()
-    joints = [joint.in_other_axes(X_SB) for joint in body.joints]
+    joints = [joint.transformed_by(X_SB) for joint in body.joints]
     inner = replace(body, X_PB=X_SB, joints=[])
     return Body(site, body.X_PB @ X_BS, joints, children=[inner], is_auxiliary=True)
 
@@ -189,7 +188,7 @@ def _moving_body_of_each_body(arm: Body, chain: set[int]) -> dict[str, str]:
     return dict(collect_carriers(arm, "world"))
 
 
-def _is_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
+def _closes_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
     ends = [given.get("body1", "world"), given.get("body2", "world")]
     if "site1" in given or not all(end == "world" or end in carriers for end in ends):
         return False  # a free or mocap body, another arm
@@ -198,13 +197,13 @@ def _is_loop(given: dict[str, str], carriers: dict[str, str]) -> bool:
 
 
 def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
-    """Return the limits [N m, N] of joints by name; joints without a limit have no entry.
+    """Return the effort limits [N m, N] of joints by name; joints without a limit have no entry.
 
-    Several actuators of a joint add up. The joint's own `actuatorfrcrange` limits their sum.
+    Limits of several actuators add up. The joint's own `actuatorfrcrange` limits their sum.
     """
     by_joint: dict[str, float] = {}
-    for element in mjcf.children("actuator"):
-        given = mjcf.attributes(element, "", f"actuator {element.get('name', '')}")
+    for element in mjcf.elements_in("actuator"):
+        given = mjcf.attributes_of(element, "", f"actuator {element.get('name', '')}")
         name = given.get("joint") or given.get("jointinparent")
         if name:
             by_joint[name] = by_joint.get(name, 0.0) + _effort_limit_of_actuator(
@@ -212,7 +211,7 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
             )
     limits = {}
     for joint in joints:
-        own = joint.attributes.limits(
+        own = joint.attributes.read_range(
             "actuatorfrcrange", "actuatorfrclimited", automatic=mjcf.autolimits
         )
         limit = min(by_joint.get(joint.name, float("inf")), _effort_in_both_directions(own))
@@ -224,16 +223,15 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
 def _effort_limit_of_actuator(mjcf: Mjcf, given: Attributes, tag: str) -> float:
     gear = abs(given.numbers("gear", (1.0,))[0])
     force = _effort_in_both_directions(
-        given.limits("forcerange", "forcelimited", automatic=mjcf.autolimits)
+        given.read_range("forcerange", "forcelimited", automatic=mjcf.autolimits)
     )
     if (gain := _force_per_control(given, tag)) > 0.0:
-        control = given.limits("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
+        control = given.read_range("ctrlrange", "ctrllimited", automatic=mjcf.autolimits)
         force = min(force, gain * _effort_in_both_directions(control))
     return gear * force
 
 
 def _force_per_control(given: Attributes, tag: str) -> float:
-    """Return force by control signal; 0 if the signal is no force (position servo)."""
     if tag == "motor":
         return 1.0
     if tag != "general" or given.get("kind", "general") not in ("general", "motor"):
@@ -242,7 +240,7 @@ def _force_per_control(given: Attributes, tag: str) -> float:
     if (
         biased
         or given.get("gaintype", "fixed") != "fixed"
-        or given.get("dyntype") in _DYNAMICS_WITH_STATE
+        or given.get("dyntype") in _UNBOUNDED_DYNAMICS_TYPES
     ):
         return 0.0
     return abs(given.numbers("gainprm", (1.0,))[0])

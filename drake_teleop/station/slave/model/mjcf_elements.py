@@ -1,4 +1,4 @@
-"""Elements of an MJCF file after includes, compiler settings and class defaults are applied."""
+"""Elements of an MJCF file, with its includes, compiler settings and class defaults applied."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-_MAX_DEPTH = 150  # largest depth of nested elements
-MIN_LENGTH = 1e-9
+_MAX_NESTING_DEPTH = 150  # largest depth of nested elements
+MIN_VECTOR_LENGTH = 1e-9
 """Shortest vector that has a direction."""
 MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
 _ORIENTATION_ATTRIBUTES = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
@@ -29,7 +29,7 @@ _MAIN_DEFAULT_CLASS = "main"  # name of the class at the top
 
 
 class Attributes(dict[str, str]):
-    """Attributes of one element, with `label` for messages; `report` takes their faults."""
+    """Attributes of one XML element; `label` names it in the faults that `report` receives."""
 
     def __init__(self, values: dict[str, str], label: str, report: RepairReport) -> None:
         super().__init__(values)
@@ -38,7 +38,7 @@ class Attributes(dict[str, str]):
     def numbers(
         self, name: str, default: tuple[float, ...], largest: float = math.inf
     ) -> list[float]:
-        """Return the numbers of an attribute; `default` completes a list that is too short."""
+        """Return the numbers in attribute `name`; the end of `default` completes a short list."""
         try:
             values = [float(word) for word in self.get(name, "").split()]
         except ValueError:
@@ -52,7 +52,7 @@ class Attributes(dict[str, str]):
         return [*values, *default[len(values) :]][: len(default)]
 
     def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
-        """Return the numbers of an attribute that has as many as `default`, each up to 1e6."""
+        """Return the numbers in attribute `name`, or `default`; their number must be equal."""
         count, values = len(default), self.numbers(name, default)
         if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > MAX_VALUE:
             what = f"{name} {self[name]!r} is not {count} numbers up to {MAX_VALUE:g}"
@@ -61,11 +61,13 @@ class Attributes(dict[str, str]):
         return np.array(values)
 
     def number(self, name: str, default: float) -> float:
-        """Return the number of an attribute, or a default."""
         return self.numbers(name, (default,))[0]
 
-    def limits(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
-        """Return the range `name`, or None if it does not apply (`flag`, autolimits)."""
+    def read_range(self, name: str, flag: str, *, automatic: bool) -> tuple[float, float] | None:
+        """Return the range in attribute `name`, or None if attribute `flag` switches it off.
+
+        Without `flag`, `automatic` switches a range of nonzero width on.
+        """
         lower, upper = self.numbers(name, (0.0, 0.0))
         limited = self.get(flag, "auto")
         if limited == "false" or (limited == "auto" and not (automatic and lower != upper)):
@@ -76,7 +78,7 @@ class Attributes(dict[str, str]):
 
 
 class Mjcf:
-    """Content of an MJCF file, and the report of its repairs and faults."""
+    """Content of an MJCF file with its includes, and the report of repairs and faults."""
 
     def __init__(self, root: Element, path: Path, files: ModelFiles, report: RepairReport) -> None:
         self.root, self.path, self.files, self.report = root, path, files, report
@@ -95,24 +97,23 @@ class Mjcf:
         for element in self.root.findall("default"):
             self._read_defaults(element, _MAIN_DEFAULT_CLASS, self._defaults[_MAIN_DEFAULT_CLASS])
 
-    def file(self, element: Element, name: str, folder: str) -> Path | None:
-        """Return a file beside the main file, or else beside the included one."""
+    def find_file(self, element: Element, name: str, folder: str) -> Path | None:
+        """Return the file `name` in `folder`, beside the main or else the included MJCF file."""
         places = [self.path.resolve().parent, self._folders.get(element)]
         found = (self.files.find_file(name, place / folder) for place in places if place)
         return next((file for file in found if file is not None and not file.is_dir()), None)
 
-    def children(self, section: str) -> Iterator[Element]:
+    def elements_in(self, section: str) -> Iterator[Element]:
         """Yield the elements in all sections of this name, such as two `asset` sections."""
         for element in self.root.findall(section):
             yield from element
 
     def angle_in_rad(self, value: float) -> float:
-        """Return an angle of the file in rad."""
         degrees = self.compiler.get("angle", "degree") == "degree"
         return math.radians(value) if degrees else value
 
-    def attributes(self, element: Element, childclass: str, label: str) -> Attributes:
-        """Return the attributes of an element, with the defaults of its class."""
+    def attributes_of(self, element: Element, childclass: str, label: str) -> Attributes:
+        """Return the attributes of an element, with defaults of its class or else `childclass`."""
         name = element.get("class") or childclass or _MAIN_DEFAULT_CLASS
         if name not in self._defaults:
             self.report.add_fault(f"{label}: there is no class {name}")
@@ -121,7 +122,7 @@ class Mjcf:
         defaults = self._defaults[name].get(kind, {})
         return Attributes(_merge_defaults(defaults, element.attrib), label, self.report)
 
-    def pose(self, attributes: Attributes) -> RigidTransform:
+    def read_pose(self, attributes: Attributes) -> RigidTransform:
         """Return the pose of an element in its parent, from `pos` and its orientation."""
         return RigidTransform(
             self._rotation_of_element(attributes), attributes.vector("pos", (0.0,) * 3)
@@ -147,18 +148,18 @@ class Mjcf:
         if "xyaxes" in given:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
-            if np.linalg.norm(z) < MIN_LENGTH:
+            if np.linalg.norm(z) < MIN_VECTOR_LENGTH:
                 self.report.add_fault(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
             return RotationMatrix(columns / np.linalg.norm(columns, axis=0))
-        return rotation_to(given.vector("zaxis", (0.0, 0.0, 1.0)))
+        return smallest_rotation_of_z_to(given.vector("zaxis", (0.0, 0.0, 1.0)))
 
     def _insert_includes(
         self, element: Element, path: Path, included: set[Path], depth: int
     ) -> None:
-        if depth > _MAX_DEPTH:
-            what = f"its elements are nested more than {_MAX_DEPTH} deep"
+        if depth > _MAX_NESTING_DEPTH:
+            what = f"its elements are nested more than {_MAX_NESTING_DEPTH} deep"
             raise DrakeTeleopError(what, where=str(self.path))
         content = list[Element]()
         for child in element:
@@ -169,7 +170,7 @@ class Mjcf:
                 content.append(child)
                 continue
             name = child.get("file", "")
-            file = self.file(child, name, "")
+            file = self.find_file(child, name, "")
             if file is None:
                 self.report.add_fault(f"the included file {name!r} was not found")
             elif file.resolve() in included:
@@ -210,8 +211,8 @@ def _rotation_about_axis(axis: NDArray[np.float64], angle: float) -> RotationMat
     return RotationMatrix(AngleAxis(angle, axis / length)) if length else RotationMatrix()
 
 
-def rotation_to(z: NDArray[np.float64]) -> RotationMatrix:
-    """Return the smallest rotation that turns the z axis to this direction (3,)."""
+def smallest_rotation_of_z_to(z: NDArray[np.float64]) -> RotationMatrix:
+    """Return the smallest rotation that turns the z axis to the direction `z` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], z)
     sine = float(np.linalg.norm(axis))
     return _rotation_about_axis(

@@ -22,12 +22,11 @@ class MassProperties(NamedTuple):
     inertia: _Array
 
     def in_frame(self, X_BG: RigidTransform) -> MassProperties:
-        """Return the properties in the frame B, for properties in G."""
+        """Return properties that are given in G, in the frame B."""
         R = X_BG.rotation().matrix()
         return MassProperties(self.mass, X_BG @ self.centre, R @ self.inertia @ R.T)
 
     def with_mass(self, mass: float) -> MassProperties:
-        """Return the same shape with another mass."""
         ratio = mass / self.mass if self.mass else 0.0
         return MassProperties(mass, self.centre, self.inertia * ratio)
 
@@ -36,7 +35,6 @@ NO_MASS = MassProperties(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
 def combine_properties(parts: list[MassProperties]) -> MassProperties:
-    """Return the mass properties of several parts of one body."""
     mass = sum(part.mass for part in parts)
     if mass <= 0.0:
         return NO_MASS
@@ -48,7 +46,7 @@ def combine_properties(parts: list[MassProperties]) -> MassProperties:
 
 
 def primitive_properties(kind: str, size: list[float]) -> MassProperties:
-    """Return the mass properties of a shape with density 1 in its own axes."""
+    """Return the mass properties of a shape of density 1 in its own axes."""
     a, b, c = size
     if kind == "box":
         volume, moments = 8 * a * b * c, np.array([b**2 + c**2, a**2 + c**2, a**2 + b**2]) / 3
@@ -69,10 +67,9 @@ def primitive_properties(kind: str, size: list[float]) -> MassProperties:
 
 
 def mesh_properties(mesh: Mesh) -> MassProperties:
-    """Return the mass properties of a mesh with density 1, by its `inertia` attribute.
+    """Return the mass properties of a mesh of density 1, by MuJoCo's rule in `mesh.inertia`.
 
-    The legacy mode counts the tetrahedra between triangles and centre as positive. The centre is
-    first the triangles' centre of area.
+    The rule "legacy" counts all tetrahedra between triangles and centre as positive.
     """
     triangles = mesh.triangles()
     if mesh.inertia == "convex":
@@ -83,20 +80,20 @@ def mesh_properties(mesh: Mesh) -> MassProperties:
     centre = area @ corners.mean(axis=1) / max(float(area.sum()), 1e-300)
     if mesh.inertia == "shell":
         return _properties_of_simplices(corners - centre, area, centre)
-    volume = _volumes(corners - centre, mesh.inertia)
+    volume = _tetrahedron_volumes(corners - centre, mesh.inertia)
     if volume.sum() <= 0.0:
         return NO_MASS
     centre = centre + volume @ (corners - centre).sum(axis=1) / 4 / volume.sum()
     # As in MuJoCo, the volumes are computed again about the centre of mass.
     return _properties_of_simplices(
-        corners - centre, _volumes(corners - centre, mesh.inertia), centre, 4
+        corners - centre, _tetrahedron_volumes(corners - centre, mesh.inertia), centre, 4
     )
 
 
-def fitted_shape(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
-    """Return pose and size of the primitive that replaces a mesh (`type` with `mesh`).
+def fit_primitive(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform, list[float]]:
+    """Return pose and size of the primitive, such as a box, that MuJoCo fits to a mesh.
 
-    The box has the mesh's inertia; `by_box`, it contains the mesh (`fitaabb`).
+    Its size follows from the mesh's inertia, or with `by_box` from its bounding box (`fitaabb`).
     """
     mass, centre, inertia = mesh_properties(mesh)
     moments, axes = np.linalg.eigh(inertia)
@@ -123,7 +120,7 @@ def fitted_shape(mesh: Mesh, kind: str, *, by_box: bool) -> tuple[RigidTransform
 def _properties_of_simplices(
     corners: _Array, weight: _Array, centre: _Array, count: int = 3
 ) -> MassProperties:
-    """Sum triangles (count 3), or tetrahedra from the centre (count 4), by weight (m,)."""
+    """Return mass properties of m triangles (count 3) or tetrahedra with the centre (count 4)."""
     total = corners.sum(axis=1)
     second = np.einsum("nai,naj->nij", corners, corners) + np.einsum("ni,nj->nij", total, total)
     products = np.einsum("n,nij->ij", weight, second) / (count * (count + 1))
@@ -132,11 +129,10 @@ def _properties_of_simplices(
     return MassProperties(mass, centre, inertia)
 
 
-def _volumes(corners: _Array, mode: str) -> _Array:
+def _tetrahedron_volumes(corners: _Array, mode: str) -> _Array:
     volume = np.linalg.det(corners) / 6
     return np.abs(volume) if mode == "legacy" else volume
 
 
 def _inertia_of_unit_point(p: _Array) -> _Array:
-    """Return the inertia (3, 3) of a unit point mass at p."""
     return np.asarray(p @ p * np.eye(3) - np.outer(p, p))

@@ -1,4 +1,4 @@
-"""Meshes of an MJCF file: triangles for masses, and .obj files for Drake."""
+"""Meshes of an MJCF file, as triangles for masses and as .obj files for Drake."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Mesh:
         self._scale = attributes.vector("scale", (1.0, 1.0, 1.0))
         reference = {"pos": attributes.get("refpos", "0 0 0")}
         reference["quat"] = attributes.get("refquat", "1 0 0 0")
-        self._X_FM = mjcf.pose(Attributes(reference, attributes.label, mjcf.report))
+        self._X_FM = mjcf.read_pose(Attributes(reference, attributes.label, mjcf.report))
         self._triangles: Triangles | None = None
 
     @property
@@ -46,12 +46,12 @@ class Mesh:
         return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
 
     def triangles(self) -> Triangles:
-        """Return the transformed triangles."""
+        """Return the triangles with scale and reference pose applied."""
         if self._triangles is None:
             if self.file is not None:
                 vertices, faces = read_triangles(self.file)
             else:
-                vertices, faces = check_triangles(_read_inline(self._attributes))
+                vertices, faces = check_triangles(_read_inline_mesh(self._attributes))
             moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
             if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
                 faces = faces[:, ::-1]
@@ -59,13 +59,13 @@ class Mesh:
         return self._triangles
 
     def write_obj(self, folder: Path) -> Path:
-        """Return an .obj file for Drake, converted into `folder` if necessary."""
+        """Return an .obj file for Drake, written to `folder` if conversion is necessary."""
         if self.file is not None and self.is_readable_by_drake:
             return self.file.resolve()
         return self._write_triangles(self.triangles(), folder)
 
     def write_hull(self, folder: Path) -> Path:
-        """Return an .obj file in `folder` with the convex hull (collision shape)."""
+        """Write the convex hull, for contact, to an .obj file in `folder`; return its path."""
         return self._write_triangles(convex_hull(self.triangles().vertices), folder)
 
     def _write_triangles(self, triangles: Triangles, folder: Path) -> Path:
@@ -76,22 +76,22 @@ class Mesh:
 
 
 class MeshLibrary:
-    """Meshes of a file by name; unused ones are never read."""
+    """Meshes of an MJCF file by name, read only if they are used."""
 
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf = mjcf
         self._meshes: dict[str, Mesh | str] = {}
         self.inaccessible: list[str] = []  # faults of files that may not be read
-        for element in mjcf.children("asset"):
+        for element in mjcf.elements_in("asset"):
             label = f"{element.tag} {element.get('name') or element.get('file', '')}"
-            attributes = mjcf.attributes(element, "", label)
+            attributes = mjcf.attributes_of(element, "", label)
             file, fault = self._load_mesh(element, attributes)
             if element.tag == "mesh":
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
 
     def find(self, name: str) -> Mesh | str:
-        """Return a mesh, or its fault as text."""
+        """Return a mesh, or a text about its fault."""
         mesh = self._meshes.get(name, _NOT_FOUND_FAULT)
         if isinstance(mesh, Mesh) and not mesh.is_readable_by_drake:
             try:
@@ -110,12 +110,12 @@ class MeshLibrary:
             name = re.split(r"[/\\]", name)[-1]
         own = "meshdir" if element.tag == "mesh" else "texturedir"
         folder = compiler.get(own, compiler.get("assetdir", ""))
-        file = self._mjcf.file(element, name, folder)
+        file = self._mjcf.find_file(element, name, folder)
         if file is None:
             return None, _NOT_FOUND_FAULT
         if self._mjcf.files.may_read(file):
             try:
-                self._mjcf.files.check(file)
+                self._mjcf.files.check_file(file)
             except DrakeTeleopError as error:
                 self.inaccessible.append(str(error))
                 return None, str(error)
@@ -126,7 +126,7 @@ class MeshLibrary:
         return file, ""
 
 
-def _read_inline(attributes: Attributes) -> Triangles:
+def _read_inline_mesh(attributes: Attributes) -> Triangles:
     vertices = np.array(attributes["vertex"].split(), dtype=float).reshape(-1, 3)
     if "face" not in attributes:
         return convex_hull(vertices)

@@ -1,7 +1,7 @@
 """Repair of an MJCF text, so that Drake reads the arm in it as MuJoCo does.
 
 The text is written anew: poses as quaternions, angles in rad, masses as explicit inertias, one
-joint a body, and only the bodies that the arm carries.
+joint per body, and only the bodies that the arm carries.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _GRAVITY, _GRAVITY_TOLERANCE = (0.0, 0.0, -9.81), 0.02  # [m/s^2]
 def repair_mjcf(
     root: Element, path: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of an MJCF file that Drake reads, with meshes converted in `folder`.
+    """Return an MJCF text that Drake reads, with meshes converted in `folder`.
 
-    A scene, or a file that directives add, keeps all bodies and joints.
+    A scene, or a file that model directives add, keeps all bodies and joints.
     """
     report = RepairReport(strict=purpose.is_scene)
     mjcf = Mjcf(root, path, files, report)
@@ -70,7 +70,7 @@ def repair_mjcf(
     _check_bodies(world, report)
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
-    _state_lost_shapes(reader, report)
+    _report_lost_shapes(reader, report)
     report.raise_faults(path)
     text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
     report.raise_faults(path)
@@ -98,7 +98,7 @@ def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -
 
     def set_masses_below(body: Body, is_moved: bool) -> None:
         is_moved |= id(body) in moving
-        _set_mass(body, reader, factor, mjcf.report, is_moved=is_moved)
+        _set_mass_of_body(body, reader, factor, mjcf.report, is_moved=is_moved)
         if id(body) in moving and body.inertial is NO_MASS and not body.is_auxiliary:
             mjcf.report.state_assumption("no inertia of", body.name)
         for child in body.children:
@@ -108,12 +108,12 @@ def _set_masses(world: Body, reader: BodyReader, moving: set[int], mjcf: Mjcf) -
         set_masses_below(body, is_moved=False)
 
 
-def _set_mass(
+def _set_mass_of_body(
     body: Body, reader: BodyReader, factor: float, report: RepairReport, *, is_moved: bool
 ) -> None:
     if body.is_auxiliary:
         return
-    properties = reader.mass(body)
+    properties = reader.mass_properties(body)
     if properties.mass <= 0.0:
         if is_moved and properties.inertia.any():
             report.state_repair("an inertia without a mass left out of", body.name)
@@ -130,11 +130,12 @@ def _set_mass(
 
 def _total_mass_in_file(mjcf: Mjcf) -> float:
     reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
-    mass = sum(reader.mass(body).mass for body in reader.read_world().with_descendants()[1:])
+    bodies = reader.read_world().with_descendants()[1:]
+    mass = sum(reader.mass_properties(body).mass for body in bodies)
     return mass if mass > 0.0 else np.inf
 
 
-def _state_lost_shapes(reader: BodyReader, report: RepairReport) -> None:
+def _report_lost_shapes(reader: BodyReader, report: RepairReport) -> None:
     for fault, shapes in reader.lost.items():
         for body, shape in shapes:
             if takes_part_in_contacts(shape) or not body.geoms:

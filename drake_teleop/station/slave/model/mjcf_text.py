@@ -1,4 +1,4 @@
-"""Text of an MJCF file for Drake, with explicit poses, masses and limits."""
+"""Writing of MJCF text for Drake, with explicit poses, masses and limits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drake_teleop.station.slave.model.urdf_repair import ModelPurpose
 
 
 class MjcfText:
-    """Writer of the text; the bodies on the world float in the text of a tool.
+    """Writer of MJCF text; in the text of a tool the top bodies float.
 
     Contact shapes are convex hulls, as in MuJoCo, except in a scene.
     """
@@ -30,18 +30,18 @@ class MjcfText:
         self._meshes: dict[tuple[int, bool], str] = {}
         self._colours = {
             element.get("name", ""): rgba
-            for element in mjcf.children("asset")
+            for element in mjcf.elements_in("asset")
             if element.tag == "material"
-            and (rgba := mjcf.attributes(element, "", "material").get("rgba"))
+            and (rgba := mjcf.attributes_of(element, "", "material").get("rgba"))
         }
 
     def write(self, world: Body, moving: list[Joint]) -> str:
-        """Return the text of a world; `moving` get actuators, which carry their rotor inertia."""
+        """Return the MJCF text of a world; the joints `moving` get actuators."""
         top = SubElement(self._root, "worldbody")
         self._write_content(top, world)
         names = {body.name for body in world.with_descendants()}
         contact = SubElement(self._root, "contact")
-        for each in self._mjcf.children("contact"):
+        for each in self._mjcf.elements_in("contact"):
             ends = {name: each.get(name, "") for name in ("body1", "body2")}
             if each.tag == "exclude" and names.issuperset(ends.values()):
                 SubElement(contact, "exclude", ends)
@@ -106,7 +106,7 @@ class MjcfText:
         try:
             hull = self._mesh_asset(geom.mesh, hull=True)
         except ValueError as error:
-            fault = f"a mesh has {error}; shapes are missing of"
+            fault = f"{error}; shapes are missing of"
             self._mjcf.report.state_repair(fault, body.name)
         else:
             SubElement(element, "geom", {**values, **felt, **hull})

@@ -1,16 +1,16 @@
-"""Numbers in the text of URDF and SDF models: separators, and checks of joints."""
+"""Checks of numbers in the text of URDF and SDF models."""
 
 from __future__ import annotations
 
 import math
 from xml.etree.ElementTree import Element
 
-from drake_teleop.station.slave.model.model_tree import WORLD, joint_end
+from drake_teleop.station.slave.model.model_tree import WORLD_NAME, joint_end
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
 MAX_VALUE = 1e6  # largest length, mass or inertia, SI units; limits may be larger
-_LIST_ATTRIBUTES = ("xyz", "rpy", "rgba", "size", "scale")
-_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "specular", "emissive")
+_NUMBER_LIST_ATTRIBUTES = ("xyz", "rpy", "rgba", "size", "scale")
+_NUMBER_LIST_TAGS = ("pose", "xyz", "size", "scale", "diffuse", "ambient", "specular", "emissive")
 # Elements with lengths, inertias or rotor inertias in URDF and SDF.
 _QUANTITY_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
 _QUANTITY_TAGS |= {"radius", "radii", "length", "scale", "drake:rotor_inertia", "drake:gear_ratio"}
@@ -18,25 +18,24 @@ _MOVING_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 
 
 def parse_number(text: str | None) -> float:
-    """Return the number in a text, or NaN."""
+    """Return the number in a text, or NaN if there is none."""
     try:
         return float(text or "")
     except ValueError:
         return math.nan
 
 
-def separate_by_blanks(root: Element) -> None:
-    """Replace commas between the numbers of a list by blanks."""
+def replace_commas_by_blanks(root: Element) -> None:
     for element in root.iter():
-        for name in _LIST_ATTRIBUTES:
+        for name in _NUMBER_LIST_ATTRIBUTES:
             if "," in element.get(name, ""):
                 element.set(name, element.get(name, "").replace(",", " "))
-        if element.tag in _LIST_TAGS and "," in (element.text or ""):
+        if element.tag in _NUMBER_LIST_TAGS and "," in (element.text or ""):
             element.text = (element.text or "").replace(",", " ")
 
 
 def check_quantities(element: Element, where: str, report: RepairReport) -> None:
-    """Refuse lengths and rotor inertias that are no numbers, or too large, in an element."""
+    """Report lengths, inertias or rotor inertias in an element that are too large or no numbers."""
     for inner in element.iter():
         if inner.tag not in _QUANTITY_TAGS:
             continue
@@ -57,14 +56,14 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
 
 
 def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_chain: bool) -> None:
-    """Correct limits and damping of a joint; report other faults."""
+    """Correct limits, friction and damping of a joint; report changes and faults."""
     name = joint.get("name", "")
     where = f"joint {name}"
     for end in ("parent", "child"):
         link = joint_end(joint, end)
         if not link:
             report.add_fault(f"{where} has no {end} link")
-        elif link not in links and link != WORLD and "::" not in link and in_chain:
+        elif link not in links and link != WORLD_NAME and "::" not in link and in_chain:
             report.add_fault(f"{where}: its {end} link {link!r} does not exist")
     check_quantities(joint, where, report)
     if joint.get("type") == "fixed":
@@ -72,14 +71,14 @@ def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_cha
             joint.remove(mimic)
         return
     if in_chain:
-        _check_independent(joint, where, report)
+        _check_joint_is_independent(joint, where, report)
     for limit in joint.iter("limit"):
-        _check_limit(limit, where, report)
+        _check_joint_limit(limit, where, report)
     for dynamics in joint.iter("dynamics"):
-        _check_dynamics(dynamics, name, report)
+        _check_joint_dynamics(dynamics, name, report)
 
 
-def _check_independent(joint: Element, where: str, report: RepairReport) -> None:
+def _check_joint_is_independent(joint: Element, where: str, report: RepairReport) -> None:
     kind, name = joint.get("type") or "typeless", joint.get("name", "")
     if kind not in _MOVING_JOINT_TYPES:
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
@@ -99,7 +98,7 @@ def _check_independent(joint: Element, where: str, report: RepairReport) -> None
         report.add_fault(f"{where}: axis {text!r} is no direction; give three numbers")
 
 
-def _check_limit(limit: Element, where: str, report: RepairReport) -> None:
+def _check_joint_limit(limit: Element, where: str, report: RepairReport) -> None:
     values = dict[str, float]()
     for name in ("lower", "upper", "velocity", "effort"):
         text = limit.get(name) or limit.findtext(name)
@@ -120,7 +119,7 @@ def _check_limit(limit: Element, where: str, report: RepairReport) -> None:
         report.add_fault(f"{where}: lower limit {lower:g} is above upper limit {upper:g}")
 
 
-def _check_dynamics(dynamics: Element, name: str, report: RepairReport) -> None:
+def _check_joint_dynamics(dynamics: Element, name: str, report: RepairReport) -> None:
     damping, friction = (
         parse_number(dynamics.get(what) or dynamics.findtext(what) or "0")
         for what in ("damping", "friction")

@@ -1,6 +1,6 @@
-"""Files that a robot model references, and access rules for them.
+"""Files that a robot model references, and access rules, because models may be untrusted.
 
-Models may be untrusted. Only files inside the model's folder and its packages are read, after
+Only files inside the model's folder and its packages are read, after
 resolving symbolic links. Packages are `package_paths`, ROS packages (package.xml) around the model
 and the installed Python package around it. Include cycles are errors; number and size of files are
 limited.
@@ -25,8 +25,8 @@ from drake_teleop.common.texts import read_yaml
 
 # Limits for all files together (repeated includes count again), and bytes of one text file.
 _MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
-_MAX_NAME_LENGTH = 4096
-_MAX_DEPTH = 20  # largest depth of nested includes
+_MAX_PATH_LENGTH = 4096
+_MAX_INCLUDE_DEPTH = 20  # largest depth of nested includes
 _BINARY_SUFFIXES = (
     ".obj",
     ".glb",
@@ -52,12 +52,12 @@ _OBJ_REFERENCE_PATTERN = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.M)
 
 
 class ModelFiles:
-    """Access to the files that a model may read; `packages` contains folders by package name."""
+    """Access to the files that a model may read; `packages` are folders by package name."""
 
     def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
         self._model, self._folder = model, model.resolve().parent
         self._total = 0, 0
-        _check_size(1, model.stat().st_size, model)
+        _check_num_files_and_size(1, model.stat().st_size, model)
         self.packages: dict[str, Path] = {}
         inner = [each for folder in package_paths for each in sorted(folder.glob("*"))]
         for folder in (*package_paths, *inner):
@@ -78,8 +78,8 @@ class ModelFiles:
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._bases = {""}
 
-    def share_packages(self, known: PackageMap) -> None:
-        """Merge `packages` with Drake's map; remove the package that Drake downloads."""
+    def merge_packages(self, known: PackageMap) -> None:
+        """Merge `packages` with Drake's map `known`, without the package that Drake downloads."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
@@ -90,8 +90,8 @@ class ModelFiles:
     def find_file(self, address: str, folder: Path | None = None) -> Path | None:
         """Return the existing file or folder at an address, or None.
 
-        The address is package://, model://, file:// or a path relative to `folder`, by default the
-        model's.
+        The address begins with package://, model:// or file://, or is a path relative to `folder`,
+        by default the model's folder.
         """
         match = re.match(r"(?:package|model)://([^/]+)/?(.*)", address, re.S)
         if match:
@@ -106,40 +106,45 @@ class ModelFiles:
         roots = (*self._roots, *self.packages.values())
         return any(path.resolve().is_relative_to(root) for root in roots)
 
-    def check(self, path: Path) -> None:
-        """Check a file and all files that it references, except meshes of the model's own links."""
+    def check_file(self, path: Path) -> None:
+        """Raise DrakeTeleopError if a file references forbidden, missing, or too large files.
+
+        Meshes of the model's own links are not checked.
+        """
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
             self._sizes.clear()
             files, size = self._check_and_measure(path, ())
         self._total = self._total[0] + files, self._total[1] + size
-        _check_size(*self._total, self._model)
+        _check_num_files_and_size(*self._total, self._model)
 
     def _check_and_measure(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         real, where = path.resolve(), str(including[-1] if including else self._model)
         if not self.may_read(real):
             raise DrakeTeleopError(
-                f"names {real}, which is outside the model's folder and its packages",
+                f"references {real}, which is outside the model's folder and its packages",
                 where=where,
                 remedy="move it there, or name its folder: --package-path, slave.package_paths",
             )
-        if real in including or len(including) > _MAX_DEPTH:
-            what = "names itself" if real in including else "is nested too deeply"
-            raise DrakeTeleopError(f"{what} by {path.name}", where=where, remedy="cut the circle")
+        if real in including or len(including) > _MAX_INCLUDE_DEPTH:
+            what = "includes itself" if real in including else "is nested too deeply"
+            raise DrakeTeleopError(
+                f"{what} through {path.name}", where=where, remedy="remove this reference"
+            )
         if real not in self._sizes:
             if not (real.is_file() or real.is_dir()):
                 raise DrakeTeleopError(
-                    f"names {path}, which does not exist",
+                    f"references {path}, which does not exist",
                     where=where,
                     remedy="correct the path or add the file",
                 )
             files, size = 1, real.stat().st_size
-            _check_size(files, size, path)
+            _check_num_files_and_size(files, size, path)
             for named in list(self._referenced_files(real)):
                 more = self._check_and_measure(named, (*including, real))
                 files, size = files + more[0], size + more[1]
-                _check_size(files, size, path)
+                _check_num_files_and_size(files, size, path)
             self._sizes[real] = files, size
         return self._sizes[real]
 
@@ -149,9 +154,9 @@ class ModelFiles:
             tops.append(Path.cwd())  # Drake resolves nested includes from here
         folders = {top / base for top in tops for base in self._bases}
         try:
-            for address in self._addresses(path):
-                if len(address) > _MAX_NAME_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
-                    what = f"names a file by {len(address)} characters"  # Drake aborts on it
+            for address in self._addresses_in_file(path):
+                if len(address) > _MAX_PATH_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
+                    what = f"references a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.find_file(address, folder) for folder in folders}
                 found = {file for each in named for file in _existing_paths(each)}
@@ -159,7 +164,7 @@ class ModelFiles:
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
-    def _addresses(self, path: Path) -> Iterator[str]:
+    def _addresses_in_file(self, path: Path) -> Iterator[str]:
         kind = path.suffix.lower()
         if path.is_dir():  # Gazebo model folder
             yield from (
@@ -187,7 +192,6 @@ class ModelFiles:
 
 
 def _is_installed_package(folder: Path) -> bool:
-    """Return whether a folder is a Python package beside its `.dist-info`, and no home folder."""
     return (
         os.path.isfile(folder / "__init__.py")
         and any(each.is_dir() for each in folder.parent.glob("*.dist-info"))
@@ -203,26 +207,26 @@ def _existing_paths(path: Path | None) -> list[Path]:
         return []
 
 
-def _check_size(files: int, size: int, path: Path) -> None:
+def _check_num_files_and_size(files: int, size: int, path: Path) -> None:
     most = _MAX_BYTES if files > 1 or path.suffix.lower() in _BINARY_SUFFIXES else _MAX_TEXT
     if files > _MAX_FILES or size > most:
         what = f"{_MAX_FILES} files" if files > _MAX_FILES else f"{most // 10**6} MB"
         raise DrakeTeleopError(
-            f"takes more than {what} to read", where=str(path), remedy="remove or simplify parts"
+            f"exceeds the limit of {what}", where=str(path), remedy="remove or simplify parts"
         )
 
 
 def read_xml(path: Path) -> Element:
-    """Return the root of an XML file, with `drake:` prefixes unchanged.
+    """Return the root element of an XML file, with `drake:` prefixes unchanged.
 
-    Drake also reads malformed XML, which these checks cannot; here malformed XML is an error.
+    A DrakeTeleopError is raised for malformed XML, which Drake reads but these checks cannot.
     """
     builder, parser = TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
 
     def reject_entity(name: str | None, *_: object) -> NoReturn:
-        raise ValueError(f"the entity {name} is not in this file")
+        raise ValueError(f"the entity {name} is not defined in this XML file")
 
     parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = reject_entity
     try:

@@ -1,4 +1,4 @@
-"""Links and joints of a URDF robot or SDF model, and the chain of joints to the sensor frame."""
+"""Tree of links and joints of a URDF robot or SDF model, reduced to the arm with the sensor."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from xml.etree.ElementTree import Element
 
 from drake_teleop.station.slave.model.repair_report import RepairReport
 
-WORLD = "world"  # name in URDF and SDF
+WORLD_NAME = "world"  # name in URDF and SDF
 JOINT_TAGS = ("joint", "drake:joint")
 _LOOP_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
 _NUM_CONSTRAINT_ENDS = 2  # names of bodies or frames in such a constraint
-_BASE_JOINT_TYPES = ("floating", "planar")
+_FREE_BASE_JOINT_TYPES = ("floating", "planar")
 
 
-def joints_of(scope: Element) -> list[Element]:
-    """Return the joints of a robot or model, without those of nested models."""
+def list_joints(scope: Element) -> list[Element]:
+    """Return the joints of a robot or model element, without those of nested models."""
     return [child for child in scope if child.tag in JOINT_TAGS]
 
 
@@ -27,11 +27,11 @@ def joint_end(joint: Element, name: str) -> str:
 
 @dataclass(eq=False)
 class ModelTree:
-    """Joints up to the sensor from the base outwards, and all links by the nearest of them.
+    """Result of `reduce_to_chain`.
 
     Attributes:
         chain: joints from the root to the sensor's link, also fixed ones.
-        moved: number of the last moving joint of the chain below each link; 0 for links at rest.
+        moved: for each link the number of moving joints of the chain between root and link.
     """
 
     chain: list[Element]
@@ -39,13 +39,13 @@ class ModelTree:
 
 
 def link_of_frame(scope: Element, frame: str) -> str:
-    """Return the link that carries a frame, link or joint of this name, or an empty text."""
+    """Return the link that carries the frame, link or joint `frame`, or an empty text."""
     links = [link.get("name", "") for link in scope.findall("link")]
     carriers = {
         each.get("name", ""): each.get("link") or each.get("attached_to") or ""
         for each in scope.findall("frame")
     }
-    carriers |= {each.get("name", ""): joint_end(each, "child") for each in joints_of(scope)}
+    carriers |= {each.get("name", ""): joint_end(each, "child") for each in list_joints(scope)}
     passed = set[str]()
     while frame not in links and frame in carriers and frame not in passed:
         passed.add(frame)
@@ -56,19 +56,19 @@ def link_of_frame(scope: Element, frame: str) -> str:
 def reduce_to_chain(
     scope: Element, sensor_link: str, hold: set[str], report: RepairReport
 ) -> ModelTree | None:
-    """Keep the tree with the sensor, and fix its joints outside the chain at their default.
+    """Keep the tree of links with the sensor; fix joints that are not between root and sensor.
 
-    Other roots and joints that close a loop are removed. The joints `hold` count as fixed. Return
-    None, with the faults in `report`, if the chain is ambiguous.
+    Other trees and joints that close a loop are removed. The joints `hold` count as fixed. Return
+    None, with a fault in `report`, if the joints up to the sensor are ambiguous.
     """
-    chain = _chain_to(scope, sensor_link, report)
+    chain = _joint_chain_to_link(scope, sensor_link, report)
     if chain is None:
         return None
     chain = _remove_free_base(scope, chain, report)
     root = joint_end(chain[0], "parent") if chain else sensor_link
     moved = _remove_unreachable(scope, root, chain, hold, report)
     in_chain = set(map(id, chain))
-    for joint in joints_of(scope):
+    for joint in list_joints(scope):
         if id(joint) not in in_chain and joint.get("name") not in hold:
             fix_joint(joint, report)
     _remove_loops(scope, moved, report)
@@ -76,7 +76,7 @@ def reduce_to_chain(
 
 
 def fix_joint(joint: Element, report: RepairReport) -> None:
-    """Make a joint that moves a fixed one, at its default position."""
+    """Change a moving joint to a fixed one, at its default position."""
     if joint.get("type") == "fixed":
         return
     report.state_assumption("held:", joint.get("name", ""))
@@ -87,17 +87,17 @@ def fix_joint(joint: Element, report: RepairReport) -> None:
             joint.remove(child)
 
 
-def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] | None:
+def _joint_chain_to_link(scope: Element, link: str, report: RepairReport) -> list[Element] | None:
     parents: dict[str, list[Element]] = {}
-    for joint in joints_of(scope):
+    for joint in list_joints(scope):
         parents.setdefault(joint_end(joint, "child"), []).append(joint)
     chain, passed = list[Element](), set[str]()
     while link in parents:
         if link in passed:
-            report.add_fault(f"its joints form a circle through {link}; cut the loop")
+            report.add_fault(f"its joints form a loop through {link}; cut the loop")
             return None
         passed.add(link)
-        if link == WORLD:
+        if link == WORLD_NAME:
             report.add_fault(f"world is the child of {parents[link][0].get('name', '')}")
             return None
         if len(parents[link]) > 1:
@@ -111,13 +111,13 @@ def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] 
 
 def _remove_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
     moving = [k for k, joint in enumerate(chain) if joint.get("type") != "fixed"]
-    if not moving or chain[moving[0]].get("type") not in _BASE_JOINT_TYPES:
+    if not moving or chain[moving[0]].get("type") not in _FREE_BASE_JOINT_TYPES:
         return chain
     free = chain[moving[0]]
     report.state_assumption("welded to the world, where it may float:", joint_end(free, "child"))
     scope.remove(free)
     for link in scope.findall("link"):
-        if link.get("name") == WORLD:
+        if link.get("name") == WORLD_NAME:
             scope.remove(link)
     return chain[moving[0] + 1 :]
 
@@ -131,7 +131,7 @@ def _remove_unreachable(
         count += joint.get("type") != "fixed" and joint.get("name", "") not in hold
         number_of[id(joint)] = count
     outboard: dict[str, list[Element]] = {}
-    for joint in sorted(joints_of(scope), key=lambda joint: id(joint) not in number_of):
+    for joint in sorted(list_joints(scope), key=lambda joint: id(joint) not in number_of):
         outboard.setdefault(joint_end(joint, "parent"), []).append(joint)
     moved, ahead, kept = {root: 0}, [root], set[int]()
     while ahead:
@@ -139,15 +139,15 @@ def _remove_unreachable(
         for joint in outboard.get(parent, []):
             child = joint_end(joint, "child")
             exists = child in links or id(joint) in number_of
-            if exists and child not in moved and child != WORLD:
+            if exists and child not in moved and child != WORLD_NAME:
                 moved[child] = number_of.get(id(joint), moved[parent])
                 kept.add(id(joint))
                 ahead.append(child)
     for name in links.keys() - moved.keys():
         scope.remove(links[name])
-    for name in [name for name in links if name not in moved and name != WORLD]:
+    for name in [name for name in links if name not in moved and name != WORLD_NAME]:
         report.state_repair("not connected to the arm and left out:", name or "a link without name")
-    for joint in joints_of(scope):
+    for joint in list_joints(scope):
         if id(joint) not in kept:
             scope.remove(joint)
             if joint_end(joint, "parent") in moved:

@@ -1,4 +1,4 @@
-"""Repair of SDF texts: the model with the sensor, without elements that Drake does not read."""
+"""Repair of SDF texts: only the model with the sensor, without elements that Drake ignores."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from drake_teleop.station.slave.model.repair_report import RepairedModel, Repair
 from drake_teleop.station.slave.model.urdf_repair import (
     ModelPurpose,
     finish_repair,
-    repair_scope,
+    repair_links_and_joints,
     repair_urdf,
 )
 
 _MODEL_CONFIG, _URDF, _SDF = "model.config", ".urdf", ".sdf"
 _INCLUDE_URI_PATH = ".//include/uri"
 # Children that Drake reads; it also reads elements with its own prefix.
-_READ_TAGS_OF = {
+_READABLE_CHILD_TAGS = {
     "model": {"pose", "link", "joint", "frame", "model", "include", "static"},
     "link": {"pose", "inertial", "collision", "visual"},
     "collision": {"pose", "geometry", "surface"},
@@ -30,16 +30,16 @@ _READ_TAGS_OF = {
 def repair_sdf(
     root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of an SDF that Drake reads, with meshes and included files in `folder`."""
+    """Return an SDF text that Drake reads, with converted meshes and includes in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     if not purpose.is_scene:
-        _keep_one_model(root, file, files, purpose.sensor, report)
+        _keep_model_with_sensor(root, file, files, purpose.sensor, report)
         for element in list(root.iter()):
-            allowed = _READ_TAGS_OF.get(element.tag)
+            allowed = _READABLE_CHILD_TAGS.get(element.tag)
             for child in list(element) if allowed else ():
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
-    repair_scope(root, purpose, report, is_sdf=True)
+    repair_links_and_joints(root, purpose, report, is_sdf=True)
     for model in root.findall("model"):
         model.set("name", model.get("name") or file.stem)
     report.raise_faults(file)
@@ -61,7 +61,7 @@ def repair_sdf(
 def _repair_included(
     uri: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel | None:
-    """Replace an included file by its repaired text; leave a folder to Drake."""
+    """Let an include refer to a repaired copy of its file; return it, or None for a folder."""
     address = (uri.text or "").strip()
     included = _included_file(address, file, files)
     if included is None:  # Drake searches in more places, and crashes on a circle through them
@@ -92,7 +92,7 @@ def _included_file(address: str, file: Path, files: ModelFiles) -> Path | None:
     return found
 
 
-def _keep_one_model(
+def _keep_model_with_sensor(
     root: Element, file: Path, files: ModelFiles, sensor: str, report: RepairReport
 ) -> None:
     worlds = root.findall("world")

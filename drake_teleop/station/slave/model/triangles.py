@@ -1,4 +1,4 @@
-"""Triangle meshes of STL, OBJ and MSH files, their convex hulls, and their text for Drake."""
+"""Triangle meshes of STL, OBJ and MSH files, their convex hulls, and OBJ text for Drake."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Triangles(NamedTuple):
 
 
 def read_triangles(file: Path) -> Triangles:
-    """Return the triangles of an STL, OBJ or MSH file."""
+    """Return the triangles of an STL, OBJ or MSH file, or raise ValueError."""
     read = {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}
     try:
         return check_triangles(read[file.suffix.lower()](file.read_bytes()))
@@ -34,30 +34,29 @@ def read_triangles(file: Path) -> Triangles:
 
 
 def check_triangles(triangles: Triangles) -> Triangles:
-    """Return the triangles; raise ValueError unless all their vertices exist and are finite."""
+    """Return `triangles`; raise ValueError unless all their vertices exist and are finite."""
     vertices, faces = triangles
     if not faces.size or faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError("no triangles")
+        raise ValueError("a mesh has no triangles")
     if not np.isfinite(vertices).all():
-        raise ValueError("vertices that are not finite")
+        raise ValueError("a mesh has vertices that are not finite")
     return triangles
 
 
 def obj_text(triangles: Triangles) -> str:
-    """Return the triangles as text of an OBJ file."""
     vertices, faces = triangles.vertices, triangles.faces + 1
     text = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel())
     return text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel())
 
 
 def convex_hull(vertices: _Array) -> Triangles:
-    """Return the convex hull with triangles that face outwards."""
+    """Return the convex hull, with triangles that face outwards, or raise ValueError."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
         hull = ConvexHull(vertices)
     except QhullError as error:
-        raise ValueError("no volume") from error
+        raise ValueError("a mesh has no volume") from error
     faces = hull.simplices.astype(np.intp)
     inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
     faces[inwards] = faces[inwards, ::-1]
@@ -98,7 +97,7 @@ def _read_obj(data: bytes) -> Triangles:
 def _read_msh(data: bytes) -> Triangles:
     n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
     if min(n, normals, texture, count) < 0:
-        raise ValueError("a negative count")
+        raise ValueError("a mesh file has a negative count")
     vertices = np.frombuffer(data, "<f4", 3 * n, 16).reshape(-1, 3)
     start = 16 + 4 * (3 * n + 3 * normals + 2 * texture)
     faces = np.frombuffer(data, "<i4", 3 * count, start).reshape(-1, 3)

@@ -1,6 +1,6 @@
 """Repair of URDF and SDF texts, so that Drake reads the arm in them.
 
-Links and joints that the arm does not need never stop the reading. Every repair is stated.
+Faults of links and joints that the arm does not need are repaired. Every repair is reported.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from drake_teleop.station.slave.model.model_numbers import (
     check_joint,
     check_quantities,
     parse_number,
-    separate_by_blanks,
+    replace_commas_by_blanks,
 )
 from drake_teleop.station.slave.model.model_references import ModelFiles
 from drake_teleop.station.slave.model.model_tree import (
-    WORLD,
+    WORLD_NAME,
     ModelTree,
     fix_joint,
     joint_end,
-    joints_of,
     link_of_frame,
+    list_joints,
     reduce_to_chain,
 )
 from drake_teleop.station.slave.model.repair_report import RepairedModel, RepairReport, join_names
 
-_URDF_PARTS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
-_URDF_PARTS |= {"drake:collision_filter_group"}
-_NUM_COLOURS = 4  # red, green, blue, opacity
+_READABLE_URDF_TAGS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
+_READABLE_URDF_TAGS |= {"drake:collision_filter_group"}
+_NUM_RGBA_VALUES = 4  # red, green, blue, opacity
 _DRAKE_ROTOR_TAGS = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
@@ -43,10 +43,10 @@ class ModelPurpose(NamedTuple):
     Attributes:
         sensor: frame, link or site of the sensor; empty for tools and surroundings.
         hold: angles or positions [rad, m] of joints that do not move.
-        is_tool: whether all joints are held.
-        is_scene: whether every element that the tool could touch must be readable.
-        in_directives: whether other files may attach to any link, and set positions.
-        has_geometry: whether the plant takes shapes.
+        is_tool: whether the model is a tool, whose joints are all fixed.
+        is_scene: whether the model is surroundings: all its shapes must be readable.
+        in_directives: whether model directives add the model, so that every link is kept.
+        has_geometry: whether the plant has shapes.
     """
 
     sensor: str = ""
@@ -60,40 +60,40 @@ class ModelPurpose(NamedTuple):
 def repair_urdf(
     root: Element, file: Path, files: ModelFiles, purpose: ModelPurpose, folder: Path
 ) -> RepairedModel:
-    """Return the text of a URDF that Drake reads, with meshes converted in `folder`."""
+    """Return a URDF text that Drake reads, with meshes converted in `folder`."""
     report = RepairReport(strict=purpose.is_scene)
     root.set("name", root.get("name") or file.stem)
     if not purpose.is_scene:
-        for child in [child for child in root if child.tag not in _URDF_PARTS]:
+        for child in [child for child in root if child.tag not in _READABLE_URDF_TAGS]:
             if not child.tag.endswith(("_constraint", "_bushing_rpy")):
                 root.remove(child)
         _keep_one_material_per_name(root)
-    repair_scope(root, purpose, report, is_sdf=False)
+    repair_links_and_joints(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
-        _remove_idle_parts(root, report)
+        _remove_unused_elements(root, report)
     return finish_repair(root, file, files, report, folder if purpose.has_geometry else None)
 
 
-def repair_scope(
+def repair_links_and_joints(
     root: Element, purpose: ModelPurpose, report: RepairReport, *, is_sdf: bool
 ) -> None:
     """Repair links and joints of a robot, or of a model and its nested models."""
-    separate_by_blanks(root)
+    replace_commas_by_blanks(root)
     scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
-        _name_joints(scope, report)
+        _make_names_unique(scope, report)
     tree = _model_tree_of_scopes(scopes, purpose, report)
     chain = set() if tree is None else set(map(id, tree.chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
-        for joint in joints_of(scope):
+        for joint in list_joints(scope):
             if joint.get("name") in purpose.hold:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
             in_chain = id(joint) in chain and joint.get("name") not in purpose.hold
             check_joint(joint, links, report, in_chain=in_chain)
         moving = {
-            joint_end(each, "child") for each in joints_of(scope) if each.get("type") != "fixed"
+            joint_end(each, "child") for each in list_joints(scope) if each.get("type") != "fixed"
         }
         for link in scope.findall("link"):
             name = link.get("name", "")
@@ -108,7 +108,7 @@ def repair_scope(
 def finish_repair(
     root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path | None
 ) -> RepairedModel:
-    """Make the addresses of meshes absolute; return the text, or raise all faults at once.
+    """Convert meshes and return the text, or raise one DrakeTeleopError about all faults.
 
     Without a folder for converted meshes the text has no shapes.
     """
@@ -128,13 +128,13 @@ def finish_repair(
 
 
 def dependent_joints(root: Element) -> dict[str, str]:
-    """Return, by joint or link, the reason why it does not move independently."""
+    """Return the joints and links that do not move independently, with the reasons."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         parent = joint_end(joint, "parent")
         if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
             found[joint.get("name", "")] = "moves with another joint (mimic)"
-        if joint.get("type") == "floating" and parent != WORLD:
+        if joint.get("type") == "floating" and parent != WORLD_NAME:
             found[joint_end(joint, "child")] = f"floats on {parent}"
     return found
 
@@ -143,7 +143,7 @@ def _model_tree_of_scopes(
     scopes: list[Element], purpose: ModelPurpose, report: RepairReport
 ) -> ModelTree | None:
     if purpose.is_tool:
-        for joint in (joint for scope in scopes for joint in joints_of(scope)):
+        for joint in (joint for scope in scopes for joint in list_joints(scope)):
             fix_joint(joint, report)
         return None
     if len(scopes) != 1 or purpose.in_directives or scopes[0].find("include") is not None:
@@ -152,16 +152,16 @@ def _model_tree_of_scopes(
     return reduce_to_chain(scopes[0], link, set(purpose.hold), report) if link else None
 
 
-def _name_joints(scope: Element, report: RepairReport) -> None:
+def _make_names_unique(scope: Element, report: RepairReport) -> None:
     names = set[str]()
-    for number_of_joint, joint in enumerate(joints_of(scope), start=1):
+    for number_of_joint, joint in enumerate(list_joints(scope), start=1):
         name = joint.get("name", "")
         if not name or name in names:
             new = f"{name or 'joint'}_{number_of_joint}"
             report.state_repair("a new name for the joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
-    links, children = set[str](), Counter(joint_end(joint, "child") for joint in joints_of(scope))
+    links, children = set[str](), Counter(joint_end(joint, "child") for joint in list_joints(scope))
     for link in scope.findall("link"):
         name = link.get("name", "")
         if name in links and children[name] > 1:
@@ -173,7 +173,6 @@ def _name_joints(scope: Element, report: RepairReport) -> None:
 
 
 def _keep_one_material_per_name(root: Element) -> None:
-    """Define each named colour once, in the robot; visuals refer to it, or have a nameless one."""
     own = [each for each in root.iter("material") if _has_colour(each) and each.get("name")]
     defined = {each.get("name", ""): each for each in reversed([*root.findall("material"), *own])}
     defined = {name: each for name, each in defined.items() if _has_colour(each)}
@@ -197,12 +196,12 @@ def _has_colour(material: Element) -> bool:
     values = (
         [] if colour is None else [parse_number(word) for word in colour.get("rgba", "").split()]
     )
-    return len(values) == _NUM_COLOURS and all(0.0 <= value <= 1.0 for value in values)
+    return len(values) == _NUM_RGBA_VALUES and all(0.0 <= value <= 1.0 for value in values)
 
 
-def _remove_idle_parts(root: Element, report: RepairReport) -> None:
+def _remove_unused_elements(root: Element, report: RepairReport) -> None:
     links = {link.get("name", "") for link in root.findall("link")}
-    moving = {joint.get("name", "") for joint in joints_of(root) if joint.get("type") != "fixed"}
+    moving = {joint.get("name", "") for joint in list_joints(root) if joint.get("type") != "fixed"}
     for frame in root.findall("frame"):
         if frame.get("link") not in links:
             root.remove(frame)

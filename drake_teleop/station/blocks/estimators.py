@@ -16,7 +16,7 @@ from drake_teleop.station.estimation import contact_detection, load_estimator
 
 
 class _SamplePorts:
-    """Ports of a sample's parts, in place of the port `sample`."""
+    """Input ports for the parts of a sensor sample, instead of one port `sample`."""
 
     def __init__(self, system: LeafSystem) -> None:
         sizes = list(signals_of_sample(0).items())[:-1]
@@ -33,7 +33,7 @@ class _SamplePorts:
 
 
 class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
-    """Estimator of load and sensor offsets, updated with every sample of the wrist sensor.
+    """Block that estimates load and sensor offsets from every sample of the wrist sensor.
 
     .. pydrake_system::
 
@@ -46,14 +46,15 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
         - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
         output_ports:
         - load_estimate: (16,) [offsets; phi]
-        - load_state: (1,) see `station.estimation.load_estimator.LoadEstimator`
+        - load_state: (1,) 0 learning, 1 settled, 2 disturbed, 3 another load
 
     Args:
         noise_std: (6,) standard deviations of the wrench [N, N m].
-        motion_std: (9,) standard deviations of the motion, for method "rtls" and `watch`.
+        motion_std: (9,) standard deviations of specific force, angular velocity and angular
+            acceleration, for method "rtls" and `watch`.
         period: sampling period [s].
         initial: (16,) initial estimate.
-        config: default: recursive least squares from the start.
+        config: settings; default: recursive least squares from the start.
     """
 
     __slots__ = ()
@@ -76,12 +77,12 @@ class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
             np.zeros(16) if initial is None else finite_array("initial", initial, 16),
         )
 
-    def _declare_sample(self, size: int) -> Any:
+    def _declare_sample_ports(self, size: int) -> Any:
         return _SamplePorts(self)
 
 
 class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
-    """Detector of contact, from the wrench without the part of the load.
+    """Block that detects contact in the measured wrench without the load's part.
 
     .. pydrake_system::
 
@@ -98,7 +99,7 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
         - contact: (1,) 1 in contact, else 0
 
     Args:
-        floor: noise floor in free motion, fitted at the rate of this block.
+        floor: noise floor of the wrench in free motion, fitted at the rate of this block.
         period: sampling period [s].
         gravity_W: (3,) [m/s^2].
     """
@@ -118,7 +119,7 @@ class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
         self._gravity_W = finite_array("gravity_W", gravity_W, 3)
         self._orientation = self.DeclareVectorInputPort("R_WS", 9)
 
-    def _declare_sample(self, arm: Any) -> Any:
+    def _declare_sample_ports(self, arm: Any) -> Any:
         return _SamplePorts(self)
 
     def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
