@@ -552,7 +552,7 @@ def _reading_lines(_: Path) -> list[bytes]:
 
 def _wrenches(path: Path) -> None:
     """Whatever comes, what goes out is finite, and zero if it is flagged."""
-    content, size = path.read_bytes(), udp.READING.size
+    content, size = path.read_bytes(), udp.READING_FORMAT.size
     if path.suffix == ".bin":
         parts = [content[k : k + size] for k in range(0, len(content), size)]
         readings = [udp.unpack_reading(part) for part in parts]
