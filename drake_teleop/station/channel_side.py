@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
-    """Build the channel of a scenario: wires only for an ideal network without a method.
+    """Build the channel of a scenario: direct wires for an ideal network without passivity method.
 
     .. pydrake_system::
 
@@ -94,9 +94,9 @@ def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> P
 
 
 def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
-    """Return the scenario's passivity method, with mass and servo of the arm if it needs them.
+    """Return the scenario's passivity settings, with mass and servo of the arm if needed.
 
-    A DrakeTeleopError is raised if the arm has fewer than six joints (unbounded mass).
+    An arm with fewer than six joints, whose mass is then unbounded, raises a DrakeTeleopError.
     """
     passivity = scenario.passivity
     if not METHODS[passivity.method].needs_arm_mass or passivity.slave_mass is not None:
@@ -104,7 +104,8 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"the mass of an arm with {slave.arm.num_joints} joints is unbounded in a direction",
+            f"this method needs the arm's mass, but with {slave.arm.num_joints} joints it is "
+            "unbounded in a direction",
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
@@ -124,6 +125,6 @@ def power_scale_of_scenario(scenario: Scenario) -> Array:
 
 
 def _contact_scale(scenario: Scenario) -> float:
-    """Return force scale times gamma, where a gamma of 0 (no displayed contact) counts as 1."""
+    """Return force scale times gamma, the rendered share of contact; gamma 0 counts as 1."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

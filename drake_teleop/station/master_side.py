@@ -40,9 +40,9 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         - pose_command: (7,) X_WS, setpoint of the slave
         - leader_joints: (n,) setpoint of the slave's joints (leader arm in joint mode) [rad]
         - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m]
-        - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: signals
+        - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: for logs
         - displayed_and_fault: force_to_master and fault_at_hand in one port, for the log
-        - task_state: signal (with a task)
+        - task_state: for the log (with a task)
 
     Args:
         operator: custom operator, added as "live_hand"; None for the scenario's operator.

@@ -268,7 +268,7 @@ def test_ledger_rejects_arm_with_five_joints(folder, scenario):
     assert "held: j6, j7, to_finger" in NominalSlave(five.slave).assumptions
     MakeTeleopStation(five, load_estimate=true_load(five))
     over = replace(five, channel=Channel(network="lan"), passivity__method="ledger")
-    with pytest.raises(DrakeTeleopError, match="mass of an arm with 5 joints is unbounded"):
+    with pytest.raises(DrakeTeleopError, match="arm's mass, but with 5 joints it is unbounded"):
         MakeTeleopStation(over, load_estimate=true_load(five))
 
 

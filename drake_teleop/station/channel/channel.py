@@ -1,4 +1,4 @@
-"""Channel between master and slave: network and passivity method at both ends (long: one step)."""
+"""Channel between master and slave (long: one file for one compiled step of both ends)."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 @settings
 @dataclass
 class Channel(NetworkConfig):
-    """Network between master and slave: a preset, or `custom` with the fields of this block."""
+    """Settings of the network between master and slave: a preset, or `custom` with other fields."""
 
     network: str = choice(
         "custom", _NETWORK_NAMES, "a preset, or custom for the network of these fields"
@@ -91,7 +91,10 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
     def timeout_s(self, period: float) -> float:
-        """Return the silence [s] that starts the safe state, for a packet every `period` [s]."""
+        """Return the time without packets [s] after which an end enters its safe state.
+
+        `period` [s] is the interval of the packets.
+        """
         if self.timeout is not None:
             return self.timeout
         longest = [
@@ -143,7 +146,7 @@ _NO_LOAD_WRENCH = np.zeros(6)
 def initial_state_of_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the state of both ends before their first step; `start` (7,) is the slave's X_WS."""
+    """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
     ends = np.zeros(_STATE_SIZE)
     ends[_LAST_POSE_AT_MASTER][:7] = ends[_LAST_POSE_AT_SLAVE][:7] = start
     ends[_VALID_TIME] = STOP_TIME_S
@@ -180,6 +183,7 @@ def step_channel(
     """Run one step of both ends and of both directions of the network.
 
     Args:
+        steps: addresses of the passivity method's compiled functions.
         pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
             `TeleopChannel`.
         T: time between steps [s].
@@ -187,7 +191,7 @@ def step_channel(
         frame: (11,) R_WB by rows, scale of translation and of rotation.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
-        ports: (PORTS,) port energies, updated; times without packets, written.
+        ports: (8,) output port `ports` of `TeleopChannel`: energies updated, times written.
         wrench_received: (7,) written: F_E_B to render, and contact flag of the newest packet.
     """
     k = int(ends[_STEP_COUNT])
@@ -252,8 +256,7 @@ def step_slave_end(
     steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
-    """Run one step of the slave's end; arguments are those of `step_channel` and"
-    " `step_master_end`."""
+    """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
     before, held = ends[_LAST_POSE_AT_SLAVE], ends[_VALID_WRENCH_AT_SLAVE]
     watch, memory, work = (
         ends[_SLAVE_SILENCE_MONITOR],
@@ -302,7 +305,7 @@ def step_slave_end(
 
 @njit(cache=True)
 def _increment_into(pose, before, dx):
-    """Write the increment `dx` (6,) since the last finite pose; return whether `pose` is finite."""
+    """Write the change `dx` (6,) since the last finite pose; return whether `pose` is finite."""
     valid = all_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)
@@ -350,13 +353,13 @@ class TeleopChannel(LeafSystem):
         - pose_slave: (7,) actual X_WS of the slave
         - saturated: (1,) 1 while the wrench is invalid
         - contact: (1,) flag of the slave's contact detector; 0 if unconnected
-        - load_wrench_B: (6,) the load's part of wrench_B, for `ledger`; 0 if unconnected
+        - load_wrench_B: (6,) part of wrench_B from the load, for method `ledger`; 0 if unconnected
         output_ports:
         - pose_received: (7,) X_WS command of the slave
         - wrench_received: (6,) F_E_B to render at the hand [N, N m]
-        - ports: (8,) energy input of the hand by translation and rotation, and of the slave's
-          wrench [J]; time without packets at master and slave [s]; energy input of the slave's
-          wrench along the command [J]
+        - ports: (8,) energy input of the hand (2) and of the slave's wrench (2), by translation and
+          rotation [J]; time without packets at master and slave (2) [s]; energy input of the
+          slave's wrench along the slave's command (2) [J]
         - contact_at_hand: (1,) contact flag of the newest packet at the master
 
     Args:
@@ -448,7 +451,7 @@ class TeleopChannel(LeafSystem):
         slave: NDArray[np.float64],
         fills: float,
     ) -> None:
-        """Start in a running station, without packets in transit and with a constant slave command.
+        """Restart in a running station, without packets in transit, at a constant slave command.
 
         `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
         time in which the slave of method `wave` keeps its command.

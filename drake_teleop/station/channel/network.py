@@ -42,7 +42,7 @@ _MINUTE_S, _SILENCE_SEED = 60.0, 20090101  # [s]; seed for the silence of a netw
 @settings
 @dataclass
 class NetworkConfig:
-    """One direction of a network; the default is ideal: packet k arrives at step k."""
+    """Settings of one direction of a network; the default is ideal: packet k arrives at step k."""
 
     delay: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "mean one-way delay")
     jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) standard deviations over the mean delay")
@@ -128,7 +128,7 @@ def network_parameters(
     least: int = 0,
     delays: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the parameters of one direction for the compiled functions below.
+    """Return the parameters of one direction for `send_packet` and `receive_packet`.
 
     Args:
         direction: FORWARD or BACKWARD, with independent random numbers.
@@ -180,7 +180,7 @@ def mean_delay(config: NetworkConfig) -> float:
 
 
 def longest_delay(config: NetworkConfig) -> float:
-    """Return the largest age of a packet when it is used [s]."""
+    """Return the largest age of an arriving packet when the receiver uses it [s]."""
     longest = config.delay * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter)
     if config.trace is not None:
         longest = float(_read_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
@@ -226,7 +226,7 @@ def _random_uniform(p, k, draw):
 
 @njit(cache=True)
 def _delay_steps(p, k, draw):
-    """Return the delay of packet k [steps], -1 if the trace lost it; use three random numbers."""
+    """Return the delay of packet k [steps] from random numbers `draw` to `draw` + 2; -1: lost."""
     if p.shape[0] > _TRACE:
         steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
         return int(max(steps, p[_MIN_DELAY])) if steps >= 0.0 else -1
@@ -247,7 +247,7 @@ def _delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _advance_chain(p, k, bad):
-    """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none)."""
+    """Return the loss state (1: bad) at step k; delays of packet and copy [steps] (-1: none)."""
     if p[_BAD_SHARE] > 0.0:
         likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
         bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
@@ -276,7 +276,7 @@ def initial_network_state(
 
 @njit(cache=True)
 def send_packet(p, state, k, packet):
-    """Send the packet of step `k` and update `state`; steps count from 0 without gaps."""
+    """Send `packet` at step `k` and update `state`; call this for every step from 0 on."""
     receiver, in_transit = state
     slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
     receiver[_BAD_STATE], first, second = _advance_chain(p, k, receiver[_BAD_STATE])
@@ -292,9 +292,9 @@ def send_packet(p, state, k, packet):
 
 @njit(cache=True)
 def receive_packet(p, state, k, packet):
-    """Write the newest packet (N,) at step `k` into `packet`, after `send` of the same step.
+    """Write the newest packet (N,) that has arrived by step `k` into `packet`.
 
-    Return the step at which it was sent, or -1, and True if it is new.
+    Return the step at which it was sent (-1: none), and True if it is new.
     """
     receiver, in_transit = state
     slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
@@ -330,7 +330,7 @@ def _fill_silence(policy, silent, packet):
 def packet_delays(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive."""
+    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
     return _compute_delays(network_parameters(config, seed, direction, period), steps)
 
 

@@ -1,4 +1,4 @@
-"""Haptic devices by name: the paper's Phantom, and others by data sheets."""
+"""Haptic devices by name: the Phantom of the paper, and others from data sheets."""
 
 import copy
 import dataclasses
@@ -53,7 +53,7 @@ class JointFriction:
 @settings
 @dataclass
 class DeviceFigures:
-    """Data sheet of a device in task space; x of its base frame points to the operator, z up."""
+    """Data sheet of a device for `task_space`; its base axis x points to the operator, z up."""
 
     apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "apparent mass at the grip")
     inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "inertia about every axis")
@@ -134,7 +134,7 @@ FIGURES["virtuose_6d"] = dataclasses.replace(
 @settings
 @dataclass
 class Master:
-    """Haptic device and its start position."""
+    """Settings of the haptic device, with its start position."""
 
     model: str = choice(
         PHANTOM_NAME,
@@ -180,7 +180,7 @@ class Master:
         """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
         if self.is_joint_leader:
             raise DrakeTeleopError(
-                f"{what} supports pose mode only",
+                f"{what} cannot use a leader arm that commands joints",
                 where="master.leader.leads",
                 remedy="set it to pose: the rendered force is the same",
             )
@@ -224,19 +224,19 @@ class Master:
     def check(self, where: str) -> None:
         if self.model == PHANTOM_NAME and self.figures is not None:
             raise DrakeTeleopError(
-                "the model of the Phantom is fixed and has no data sheet",
+                "the Phantom has fixed dynamics and accepts no data sheet",
                 where=f"{where}.figures",
                 remedy="leave them out, or choose another model, such as custom",
             )
         if self.model != PHANTOM_NAME and self.friction != JointFriction():
             raise DrakeTeleopError(
-                f"only the Phantom has joint friction, not '{self.model}'",
+                f"only the Phantom accepts joint friction, not model '{self.model}'",
                 where=f"{where}.friction",
                 remedy="leave it out, and set figures.friction and figures.damping",
             )
         if (self.leader is None) == (self.model == LEADER_NAME):
             raise DrakeTeleopError(
-                "a leader arm requires `model: leader`, and this model a leader arm",
+                "`model: leader` and the settings `leader` require each other",
                 where=f"{where}.leader",
                 remedy="give both, with leader.file and leader.hand_frame, or none",
             )

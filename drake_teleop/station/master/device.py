@@ -35,7 +35,7 @@ def check_period(
     """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
-            f"a period of {period:g} s is too long for the haptic device",
+            f"the haptic device cannot run with a period of {period:g} s",
             where="master.period",
             remedy=f"choose at most {_MAX_PERIOD_S:g} s (1 kHz); the paper uses above 2 kHz",
         )
@@ -44,8 +44,8 @@ def check_period(
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
     if rate * period > _MAX_FRICTION_STEP:
         raise DrakeTeleopError(
-            f"the friction stops the device within {1e3 / rate:.2g} ms, too fast for a "
-            f"period of {1e3 * period:g} ms",
+            f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its "
+            f"simulation with a period of {1e3 * period:g} ms is unstable",
             where=device.friction_field,
             remedy="choose less friction, or a higher hand rate",
         )

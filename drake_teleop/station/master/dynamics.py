@@ -41,7 +41,7 @@ def gravity_torque_into(q, device, out):
 
 @njit(cache=True)
 def pose_into(q, device, pose):
-    """Write the stylus pose X_BE (7,) into `pose`."""
+    """Write the stylus pose X_BE (7,) at the joint positions q (6,) into `pose`."""
     if device[IN_TASK_SPACE] != 0.0:
         task_space.pose_into(q, pose)
     else:
@@ -63,7 +63,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
     """Advance `state` (12,) [q; v] in place by one Runge-Kutta step of `period` [s].
 
     `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `motor` (6,) are the motor
-    torques or forces at the joints.
+    torques or forces at the joints; `work` and `stages` are scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
     copy_into(stage, 0, state, 0, 12)
@@ -88,7 +88,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
 
 
 class DisplayDevice:
-    """Base class of haptic devices; `numbers` (NUMBERS,) contains the parameters."""
+    """Base class of haptic devices; `numbers` are the parameters with indices in `numbers.py`."""
 
     numbers: NDArray[np.float64]
 
@@ -105,7 +105,7 @@ class DisplayDevice:
 
 @dataclass(frozen=True)
 class HapticDevice(DisplayDevice):
-    """Haptic device (Phantom or in task space) with the hand's passive mass.
+    """Dynamics of a haptic device (Phantom or `task_space`) with the hand's passive mass.
 
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
     """

@@ -15,7 +15,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 def read_pose_into(q, q_start, steps, device, pose):
     """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
 
-    `steps` (6,) are in m or rad; 0 is exact.
+    `steps` (6,) are in m or rad; a step of 0 rounds nothing.
     """
     read = np.empty(6)
     for i in range(6):
@@ -25,7 +25,7 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """Encoders of a haptic device: round the stylus pose to whole steps (6,) [m, rad]; 0 is exact.
+    """Encoders of a haptic device, with whole `steps` (6,) [m, rad] of its axes; 0 is exact.
 
     Steps count from the joint positions `q_start` (6,).
 
@@ -35,7 +35,7 @@ class Encoders(LeafSystem):
         input_ports:
         - master_state: (12,) state of the device
         output_ports:
-        - pose_read: (7,) X_BE
+        - pose_read: (7,) X_BE of the rounded positions
     """
 
     __slots__ = ONE_DICT

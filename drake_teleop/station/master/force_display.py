@@ -75,7 +75,7 @@ def limit_wrench_into(wrench, numbers, J, displayed):
 
 @njit(cache=True)
 def motor_torque_into(displayed, q, numbers, J, torque):
-    """Write J^T F plus gravity compensation (6,) at q (6,) into `torque`; F is `displayed` (6,)."""
+    """Write motor torques (6,), J^T `displayed` plus gravity compensation at q, into `torque`."""
     gravity_torque_into(q, numbers, torque)
     for i in range(6):
         for k in range(6):
@@ -86,7 +86,7 @@ def motor_torque_into(displayed, q, numbers, J, torque):
 def display_into(wrench, device, numbers, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
-    `device` (27,) is the port `for_display` of `MasterDevice`; `drive` (27,) is written.
+    `device` (27,) is port `for_display` of `MasterDevice`; `drive` (27,), its input, is written.
     """
     q, fault = device[_POSITIONS], _NO_FAULT
     copy_into(drive, 6, device, 6, _SILENCE_MONITOR.stop - 6)
@@ -125,9 +125,9 @@ def _fade_after_fault(device, numbers, period, drive):
 
 
 class DeviceBlock(LeafSystem):
-    """Base class of haptic devices as blocks, at rest at `q_initial` at the start.
+    """Base class of Drake blocks of haptic devices, which start at rest at `q_initial`.
 
-    `advance` writes the states after one period.
+    The compiled function `advance` steps the states by one period.
     """
 
     __slots__ = ONE_DICT
@@ -172,8 +172,7 @@ class DeviceBlock(LeafSystem):
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    With invalid data, the displayed wrench fades to zero in 50 ms and returns as after silence in a
-    channel.
+    While data are invalid, the displayed wrench fades to zero in 50 ms; then it ramps up again.
 
     .. pydrake_system::
 
@@ -184,7 +183,7 @@ class ForceDisplay(LeafSystem):
         output_ports:
         - drive: (27,) for the device: J_M^T F + gravity compensation (6) [N m], memory
         - force_to_master: (6,) wrench F, displayed within the device's limits [N, N m]
-        - fault_at_hand: a `Fault`
+        - fault_at_hand: code of `blocks.Fault`
         - displayed_and_fault: (7,) the last two ports in one vector
     """
 

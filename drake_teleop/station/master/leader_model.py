@@ -1,4 +1,4 @@
-"""Leader arm from a model file, as a part of the scenario."""
+"""Settings of a leader arm from a model file."""
 
 import dataclasses
 import math
@@ -40,7 +40,7 @@ JOINT_MODE = "joints"
 @settings
 @dataclass
 class Leader:
-    """Arm that the operator moves; its base is placed so that E is at `position` at home."""
+    """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
 
     file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder")
     package_paths: list[str] = plain(
@@ -77,14 +77,14 @@ class Leader:
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
                 raise DrakeTeleopError(
-                    "is required for a leader arm", where=f"{where}.{name}", remedy="set it"
+                    "a leader arm requires this field", where=f"{where}.{name}", remedy="set it"
                 )
         for name in ("home", "friction", "damping", "torque_limit"):
             values = getattr(self, name)
             if not np.isfinite(values).all() or (name != "home" and min(values, default=0.0) < 0.0):
                 least, fault = ("", "") if name == "home" else (" of 0 or more", "negative or ")
                 raise DrakeTeleopError(
-                    f"contains a number that is {fault}not finite",
+                    f"{values} contains a number that is {fault}not finite",
                     where=f"{where}.{name}",
                     remedy=f"give finite numbers{least}",
                 )
@@ -143,7 +143,7 @@ class Leader:
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(
-                f"has {len(values)} numbers, the arm has {n} joints",
+                f"has {len(values)} values, the leader arm has {n} joints",
                 where=f"master.leader.{name}",
                 remedy=f"give {n}, for {', '.join(arm.joint_names)}",
             )

@@ -293,7 +293,7 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     cosine = (reach**2 + z**2 - L1**2 - L2**2) / (2 * L1 * L2)
     if abs(cosine) > 1:
         raise DrakeTeleopError(
-            f"the master cannot reach ({x:g}, {y:g}, {z:g}) m",
+            f"the Phantom's stylus cannot reach ({x:g}, {y:g}, {z:g}) m",
             where="pose_master",
             remedy="choose a start pose inside the device's workspace, in its base frame B",
         )
@@ -310,7 +310,7 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6)."""
+    """Return the joint angles of `phantom.sdf` for q (..., 6): its third is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
@@ -327,14 +327,14 @@ def check_limits(q: NDArray[np.float64]) -> None:
     for i in range(6):
         if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:
             raise DrakeTeleopError(
-                f"joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
+                f"Phantom joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
                 f"{np.degrees(JOINT_LOWER[i]):.1f} to {np.degrees(JOINT_UPPER[i]):.1f}",
                 where="pose_master",
                 remedy="choose a start pose inside the device's workspace",
             )
     if not FIVE_BAR_RANGE[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE[1] + margin:
         raise DrakeTeleopError(
-            f"q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, its range is -55 to 65",
+            f"Phantom angle q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, not -55 to 65",
             where="pose_master",
             remedy="choose a start pose inside the device's workspace",
         )

@@ -174,7 +174,7 @@ def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
         turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[MAX_ROTATION]))
         raise DrakeTeleopError(
-            f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, turned by "
+            f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, yaw, pitch, roll "
             f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "
             f"is {axes} m, +-({turns}) degrees",
             where="pose_master",

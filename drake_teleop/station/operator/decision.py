@@ -198,7 +198,6 @@ def _plan_submovement(person, memory, step, time, error_W):
 
 @njit(cache=True)
 def _contact_force_along_axis(task, person, felt):
-    """Return the contact force on the tool against the axis [N]."""
     along = 0.0
     for i in range(3):
         axis_B = 0.0
@@ -230,14 +229,14 @@ def _enter_phase(state, memory, phase, ready):
 
 @njit(cache=True)
 def update_decision(task, person, time, seen_W, felt, state, memory):
-    """Update the operator's decisions by one step of `PERIOD`.
+    """Update the operator's decisions by one step of `DECISION_PERIOD_S`.
 
     Args:
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
         felt: (5,) output of `update_perception_into`, delayed by the reaction time.
         state: (5,) phase; 1 done or -1 given up; 1 while contact is detected; detection threshold
             [N]; trust (0.1 to 1) in detecting contact; updated.
-        memory: (MEMORY,) from `initial_memory`, updated.
+        memory: (MEMORY_SIZE,) from `initial_memory`, updated.
     """
     step = int(memory[_STEP])
     memory[_STEP] += 1.0
@@ -357,7 +356,6 @@ def _perceived_force(task, person, felt, memory):
 
 @njit(cache=True)
 def _press_displacement(task, memory, force):
-    """Return the displacement towards the set force along the axis [m]; update the stiffness."""
     effect = force - memory[_LAST_FORCE]
     if effect * memory[_LAST_MOVE] > 0.0:
         stiffness = 0.5 * (memory[_STIFFNESS] + effect / memory[_LAST_MOVE])

@@ -61,7 +61,7 @@ GRIP_IMPEDANCES = {
 @settings
 @dataclass
 class MinimumJerk:
-    """Displacement on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
+    """Displacement with share 10 u^3 - 15 u^4 + 6 u^5 at u = (t - t_start) / duration."""
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
@@ -74,7 +74,7 @@ class MinimumJerk:
 @settings
 @dataclass
 class Sine:
-    """Oscillation with minimum-jerk ramps at both ends (C2).
+    """Oscillation with minimum-jerk ramps at both ends.
 
     Between the ramps the offset is amplitude * sin(2 pi frequency (t - t_start) + phase).
     """
@@ -93,7 +93,7 @@ class Sine:
 @settings
 @dataclass
 class OperatorConfig:
-    """Grip, intended motion and task of the operator."""
+    """Settings of the operator: grip, intended motion and task."""
 
     grip: str = choice("medium", tuple(GRIP_IMPEDANCES), "stiffness, damping and mass of the hand")
     intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
@@ -112,8 +112,8 @@ class OperatorConfig:
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
     """Return the segments of the intended motion as an array (n, 12) for compiled functions.
 
-    Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
-    (3), rotation (3).
+    Columns: start and length of the ramp in and of the ramp out, 2 pi frequency, phase,
+    translation (3), rotation (3).
     """
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
@@ -173,7 +173,7 @@ def intended_motion_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write the pose (7,) with unit quaternion into `out`; return whether the input is valid."""
+    """Write the pose (7,) with unit quaternion into `out`; return whether both inputs are valid."""
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -292,8 +292,8 @@ class Operator(LeafSystem):
         - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold of
           the rendered force [N], trust (with a task)
 
-    The intent is relative to `start` (7,), X_BE. A task requires training, the slave's arm, and
-    `tip` (6,), the position of the tool's tip in S and at the start in W [m].
+    The intended motion is relative to the pose X_BE `start` (7,). A task requires training, the
+    slave's arm, and `tip` (6,), the position of the tool's tip in S and at the start in W [m].
     """
 
     __slots__ = ONE_DICT
@@ -322,7 +322,9 @@ class Operator(LeafSystem):
         moving = self._declare_intended_motion() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
-                raise ValueError("a task needs training, arm and tip")
+                raise ValueError(
+                    "an operator with a task requires the arguments training, arm and tip"
+                )
             moving.add(self._declare_task(config, config.task, training, arm, tip))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)

@@ -1,7 +1,8 @@
 """Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
-A Kalman filter estimates the expected force m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 without
-contact (`docs/operator.md`). A larger force beyond the threshold is contact.
+A Kalman filter estimates mass m, damping b, friction c and offset u_0 of the force without contact,
+m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). A difference of u beyond the
+threshold is contact.
 """
 
 import math
@@ -57,7 +58,7 @@ class Perception:
     )
 
     def compiled_parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N], and decay and smoothing factors per step."""
+        """Return (4,) Weber fraction, threshold [N], decay and smoothing factors of `dt` [s]."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
@@ -180,7 +181,7 @@ def perceive_contact(
     steps = np.diff(times)
     if not len(steps) or steps.min() <= 0.0:
         raise DrakeTeleopError(
-            "is not increasing", where="t", remedy="give at least two samples in order of time"
+            "times do not increase", where="t", remedy="give at least two samples in order of time"
         )
     dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
     parameters = perception.compiled_parameters(dt)

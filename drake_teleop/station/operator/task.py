@@ -25,7 +25,7 @@ class _Task:
 @settings
 @dataclass
 class Reach(_Task):
-    """Task: move the tool's tip into a sphere in free space and keep it there (Fitts)."""
+    """Task of Fitts: move the tool's tip into a sphere in free space and keep it there."""
 
     width: float = quantity(0.01, "m", 5e-4, 0.5, "diameter of the target")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time in the target")
@@ -58,7 +58,7 @@ class Press(_Task):
 @settings
 @dataclass
 class Insert(_Task):
-    """Task: insert the tool into a slot whose mouth is the target, and push it to the floor."""
+    """Task: insert the tool into a slot with its mouth at the target, down to the slot's floor."""
 
     timeout: float = quantity(20.0, "s", 0.1, 3600.0, "after which the operator gives up")
     standoff: float = quantity(
@@ -105,11 +105,12 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Raise a DrakeTeleopError if the target's radius or standoff contains the tool's start."""
+    """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:
         raise DrakeTeleopError(
-            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m",
+            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m (its "
+            "radius or standoff)",
             where=f"{where}.translation",
             remedy="choose a target farther from the tool's start",
         )

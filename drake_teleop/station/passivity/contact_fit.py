@@ -15,7 +15,7 @@ _RIDGE = 0.05
 
 @njit(cache=True)
 def update_contact_fit(sums, force_change, displacement, speed_change, keep):
-    """Add one displacement [m] to the fit; return stiffness [N/m] and damping [N s/m].
+    """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m].
 
     `sums` (NUM_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
     """
@@ -38,8 +38,9 @@ def update_contact_fit(sums, force_change, displacement, speed_change, keep):
 def remove_slip_steps(displayed, component, explained, share, max_slip):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
-    `component` [N] is the measured force. Its changes that depth and speed explain (`explained`)
-    are rendered at once; of the others only a `share`, up to the size `max_slip`.
+    `displayed` [N] is the last rendered force, `component` [N] the measured force. Its change
+    `explained` by depth and speed is rendered at once. The remaining difference, at most
+    `max_slip`, is reduced by `share`.
     """
     displayed += explained
     displayed += min(share, 1.0) * (component - displayed)
@@ -48,7 +49,7 @@ def remove_slip_steps(displayed, component, explained, share, max_slip):
 
 @njit(cache=True)
 def force_change_by_slip(force_change, largest_change, max_slip):
-    """Return the part of a force change [N] that a slip may cause, at most `max_slip`.
+    """Return the part of a force change [N] that slip may cause, at most `max_slip`.
 
     `largest_change` [N] is the change that the largest stiffness would cause.
     """

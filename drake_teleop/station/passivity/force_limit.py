@@ -1,4 +1,4 @@
-"""Passivity method "local_force_limit": bounds force and torque rendered at the hand.
+"""Passivity method "force_limit": bounds force and torque rendered at the hand.
 
 Without an energy balance, an unstable loop stays unstable, but its limit cycle is bounded.
 """
@@ -22,7 +22,7 @@ _LOCAL_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m
 @settings
 @dataclass
 class ForceLimitConfig:
-    """Parameters of the local force limit."""
+    """Parameters of the passivity method "force_limit"."""
 
     force: float = quantity(1.0, "N", 0.0, 1e4, "largest force at the hand")
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")

@@ -77,7 +77,6 @@ class FourChannelConfig:
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet, which contains the hand's measured wrench."""
     difference = memory[_DIFFERENCE]
     difference[:] = 0.0
     connected = has_arrived(received)

@@ -1,4 +1,4 @@
-"""Master's end of the passivity method "ledger", whose energy balance is at the slave's motion.
+"""Master's end of the passivity method "ledger", which balances energy at the slave's motion.
 
 docs/theory.md, "The energy ledger", has its equations and the steps M1 to M7 and S1 to S6.
 """
@@ -117,7 +117,7 @@ _NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _places.number(), _places.vector(2
 @settings
 @dataclass
 class LedgerConfig:
-    """Parameters of the energy ledger."""
+    """Parameters of the passivity method "ledger"."""
 
     initial: list[float] = quantity(
         [0.12, 0.011],
@@ -221,7 +221,7 @@ def _update_hand_ledger(g, dx, in_contact, p, memory):
 
 @njit(cache=True)
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
-    """Write the predicted contact wrench (M2, M3) into `wrench`.
+    """Write the predicted contact wrench (docs/theory.md, M2, M3) into `wrench`.
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
@@ -303,9 +303,9 @@ def _find_slave_step(received, memory):
 
 @njit(cache=True)
 def _render_friction(T, size, force, received, dx, p, memory, wrench):
-    """Write the wall's friction, as rendered to the hand, into `wrench` (6,) (T68).
+    """Write the wall's friction, as rendered to the hand, into `wrench` (6,), docs/theory.md (T68).
 
-    It is a model at the hand's motion, plus what the model misses at the slave, which arrives late.
+    It is modelled at the hand's motion, plus measured minus modelled friction at the slave.
     """
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
     slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
@@ -342,7 +342,6 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
 
 @njit(cache=True)
 def _friction_stiffness(g, p):
-    """Return the stiffness k_h of the friction at the hand (T68) [N/m; N m/rad for g = 1]."""
     factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
     return factor * _MAX_STIFFNESS / max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
 

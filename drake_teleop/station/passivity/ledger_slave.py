@@ -1,4 +1,7 @@
-"""Slave's end of the method "ledger" (long: all steps of one end): S1 to S6 of docs/theory.md."""
+"""Slave's end of the passivity method "ledger" (long: one file for steps S1 to S6).
+
+docs/theory.md, "The energy ledger", has the equations of these steps.
+"""
 
 from __future__ import annotations
 
@@ -112,7 +115,7 @@ _DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(
 
 @njit(cache=True)
 def filter_velocity(twist, share, memory):
-    """Low-pass the velocity in `memory`; `share` is the weight of the new `twist`."""
+    """Low-pass filter the velocity in `memory`; `share` is the weight of the new `twist`."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -132,7 +135,7 @@ def wrench_component_along(a, b, p):
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return the work of a wrench (6,) over a displacement (6,) [J]; for a unit wrench [m]."""
+    """Return the work of a wrench (6,) over a displacement (6,) [J]; along a unit wrench [m]."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 
@@ -257,7 +260,6 @@ def _servo_lag(p):
 
 @njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
-    """Return k_d (S3), the largest contact stiffness that is rendered to the hand [N/m]."""
     normal, fill_level = memory[NORMAL], 0.0
     depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
@@ -396,7 +398,7 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved."""
+    """Move the command (7,) so that the motors' energy suffices; return whether it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     pose_difference_into(command, pose, motor_wrench)
     for g in range(2):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 MEMORY_SIZE = 180  #: length of the memory vector of one end
-NUM_PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` fills
+NUM_PARAMETERS = 26  #: length of the parameter vector, which `method_parameters` fills
 
 
 class SlotAllocator:
@@ -19,7 +19,9 @@ class SlotAllocator:
         """Reserve `length` places and return their slice."""
         first, self._next = self._next, self._next + length
         if self._next > self._size:
-            raise IndexError(f"the vector has {self._size} places, {self._next} are required")
+            raise IndexError(
+                f"a vector of size {self._size} has no index {self._next - 1}; increase it"
+            )
         return slice(first, self._next)
 
     def rest(self) -> slice:

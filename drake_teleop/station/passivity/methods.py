@@ -72,11 +72,11 @@ from drake_teleop.station.passivity.wave import WaveConfig
 
 @njit(cache=True)
 def _record_nothing(requested, command, pose, twist, p, memory):
-    """Substitute for `record_command` in methods without one."""
+    pass
 
 
 class PassivityMethod(NamedTuple):
-    """Both ends of a passivity method, and what it needs from the station.
+    """Functions of a passivity method, and its requirements on the station.
 
     Attributes:
         master_step, slave_step, record_command: compiled functions with the arguments of those of
@@ -85,7 +85,7 @@ class PassivityMethod(NamedTuple):
         config: settings dataclass of a registered method with `pack_into(p)`, or None.
         balance_at_motors: the energy balance is at the slave's motors, not at its command.
         needs_arm_mass: `slave_mass` and servo are by default those of the arm at the start.
-        needs_load_apart: the ends need the load's part of the wrench, `load_wrench_B`.
+        needs_load_apart: the ends need the load's part of the wrench separately.
         speed_limit: function of config and slave mass: largest speed of the slave [m/s, rad/s].
     """
 
@@ -218,9 +218,9 @@ class PassivityConfig(MethodConfigs, _CommonConfig):
         if schema is None:
             if self.registered:
                 raise DrakeTeleopError(
-                    f"'{self.method}' is no registered method",
+                    f"method '{self.method}' takes no parameters here (only registered methods do)",
                     where=f"{where}.registered",
-                    remedy="leave it out; a shipped method has its own block of parameters",
+                    remedy="leave them out; a shipped method has its own block of parameters",
                 )
             return (
                 getattr(self, _FIELD_OF_METHOD[self.method])
@@ -240,7 +240,7 @@ def method_parameters(
     power_scale: Sequence[float] = (1.0, 1.0),
     motion_scale: Sequence[float] = (1.0, 1.0),
 ) -> NDArray[np.float64]:
-    """Return the parameters (PARAMETERS,) of the selected method for the compiled steps.
+    """Return the parameters (NUM_PARAMETERS,) of the selected method for the compiled steps.
 
     Args:
         power_scale: (2,) factors from the slave's wrench to the master's power units, for force and
@@ -265,7 +265,7 @@ def method_parameters(
 def initial_method_memory(
     method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the memory (MEMORY,) of one end of the channel before its first step.
+    """Return the memory (MEMORY_SIZE,) of one end of the channel before its first step.
 
     `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives.
     """
@@ -368,7 +368,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         received, fresh, T, p, memory, packet: as for `master_step`, with the master's packet.
         pose, twist: (7,) and (6,) actual pose X_WS and twist [v; omega] of the slave, in W.
         dx: (6,) increment of this pose since the last step, in W.
-        wrench: (6,) wrench on the slave from contact, with sigma > 0 also from the load, in W.
+        wrench: (6,) wrench on the slave to render, from contact and the rendered load, in W.
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
             finite, it is the last pose with zero twist.
     """

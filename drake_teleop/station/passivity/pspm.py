@@ -1,6 +1,6 @@
 """Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
-A spring pulls each end to a set position, as near to the requested one as the energy permits.
+A spring pulls each end to a set position as near to the requested one as the energy permits.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -52,7 +52,7 @@ _OFFSET, _REQUESTED = _places.vector(6), _places.vector(6)
 @settings
 @dataclass
 class PspmConfig:
-    """Parameters of the passive set-position modulation."""
+    """Parameters of the passivity method "pspm", passive set-position modulation."""
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(

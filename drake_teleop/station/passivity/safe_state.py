@@ -52,7 +52,7 @@ _LAST_COMMAND, _PREVIOUS_COMMAND = (
 def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the silence monitor (MASTER_MONITOR_SIZE,) of the master before the first packet.
 
-    With `full` (2,), the device's limits [N, N m], it is that of normal operation.
+    With the device's limits `full` (2,) [N, N m], return that of normal operation instead.
     """
     watch = np.zeros(MASTER_MONITOR_SIZE)
     if full is None:
@@ -63,7 +63,7 @@ def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[n
 
 
 def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the silence monitor (SLAVE_MONITOR_SIZE,) of the slave; `pose` (7,): first command."""
+    """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_S] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):

@@ -88,7 +88,7 @@ _LAST_COMMAND = _places.vector(7)  # the command of the last step
 @settings
 @dataclass
 class TdpaConfig:
-    """Parameters of the time-domain passivity approach."""
+    """Parameters of the time-domain passivity approach (TDPA)."""
 
     release: float = quantity(
         0.02,

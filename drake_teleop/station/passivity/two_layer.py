@@ -1,6 +1,6 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-The tank of each end covers the energy that the wrench can use until the next step.
+The tank of each end must contain the energy that the wrench can use until the next step.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -56,7 +56,7 @@ _SPRING_WRENCH, _BRAKE_WRENCH = _places.vector(6), _places.vector(6)
 @settings
 @dataclass
 class TwoLayerConfig:
-    """Parameters of the energy tanks."""
+    """Parameters of the passivity method "two_layer"."""
 
     send_rate: float = quantity(5.0, "1/s", 0.0, 1e6, "share of a tank that is sent in a second")
     drain_rate: float = quantity(
@@ -109,7 +109,6 @@ def _exchange_energy(received, dx, T, p, memory, packet):
 
 @njit(cache=True)
 def _max_energy_use(f, dx, g, acceleration, T):
-    """Return the largest energy that the wrench `f` can use until the next step [J]."""
     return dot_of_group(f, dx, g) + length_of_group(f, g) * acceleration * T * T
 
 

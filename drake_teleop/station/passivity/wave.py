@@ -1,7 +1,7 @@
-"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991), theory.md (T33) to (T36).
+"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991).
 
-The receiver filters the integral of the wave within the received energy, so jitter and loss create
-no energy.
+docs/theory.md, (T33) to (T36). The receiver filters the integral of the wave within the received
+energy, so jitter and loss create no energy.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -92,7 +92,6 @@ class WaveConfig:
 
 @njit(cache=True)
 def _output_wave(received, T, p, memory, wave):
-    """Write the wave (6,) of this step, the filtered rate of the received wave integral (T34)."""
     ledger, played = memory[STORED_ENERGY], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):

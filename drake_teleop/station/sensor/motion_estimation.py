@@ -1,4 +1,4 @@
-"""Estimated motion of the sensor frame S (long: each source with its delay and noise).
+"""Estimated motion of the sensor frame S (long: one file for sources, their delays and noise).
 
 Sources of specific force s of So, angular velocity omega and acceleration alpha:
 
@@ -79,7 +79,7 @@ _GRAVITY = 22
 @settings
 @dataclass
 class MotionEstimationConfig:
-    """Source of the estimated motion of the sensor."""
+    """Settings of the motion estimation of the sensor frame S."""
 
     source: str = choice(
         "accelerometer", _MOTION_SOURCES, "source of angular velocity and accelerations"
@@ -185,7 +185,7 @@ def fusion_filters(
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> NDArray[np.float64]:
-    """Return standard deviations (9,) of s [m/s^2], omega (exact) [rad/s] and alpha [rad/s^2]."""
+    """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
         return np.concatenate([s_std, np.zeros(3), alpha_std])
@@ -203,7 +203,7 @@ def estimated_motion_std(
 
 
 def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the encoders' rounding error as rotation about any axis of S, 1 sigma [rad]."""
+    """Return the standard deviation [rad] of S about any axis by the encoders' rounding."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
@@ -211,7 +211,7 @@ def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
 def _accelerometer_std(
     sensor: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return standard deviations (3,) of the specific force at So, and (3,) of alpha."""
+    """Return standard deviations (3,) of specific force at So, (3,) of angular acceleration."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
@@ -259,8 +259,8 @@ def _low_pass_filters_of_paths(
     if config.source == "encoders":
         if config.encoder_bandwidth_hz >= 0.45 / period:
             raise DrakeTeleopError(
-                f"{config.encoder_bandwidth_hz:g} Hz is too near to half of the sensor's rate "
-                f"({1 / period:g} Hz)",
+                f"a bandwidth of {config.encoder_bandwidth_hz:g} Hz is too near to half of the "
+                f"sensor's rate ({1 / period:g} Hz)",
                 where="motion_estimation.encoder_bandwidth_hz",
                 remedy="lower the bandwidth below 0.45 of the sensor's rate",
             )
@@ -275,7 +275,7 @@ def _group_delay(sections: NDArray[np.float64]) -> float:
 
 @njit(cache=True)
 def estimate_sample_into(constants, memory, arm, reading, sample):
-    """Convert one reading of the sensor, one per period, to a sample of a single instant.
+    """Convert one reading of the sensor per period to a sample whose values have the same instant.
 
     Args:
         constants, memory: results of `motion_estimator`; memory is updated.

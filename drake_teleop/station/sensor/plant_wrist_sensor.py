@@ -1,7 +1,7 @@
 """Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
 
-With sampled output ports, reaction and acceleration belong to the state before a step; the block
-holds pose and velocity of this state to pair them.
+If the plant's output ports are sampled, reaction and acceleration belong to the state before a
+step; the block holds pose and velocity of this state to pair them.
 """
 
 from __future__ import annotations
@@ -159,14 +159,14 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         - reaction_forces
         - noise: (NOISE_SIZE,) standard normal numbers (not if the sensor is ideal)
         output_ports:
-        - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So, Eq. (1) [N, N m]
+        - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So [N, N m]
         - specific_force_S: (3,) a - g of So [m/s^2]
         - angular_velocity_S: (3,) [rad/s], of an ideal gyroscope with the encoders' delay
         - angular_acceleration_S: (3,) [rad/s^2]
         - status: 0 valid; 1 a channel is saturated; 2 and above no sample yet, or an impossible one
         - joint_position: (n,) positions q
         - sample_time: instant of the sample [s]
-        - sample: the parts above side by side, as `ForceScaling` reads them
+        - sample: the outputs above in one vector, for `ForceScaling`
     """
 
     __slots__ = ONE_DICT
@@ -337,7 +337,7 @@ def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
 def _event_period_and_count(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
         raise DrakeTeleopError(
-            f"{period} s is not positive and finite",
+            f"a sampling period of {period} s is not positive and finite",
             where=f"{_NAME_IN_ERRORS}: period",
             remedy="give the time between samples [s]",
         )
@@ -346,7 +346,7 @@ def _event_period_and_count(step: float | None, period: float | None) -> tuple[f
     count = (period or step) / step
     if count < 1 - _STEP_TOLERANCE or abs(count - round(count)) > _STEP_TOLERANCE:
         raise DrakeTeleopError(
-            f"{period:g} s is no multiple of the plant's time step {step:g} s",
+            f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s",
             where=f"{_NAME_IN_ERRORS}: period",
             remedy=f"choose a multiple, such as {max(1, round(count)) * step:g} s",
         )
@@ -357,7 +357,7 @@ def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple
     expect((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         raise DrakeTeleopError(
-            f"'{joint_or_frame.name()}' belongs to another plant",
+            f"joint or frame '{joint_or_frame.name()}' belongs to another plant",
             where=f"{_NAME_IN_ERRORS}: joint_or_frame",
             remedy="pass a joint or frame of this plant",
         )

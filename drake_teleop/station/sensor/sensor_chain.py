@@ -1,4 +1,4 @@
-"""Wrist sensor as a chain from truth to readings (long: parameters beside their functions)::
+"""Wrist sensor as a chain from truth to readings (long: one file for parameters and chain)::
 
     wrench at So in S        -> calibration errors ----.
     motion of S -> moved to Ao, turned into A          |
@@ -176,12 +176,12 @@ class WristSensorConfig:
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
-        """Return standard deviations (6,) of force and torque by noise and quantum [N, N m]."""
+        """Return standard deviations (6,) of force and torque by noise, quantisation [N, N m]."""
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> NDArray[np.float64]:
-        """Return standard deviations of s [m/s^2], omega (exact) and alpha [rad/s^2], (9,)."""
+        """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
@@ -218,7 +218,7 @@ class WristSensorConfig:
         filtered = not self.ideal and self.low_pass != "none"
         if filtered and self.bandwidth_hz >= 0.45 * rate_hz:
             raise DrakeTeleopError(
-                f"{self.bandwidth_hz:g} Hz is too near to half of the sensor's rate "
+                f"a bandwidth of {self.bandwidth_hz:g} Hz is too near to half of the sensor's rate "
                 f"({rate_hz:g} Hz)",
                 where=f"{where}.bandwidth_hz",
                 remedy="lower the bandwidth below 0.45 of the sensor's rate, or set low_pass: none",
@@ -251,14 +251,15 @@ PARTS: dict[str, dict[str, Any]] = {
 def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
     """Return a copy of the configuration without some parts of the sensor (keys of `PARTS`).
 
-    >>> without(WristSensorConfig(), "noise", "offset").force_noise 0.0
+    >>> without_parts(WristSensorConfig(), "noise", "offset").force_noise
+    0.0
     """
     changes = {name: value for part in parts for name, value in PARTS[part].items()}
     return dataclasses.replace(config, **copy.deepcopy(changes))
 
 
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
-    """Return the sections (2, 5) [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass."""
+    """Return two second-order sections [b0, b1, b2, a1, a2] of a 4th-order Butterworth low-pass."""
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_NUM_LOW_PASS_SECTIONS, 5))
     for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
@@ -277,7 +278,7 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 def calibration_matrices(
     config: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return matrices that multiply true values by the calibration errors, drawn with seed `unit`.
+    """Return matrices that add calibration errors to true values; `config.unit` is their seed.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
     in A.
@@ -332,7 +333,7 @@ def sensor_chain_constants(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
-    `constants[OFFSET]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
+    `constants[OFFSET_CONSTANTS]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer()
@@ -515,7 +516,7 @@ def low_pass_in_place(sections, memory, values):
 
 @njit(cache=True)
 def settle_low_pass(sections, memory, values):
-    """Set the memory of the filter `low_pass` to its steady state at `values` (n,)."""
+    """Set the memory of `low_pass_in_place` to its steady state at `values` (n,)."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):
         b1, b2 = sections[5 * k + 1], sections[5 * k + 2]

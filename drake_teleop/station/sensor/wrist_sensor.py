@@ -1,9 +1,9 @@
-"""Wrist sensor in the station: sampling instants, samples (long: the step and its block).
+"""Wrist sensor in the station (long: one file for the compiled step and its Drake block).
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
 The state at each sampling instant is interpolated within an integration step. With contact outside
-the compiled law (`ToolContactModel.beyond`) each sample is an event at the end of a step.
+the compiled contact law (`ToolContactModel.beyond`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ _NO_GIVEN_WRENCH = np.zeros(0)
 
 @njit(cache=True)
 def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Write the true wrench and motion [f, tau, s, omega, alpha] of S into `out` (15,).
+    """Write wrench f, tau, specific force s, omega and alpha of S, all true, into `out` (15,).
 
     `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
     `phi` (10,) are the tool's inertial parameters.
@@ -196,7 +196,6 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 
 @njit(cache=True)
 def _torque_after_into(held, after, torque):
-    """Write the motor torque (n,) at the time now + `after` [s]."""
     copy_into(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -210,17 +209,17 @@ def take_due_samples(
     """Take the samples that are due in the integration steps since the last call.
 
     Args:
-        physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
-            acceleration by gravity; `JointTable` of other moving bodies, wrenches from Drake).
-        sensor: (chain's constants, estimator's constants, start of its memory, start of the tail,
-            ideal).
+        physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
+            damping, gravity; `JointTable` of other moving bodies, wrenches from Drake).
+        sensor: (constants of sensor chain and of motion estimator, start of the estimator's memory
+            and of `tail`, ideal).
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         around: present [deflection and rate of the sheet, plant's state if other bodies move].
         held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
         applied_W: (6,) additional wrench on the tool.
-        memory: [last two samples (16 + n each) | chain's | estimator's | tail: samples taken,
-            length of the queue, time and x of each step's end in it].
+        memory: [last two samples (16 + n each) | sensor chain | motion estimator | `tail`:
+            number of samples, number of queued steps, time and state of each queued step's end].
         touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
             calculate it with `physics`.
         result: written: [last sample before now (16 + n) | its time [s] | memory].
@@ -559,7 +558,7 @@ class WristSensor(LeafSystem):
             1.0 + np.abs(vdot).max()
         ):
             raise DrakeTeleopError(
-                f"at {context.get_time():g} s the slave is moved by a force that is not connected",
+                f"at {context.get_time():g} s a force moves the slave and is missing at the sensor",
                 where="wrist_sensor.applied_wrench_W",
                 remedy="connect every wrench on the tool to this port",
             )
