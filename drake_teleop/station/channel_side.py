@@ -58,10 +58,10 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _limit_method_to_device(scenario, passivity_with_arm_mass(scenario)),
+            _limit_wrench_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
-            _contact_scale(scenario),
+            _contact_force_scale(scenario),
             start_pose(scenario.slave),
             1 / scenario.rates.hand_hz,
             scenario.simulation.seed,
@@ -84,7 +84,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _limit_wrench_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
         passivity,
@@ -121,10 +121,10 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def power_scale_of_scenario(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    return _contact_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
+    return _contact_force_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
-def _contact_scale(scenario: Scenario) -> float:
+def _contact_force_scale(scenario: Scenario) -> float:
     """Return force scale times gamma, the rendered share of contact; gamma 0 counts as 1."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

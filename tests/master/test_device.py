@@ -39,20 +39,22 @@ def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
 def main_mass_matrix(q) -> np.ndarray:
     """Return the mass matrix (3, 3) of the main axes without wrist, motors and hand."""
     M = np.empty((6, 6))
-    phantom._main_mass_matrix_into(q, M)
+    phantom._main_axes_mass_matrix_into(q, M)
     return M[:3, :3]
 
 
 def main_gravity(q) -> np.ndarray:
     """Return the gravity torque (3,) of the main axes without wrist."""
-    return np.array([0.0, phantom._GRAVITY_2 * np.cos(q[1]), phantom._GRAVITY_3 * np.sin(q[2])])
+    return np.array(
+        [0.0, phantom._GRAVITY_TORQUE_2 * np.cos(q[1]), phantom._GRAVITY_TORQUE_3 * np.sin(q[2])]
+    )
 
 
 def potential_energy(q) -> float:
     """Return the potential energy of device and wrist [J]."""
     weight = phantom.WRIST_MASS * phantom.GRAVITY
-    height = (phantom._GRAVITY_2 + weight * phantom.L1) * np.sin(q[1])
-    return height - (phantom._GRAVITY_3 + weight * phantom.L2) * np.cos(q[2])
+    height = (phantom._GRAVITY_TORQUE_2 + weight * phantom.L1) * np.sin(q[1])
+    return height - (phantom._GRAVITY_TORQUE_3 + weight * phantom.L2) * np.cos(q[2])
 
 
 def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:

@@ -18,19 +18,19 @@ from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
 from drake_teleop.station.master.numbers import (
-    CENTRE_OF_WORKSPACE,
     COULOMB,
-    HALF_SIZE,
+    HALF_WORKSPACE,
     HAND_INERTIA,
     HAND_MASS,
-    IN_TASK_SPACE,
     INERTIA,
+    IS_IN_TASK_SPACE,
     MASS,
     MAX_ROTATION,
     NUM_DEVICE_PARAMETERS,
     PEAK_FORCE,
     PEAK_TORQUE,
     VISCOUS,
+    WORKSPACE_CENTRE,
 )
 from drake_teleop.station.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT
 
@@ -96,7 +96,7 @@ _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD = (
     [0.11, 0.113, 0.113],
     np.radians([120.0, 70.0, 160.0]).tolist(),
 )
-_OMEGA_STEP_RAD = math.radians(0.09)
+_ENCODER_STEP_RAD = math.radians(0.09)
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
 # position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
@@ -107,14 +107,14 @@ _OMEGA_STEP_RAD = math.radians(0.09)
 _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _FREE_ROTATION, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_ROTATION, 1e-5, _OMEGA_STEP_RAD, 4000.0),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_ROTATION, 1e-5, _ENCODER_STEP_RAD, 4000.0),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_ROTATION, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _FREE_ROTATION, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _FREE_ROTATION, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_COLUMNS = (
+_DATA_SHEET_FIELDS = (
     *("apparent_mass", "friction", "peak_force", "size"),
     *("turn", "resolution", "turn_resolution", "rate_hz"),
 )
@@ -122,7 +122,7 @@ _COLUMNS = (
 FIGURES = Registry(
     "device",
     {
-        name: DeviceFigures(**dict(zip(_COLUMNS, copy.deepcopy(row), strict=True)))
+        name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELDS, copy.deepcopy(row), strict=True)))
         for name, row in _DATA_SHEETS.items()
     },
 )
@@ -160,12 +160,12 @@ class Master:
             numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = FORCE_LIMIT, WRIST_TORQUE_LIMIT
             return HapticDevice(numbers, self.model)
         figures = self._data_sheet()
-        numbers[IN_TASK_SPACE] = 1.0
+        numbers[IS_IN_TASK_SPACE] = 1.0
         numbers[COULOMB] = np.repeat([figures.friction, figures.friction_torque], 3)
         numbers[VISCOUS] = np.repeat([figures.damping, figures.turning_damping], 3)
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = figures.peak_force, figures.peak_torque
         numbers[MASS], numbers[INERTIA] = figures.apparent_mass, figures.inertia
-        numbers[CENTRE_OF_WORKSPACE], numbers[HALF_SIZE] = (
+        numbers[WORKSPACE_CENTRE], numbers[HALF_WORKSPACE] = (
             figures.centre,
             0.5 * np.array(figures.size),
         )

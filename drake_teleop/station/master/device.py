@@ -16,7 +16,7 @@ from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDi
 
 _MAX_PERIOD_S = 1e-3  # s, slower than any haptic device
 # A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
-_MAX_FRICTION_STEP = 2.0
+_MAX_RATE_TIMES_PERIOD = 2.0
 
 
 @njit(cache=True, borrows=True)
@@ -42,7 +42,7 @@ def check_period(
     device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
-    if rate * period > _MAX_FRICTION_STEP:
+    if rate * period > _MAX_RATE_TIMES_PERIOD:
         raise DrakeTeleopError(
             f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its "
             f"simulation with a period of {1e3 * period:g} ms is unstable",
@@ -77,7 +77,7 @@ class MasterDevice(DeviceBlock):
         super().__init__(period, device, q_initial, _advance_device, constants)
 
 
-def AddDevice(
+def AddHapticDevice(
     builder: DiagramBuilder,
     period: float,
     device: HapticDevice | LeaderDevice,

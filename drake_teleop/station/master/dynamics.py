@@ -14,7 +14,7 @@ from drake_teleop.station.master.numbers import (
     COULOMB,
     HAND_INERTIA,
     HAND_MASS,
-    IN_TASK_SPACE,
+    IS_IN_TASK_SPACE,
     PEAK_FORCE,
     PEAK_TORQUE,
     VISCOUS,
@@ -24,7 +24,7 @@ from drake_teleop.station.master.numbers import (
 @njit(cache=True)
 def jacobian_into(q, device, J):
     """Write the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B, into J."""
-    if device[IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE] != 0.0:
         task_space.jacobian_into(q, J)
     else:
         phantom.jacobian_into(q, J)
@@ -33,7 +33,7 @@ def jacobian_into(q, device, J):
 @njit(cache=True)
 def gravity_torque_into(q, device, out):
     """Write the joint torques or forces (6,) that compensate the device's weight into `out`."""
-    if device[IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE] != 0.0:
         out[:6] = 0.0
     else:
         phantom.gravity_torque_into(q, out)
@@ -42,7 +42,7 @@ def gravity_torque_into(q, device, out):
 @njit(cache=True)
 def pose_into(q, device, pose):
     """Write the stylus pose X_BE (7,) at the joint positions q (6,) into `pose`."""
-    if device[IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE] != 0.0:
         task_space.pose_into(q, pose)
     else:
         phantom.pose_into(q, pose)
@@ -70,7 +70,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
     total[:] = 0.0
     for i in range(4):
         copy_into(slope, 0, stage, 6, 6)
-        if device[IN_TASK_SPACE] != 0.0:
+        if device[IS_IN_TASK_SPACE] != 0.0:
             task_space.acceleration_into(
                 stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
             )
@@ -124,7 +124,7 @@ class HapticDevice(DisplayDevice):
 
     @property
     def is_phantom(self) -> bool:
-        return not self.numbers[IN_TASK_SPACE]
+        return not self.numbers[IS_IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the joint positions (6,) for a stylus pose X_BE (7,)."""

@@ -47,9 +47,9 @@ class Encoders(LeafSystem):
         self._constants = q_start, steps, device.numbers
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self._state.ticket()}
-        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._round_pose), inputs)
+        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._calc_rounded_pose), inputs)
 
-    def _round_pose(self, context: Context, output: BasicVector) -> None:
+    def _calc_rounded_pose(self, context: Context, output: BasicVector) -> None:
         q = self._state.Eval(context)[:6]
         read_pose_into(q, *self._constants, output.get_mutable_value())
 
@@ -72,7 +72,7 @@ class SampleHold(LeafSystem):
         super().__init__()
         self._value = self.DeclareVectorInputPort("value", len(start))
         self.DeclareStateOutputPort("held", self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._take_sample)
 
-    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _take_sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(0, self._value.Eval(context))

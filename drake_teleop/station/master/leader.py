@@ -17,7 +17,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of, vector_at
 from drake_teleop.station.master.dynamics import DisplayDevice
-from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, display_into
+from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, step_display
 from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
@@ -78,7 +78,7 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
 
 
 @njit(cache=True)
-def _pose_and_twist(arm, q, v, pose, twist):
+def _update_pose_and_twist(arm, q, v, pose, twist):
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
     jacobian_and_pose(arm, q, J, x)
@@ -148,13 +148,13 @@ def step_leader(
                 stage[k] = state[k] + ahead * period * slope[k]
         for k in range(2 * n):
             state[k] += period * total[k]
-        _pose_and_twist(arm, state[:n], state[n:], pose, twist)
+        _update_pose_and_twist(arm, state[:n], state[n:], pose, twist)
     for i in range(3):  # position for the display
         display[i] = pose[4 + i] if all_in_range(state) else math.nan
 
 
 @njit(cache=True)
-def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
+def _limit_wrench_to_motors(bare, arm, joints, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     motor_torques_into(bare, arm, joints, q, np.zeros(6), weight)
@@ -222,7 +222,7 @@ class LeaderDevice(DisplayDevice):
 
     def forward_kinematics(self, q: Array) -> Array:
         pose = np.array([1.0, *np.zeros(6)])
-        _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
+        _update_pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
 
     def check_limits(self, q: Array) -> None:
@@ -319,9 +319,9 @@ class LeaderDisplay(ForceDisplay):
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _limit_to_motors(*self._constants, q, wrench, self._shortened)
+            _limit_wrench_to_motors(*self._constants, q, wrench, self._shortened)
             wrench = self._shortened
-        display_into(
+        step_display(
             wrench,
             self._device.Eval(context),
             self._numbers,

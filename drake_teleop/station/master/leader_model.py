@@ -16,7 +16,7 @@ from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
 from drake_teleop.station.master.numbers import (
     HAND_INERTIA,
     HAND_MASS,
-    IN_TASK_SPACE,
+    IS_IN_TASK_SPACE,
     NUM_DEVICE_PARAMETERS,
     PEAK_FORCE,
     PEAK_TORQUE,
@@ -123,23 +123,23 @@ class Leader:
         phi[[4, 7, 9]] += hand_inertia
         held = bare.with_load(phi)
         coulomb, viscous = (
-            self._value_per_joint(name, arm, 0.0) for name in ("friction", "damping")
+            self._values_per_joint(name, arm, 0.0) for name in ("friction", "damping")
         )
-        limit = self._value_per_joint("torque_limit", arm, arm.effort_limit)
+        limit = self._values_per_joint("torque_limit", arm, arm.effort_limit)
         joints = joint_parameters(held, home, coulomb, viscous, limit, self.weight_carried)
         numbers = np.zeros(NUM_DEVICE_PARAMETERS)
         numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = self.peak_force, self.peak_torque
-        numbers[IN_TASK_SPACE] = 1.0
+        numbers[IS_IN_TASK_SPACE] = 1.0
         return LeaderDevice(held, bare, joints, home, numbers)
 
     def _home_positions(self, arm: ArmModel) -> Array:
         if self.home:
-            return self._value_per_joint("home", arm, 0.0)
+            return self._values_per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
         return np.where(within, 0.0, arm.middle_positions)
 
-    def _value_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
+    def _values_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(

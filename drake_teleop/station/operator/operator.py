@@ -190,7 +190,7 @@ def unit_pose_into(pose, twist, out):
 
 
 @njit(cache=True)
-def _limit_length(vector, limit):
+def _limit_vector_length(vector, limit):
     length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
     if length > limit:
         for k in range(3):
@@ -213,8 +213,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit_length(wrench[:3], _MAX_FORCE_N)
-    _limit_length(wrench[3:], _MAX_TORQUE_NM)
+    _limit_vector_length(wrench[:3], _MAX_FORCE_N)
+    _limit_vector_length(wrench[3:], _MAX_TORQUE_NM)
 
 
 @njit(cache=True)
@@ -388,7 +388,7 @@ class Operator(LeafSystem):
             *state,
         )
 
-    def _discrete_memory(self, context: Context) -> NDArray[np.float64]:
+    def _decision_memory(self, context: Context) -> NDArray[np.float64]:
         if not self._has_task:
             return self._no_memory
         return context.get_discrete_state(self._groups[1]).value()
@@ -410,7 +410,7 @@ class Operator(LeafSystem):
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _hand_wrench_at(
             *self._evaluate_intended_motion(context),
-            self._discrete_memory(context),
+            self._decision_memory(context),
             context.get_time(),
             self._impedance,
             self._intent_pose,
@@ -424,7 +424,7 @@ class Operator(LeafSystem):
         time, pose, memory = (
             context.get_time(),
             output.get_mutable_value(),
-            self._discrete_memory(context),
+            self._decision_memory(context),
         )
         _intended_or_planned_motion_into(
             *self._evaluate_intended_motion(context), memory, time, pose, self._intent_twist

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
 _PARAMETER_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
-_INITIAL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
-_NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
+_INITIAL_PARAMETER_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
+_FORCE_NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
 _FRICTION_SPEED = 0.01  # m/s, v_0, about the value of the device's friction
 _NUM_PARAMETERS = 6
 
@@ -66,7 +66,7 @@ class Perception:
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_COVARIANCE_START:] = np.diag(_INITIAL_STD**2).ravel()
+    memory[_COVARIANCE_START:] = np.diag(_INITIAL_PARAMETER_STD**2).ravel()
     return memory
 
 
@@ -115,7 +115,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     noticed = attentive and math.sqrt(excess_square) >= out[THRESHOLD_INDEX]
     out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
-        _update_expectation(
+        _update_expected_force(
             theta,
             memory[_COVARIANCE_START:].reshape(_NUM_PARAMETERS, _NUM_PARAMETERS),
             rows,
@@ -125,13 +125,13 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
 
 
 @njit(cache=True)
-def _update_expectation(theta, P, rows, excess, dt):
+def _update_expected_force(theta, P, rows, excess, dt):
     gain = np.empty(_NUM_PARAMETERS)
     for j in range(_NUM_PARAMETERS):
         P[j, j] += _PARAMETER_DRIFT_STD[j] * _PARAMETER_DRIFT_STD[j] * dt
     before = theta.copy()
     for i in range(3):
-        residual, variance = excess[i], _NOISE_DENSITY * _NOISE_DENSITY / dt
+        residual, variance = excess[i], _FORCE_NOISE_DENSITY * _FORCE_NOISE_DENSITY / dt
         for j in range(_NUM_PARAMETERS):
             residual -= rows[i, j] * (theta[j] - before[j])
             gain[j] = 0.0

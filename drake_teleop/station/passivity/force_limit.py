@@ -16,7 +16,7 @@ from drake_teleop.station.passivity import none
 from drake_teleop.station.passivity.memory import HELD_WRENCH, MOTION_SCALE, own_parameters
 from drake_teleop.station.passivity.packet import limit_group
 
-_LOCAL_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
+_HAND_WRENCH_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
 
 
 @settings
@@ -28,14 +28,14 @@ class ForceLimitConfig:
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_LOCAL_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
+        p[_HAND_WRENCH_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
-        limit_group(wrench, g, p[_LOCAL_LIMIT][g])
+        limit_group(wrench, g, p[_HAND_WRENCH_LIMIT][g])
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
 
 

@@ -45,15 +45,15 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    DAMPING,
-    MASS,
+    LAST_PACKET,
     MAX_RETREAT,
     MEMORY_SIZE,
     MOTION_SCALE,
     NUM_PARAMETERS,
-    PACKET,
+    SERVO_D,
+    SERVO_K,
+    SLAVE_MASS,
     STEP_COUNT,
-    STIFFNESS,
     WRENCH_LIMIT,
 )
 from drake_teleop.station.passivity.packet import (
@@ -71,7 +71,7 @@ from drake_teleop.station.passivity.wave import WaveConfig
 
 
 @njit(cache=True)
-def _record_nothing(requested, command, pose, twist, p, memory):
+def _ignore_command_change(requested, command, pose, twist, p, memory):
     pass
 
 
@@ -91,7 +91,7 @@ class PassivityMethod(NamedTuple):
 
     master_step: Any
     slave_step: Any
-    record_command: Any = _record_nothing
+    record_command: Any = _ignore_command_change
     initialize: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
     config: type[Any] | None = None
     balance_at_motors: bool = False
@@ -100,14 +100,14 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, NDArray[np.float64]], NDArray[np.float64]] | None = None
 
 
-_TDPA = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
+_TDPA_METHOD = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
 METHODS = Registry(
     "passivity method",
     {
         "none": PassivityMethod(none.master_step, none.slave_step),
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
-        "tdpa": _TDPA,
-        "charged_tdpa": _TDPA,
+        "tdpa": _TDPA_METHOD,
+        "charged_tdpa": _TDPA_METHOD,
         "two_layer": PassivityMethod(
             two_layer.master_step,
             two_layer.slave_step,
@@ -161,7 +161,7 @@ _FIELD_OF_METHOD = {
 }
 
 
-_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
+_DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
 @dataclass
@@ -249,9 +249,9 @@ def method_parameters(
     """
     p = np.zeros(NUM_PARAMETERS)
     p[WRENCH_LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
-    p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
-    p[DAMPING] = np.multiply(config.servo_damping, power_scale)
-    p[MASS] = np.multiply(config.slave_mass or _SLAVE_MASS, power_scale)
+    p[SERVO_K] = np.multiply(config.servo_stiffness, power_scale)
+    p[SERVO_D] = np.multiply(config.servo_damping, power_scale)
+    p[SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
     p[MOTION_SCALE] = motion_scale
     p[MAX_RETREAT] = (
         np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
@@ -272,7 +272,7 @@ def initial_method_memory(
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(MEMORY_SIZE)
     memory[COMMAND_POSE] = pose
-    memory[PACKET][POSE] = pose
+    memory[LAST_PACKET][POSE] = pose
     if own.initialize is not None:
         own.initialize(parameters, memory)
     return memory
@@ -312,12 +312,12 @@ def _addresses_of_functions(*steps: Any) -> tuple[int, int, int]:
 
 
 @njit(cache=True)
-def _write_packet_number(healthy, memory, packet):
+def _complete_packet(healthy, memory, packet):
     if healthy:
         packet[INPUTS_FINITE] = 1.0
-        copy_into(memory, PACKET.start, packet, 0, PACKET_SIZE)
+        copy_into(memory, LAST_PACKET.start, packet, 0, PACKET_SIZE)
     else:
-        copy_into(packet, 0, memory, PACKET.start, PACKET_SIZE)
+        copy_into(packet, 0, memory, LAST_PACKET.start, PACKET_SIZE)
         packet[INPUTS_FINITE] = 0.0
     packet[PACKET_NUMBER] = memory[STEP_COUNT]
     memory[STEP_COUNT] += 1.0
@@ -357,7 +357,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         limit_retreat_of_hand(twist, T, p, memory, wrench)
-    _write_packet_number(healthy, memory, packet)
+    _complete_packet(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -387,7 +387,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _slave_step(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _write_packet_number(healthy, memory, packet)
+    _complete_packet(healthy, memory, packet)
 
 
 @njit(cache=True)

@@ -304,21 +304,21 @@ def _rotation_matrix(axis: NDArray[np.float64], angle: float) -> NDArray[np.floa
 #: Constants: offset of force and torque, which may change during a run.
 OFFSET_CONSTANTS = slice(0, 6)
 # True values: as a sample (`drake_teleop.load.regressor`) without the flag.
-TRUE_ANGLES = slice(15, None)
+TRUE_JOINT_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 # Constants: 12 offsets, 12 drifts per sample, then these.
 _DRIFT, _NOISE, _WALK, _QUANTUM_START, _RANGE_START = range(12, 72, 12)
-_WRENCH = 72  # (6, 6)
-_MOTION = _WRENCH + 36  # (2, 3, 3) from S into A, for s and alpha
-_POSITION = _MOTION + 18  # (3,)
-_FILTER = _POSITION + 3  # (2, 5)
-_LOW_PASS_STAGE = _FILTER + 5 * _NUM_LOW_PASS_SECTIONS
-_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
-_ENCODER = _LATENCIES + 3
-_IS_IDEAL = _ENCODER + 1
-_OVERLOADS = _IS_IDEAL + 1  # (6,)
+_WRENCH_CALIBRATION = 72  # (6, 6)
+_MOTION_CALIBRATION = _WRENCH_CALIBRATION + 36  # (2, 3, 3) from S into A, for s and alpha
+_ACCELEROMETER_POSITION = _MOTION_CALIBRATION + 18  # (3,)
+_LOW_PASS_START = _ACCELEROMETER_POSITION + 3  # (2, 5)
+_LOW_PASS_STAGE = _LOW_PASS_START + 5 * _NUM_LOW_PASS_SECTIONS
+_PATH_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
+_ENCODER_STEP = _PATH_LATENCIES + 3
+_IS_IDEAL = _ENCODER_STEP + 1
+_OVERLOAD_LIMITS = _IS_IDEAL + 1  # (6,)
 _BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
@@ -375,7 +375,7 @@ def is_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor."""
     good = True
     for i in range(6):
-        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOADS + i]
+        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOAD_LIMITS + i]
     for i in range(6, truth.shape[0]):
         good = good and abs(truth[i]) <= LARGEST_PORT_VALUE
     return good
@@ -393,7 +393,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
-    angles = truth[TRUE_ANGLES]
+    angles = truth[TRUE_JOINT_ANGLES]
     if constants[_IS_IDEAL] != 0.0:
         copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
         copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
@@ -411,7 +411,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         memory[_RANDOM_WALK_START:FILTER_MEMORY_START],
         memory[FILTER_MEMORY_START:_DELAY_LINE_START],
     )
-    sections, place = constants[_FILTER:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
+    sections, place = constants[_LOW_PASS_START:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         for i in range(_NUM_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
@@ -432,7 +432,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     row[_NUM_CHANNELS + 1] = _quantize(constants, 6, 12, channels)
     if place == _AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants[_ENCODER]
+    quantum = constants[_ENCODER_STEP]
     for i in range(_DELAY_LINE_ROW, width):
         angle = angles[i - _DELAY_LINE_ROW]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
@@ -441,7 +441,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         for k in range(1, rows):
             copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
     memory[0] += 1.0
-    late = constants[_LATENCIES:_ENCODER]
+    late = constants[_PATH_LATENCIES:_ENCODER_STEP]
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     encoders = _DELAY_LINE_START + int(late[2]) * width
@@ -470,12 +470,12 @@ def _apply_calibration_errors(constants, truth, out):
     for i in range(6):
         value = 0.0
         for j in range(6):
-            value += constants[_WRENCH + 6 * i + j] * wrench[j]
+            value += constants[_WRENCH_CALIBRATION + 6 * i + j] * wrench[j]
         out[i] = value
-    r = vector_at(constants, _POSITION)
+    r = vector_at(constants, _ACCELEROMETER_POSITION)
     at_Ao = add_cross_product(add_cross_product(s, alpha, r), omega, cross(omega, r))
-    out[6], out[7], out[8] = apply_matrix(matrix_at(constants, _MOTION), at_Ao)
-    out[9], out[10], out[11] = apply_matrix(matrix_at(constants, _MOTION + 9), alpha)
+    out[6], out[7], out[8] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION), at_Ao)
+    out[9], out[10], out[11] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION + 9), alpha)
 
 
 @njit(cache=True)
