@@ -108,17 +108,14 @@ class Channel(NetworkConfig):
 _ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_MONITOR_SIZE
 _layout = SlotAllocator(_ENDS_STATE_SIZE)
 _STEP_COUNT = _layout.number()  # number of the step
-_LAST_POSE_AT_MASTER = _layout.vector(
-    8
-)  # last finite command (7); 1 if the newest command is not finite
+# Last finite command (7); 1 if the newest command is not finite.
+_LAST_POSE_AT_MASTER = _layout.vector(8)
 _LAST_POSE_AT_SLAVE = _layout.vector(8)  # pose of the slave, likewise
 _RENDERED_WRENCH = _layout.vector(6)  # wrench rendered since the last step
 _VALID_WRENCH_AT_SLAVE = _layout.vector(6)  # slave's wrench at the last step
 _VALID_WRENCH_TIME = _layout.number()  # time with valid wrenches [s]
-_MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = (
-    _layout.vector(MASTER_MONITOR_SIZE),
-    _layout.vector(SLAVE_MONITOR_SIZE),
-)
+_MASTER_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
+_SLAVE_SILENCE_MONITOR = _layout.vector(SLAVE_MONITOR_SIZE)
 MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world, one array.
 _layout = SlotAllocator(11)
@@ -127,12 +124,8 @@ _MOTION_SCALES = _layout.vector(2)  # of translation and rotation
 # Recorded values, see `ports` of `TeleopChannel`.
 NUM_PORT_SIGNALS = 8
 _layout = SlotAllocator(NUM_PORT_SIGNALS)
-_WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH, _SILENCE_TIMES = (
-    _layout.vector(2),
-    _layout.vector(2),
-    _layout.vector(2),
-)
-_WORK_ALONG_COMMAND = _layout.vector(2)
+_WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
+_SILENCE_TIMES, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
 _layout = SlotAllocator(7)
 _RECEIVED_WRENCH, _CONTACT_FLAG = _layout.vector(6), _layout.number()
@@ -209,10 +202,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE_TIMES][0], ports[_SILENCE_TIMES][1] = (
-        ends[_MASTER_SILENCE_MONITOR][SILENCE_S],
-        ends[_SLAVE_SILENCE_MONITOR][SILENCE_S],
-    )
+    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_S]
+    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_S]
 
 
 @njit(cache=True)
@@ -258,11 +249,8 @@ def step_slave_end(
 ):  # fmt: skip
     """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
     before, held = ends[_LAST_POSE_AT_SLAVE], ends[_VALID_WRENCH_AT_SLAVE]
-    watch, memory, work = (
-        ends[_SLAVE_SILENCE_MONITOR],
-        ends[SLAVE_METHOD_MEMORY],
-        ports[_WORK_OF_SLAVE_WRENCH],
-    )
+    watch, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
+    work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
     command, left = np.empty(13), pose_received.copy()
     valid = _pose_increment_into(slave_pose, before, dx)

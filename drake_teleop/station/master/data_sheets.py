@@ -92,10 +92,8 @@ class DeviceFigures:
 
 
 _FREE_ROTATION, _NO_ROTATION = DeviceFigures().turn, [0.0, 0.0, 0.0]
-_OMEGA_SIZE_M, _OMEGA_ANGLES_RAD = (
-    [0.11, 0.113, 0.113],
-    np.radians([120.0, 70.0, 160.0]).tolist(),
-)
+_OMEGA_SIZE_M = [0.11, 0.113, 0.113]
+_OMEGA_ANGLES_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
 _ENCODER_STEP_RAD = math.radians(0.09)
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of

@@ -43,10 +43,7 @@ _STOPPING_TIME = _layout.number()  # time since it began to stop
 _RESUMING_TIME = _layout.number()  # time since it began to resume
 _STOP_POSE = _layout.vector(7)  # command when it began to stop
 _STOP_VELOCITY = _layout.vector(6)  # its velocity
-_LAST_COMMAND, _PREVIOUS_COMMAND = (
-    _layout.vector(7),
-    _layout.vector(7),
-)  # last command and the one before
+_LAST_COMMAND, _PREVIOUS_COMMAND = _layout.vector(7), _layout.vector(7)
 
 
 def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:

@@ -66,11 +66,7 @@ _NEWEST_MASTER_PACKET, _SLAVE_LEDGER = INTEGRAL.start, SECOND_ENERGY
 # Parameters.
 _layout = own_parameters()
 _RELEASE, _DRAIN, _DRIFT_RATE = _layout.number(), _layout.number(), _layout.number()
-_RESERVE, _DRAG, _HAND_STIFFNESS = (
-    _layout.vector(2),
-    _layout.vector(2),
-    _layout.vector(2),
-)  # in power units
+_RESERVE, _DRAG, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))  # in power units
 _MAX_COMMAND_SPEED = _layout.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
 _layout = own_memory()
