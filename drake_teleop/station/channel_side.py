@@ -104,8 +104,8 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"this method needs the arm's mass, but with {slave.arm.num_joints} joints it is "
-            "unbounded in a direction",
+            f"'{passivity.method}' needs the arm's mass, but with {slave.arm.num_joints} joints it "
+            "is unbounded in a direction",
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )

@@ -214,14 +214,14 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
     ("leader", "said"),
     [
         (None, "master.leader: `model: leader` and the settings `leader` require each other"),
-        (Leader(hand_frame="hand"), "master.leader.file: a leader arm requires this field"),
+        (Leader(hand_frame="hand"), "master.leader.file: a leader arm requires a file"),
         (
             dataclasses.replace(LEADER, friction=[-1.0]),
             "master.leader.friction: [-1.0] contains a number that is negative",
         ),
         (
             dataclasses.replace(LEADER, home=[0.0]),
-            "master.leader.home: has 1 values, the leader arm has 6 joints",
+            "master.leader.home: 1 values do not fit a leader arm with 6 joints",
         ),
         (dataclasses.replace(LEADER, hand_frame="elbow"), "no frames are named 'elbow'"),
         (

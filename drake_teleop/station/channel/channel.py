@@ -84,7 +84,7 @@ class Channel(NetworkConfig):
             return own, own if self.backward is None else self.backward
         if own != NetworkConfig() or self.backward is not None:
             raise DrakeTeleopError(
-                f"preset '{self.network}' cannot be combined with other fields",
+                f"preset '{self.network}' cannot be combined with other channel fields",
                 where=f"{where}.network",
                 remedy="remove these fields, or set network: custom",
             )

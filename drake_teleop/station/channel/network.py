@@ -74,7 +74,7 @@ class NetworkConfig:
         check_ranges(self, where)
         if self.loss > self.burst_loss:
             raise DrakeTeleopError(
-                f"{self.loss:g} is above burst_loss {self.burst_loss:g}, the loss of the bad state",
+                f"mean loss {self.loss:g} is above burst_loss {self.burst_loss:g} of the bad state",
                 where=f"{where}.loss" if ":" in where else f"{where}:loss",
                 remedy="raise burst_loss to at least the mean loss",
             )

@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import Registry
-from drake_teleop.station.master.dynamics import HapticDevice
-from drake_teleop.station.master.leader import LeaderDevice
-from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
-from drake_teleop.station.master.numbers import (
+from drake_teleop.station.master.device_parameters import (
     COULOMB,
     HALF_WORKSPACE,
     HAND_INERTIA,
@@ -32,6 +29,9 @@ from drake_teleop.station.master.numbers import (
     VISCOUS,
     WORKSPACE_CENTRE,
 )
+from drake_teleop.station.master.dynamics import HapticDevice
+from drake_teleop.station.master.leader import LeaderDevice
+from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
 from drake_teleop.station.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT
 
 PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
@@ -212,6 +212,7 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":
+        """Return a copy with paths resolved from the scenario's folder."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))

@@ -35,9 +35,10 @@ def check_period(
     """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
-            f"the haptic device cannot run with a period of {period:g} s",
+            f"the haptic device's period of {period:g} s is not above 0 and at most "
+            f"{_MAX_PERIOD_S:g} s",
             where="master.period",
-            remedy=f"choose at most {_MAX_PERIOD_S:g} s (1 kHz); the paper uses above 2 kHz",
+            remedy="choose a hand rate of 1 kHz or more; the paper uses above 2 kHz",
         )
     device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)

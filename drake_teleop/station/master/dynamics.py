@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
-from drake_teleop.station.master.numbers import (
+from drake_teleop.station.master.device_parameters import (
     COULOMB,
     HAND_INERTIA,
     HAND_MASS,
@@ -88,7 +88,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
 
 
 class DisplayDevice:
-    """Base class of haptic devices; `numbers` are the parameters with indices in `numbers.py`."""
+    """Base class of haptic devices; `numbers` are the parameters of `device_parameters`."""
 
     numbers: NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.station.master.device_parameters import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
-from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.passivity.memory import SlotAllocator
 from drake_teleop.station.passivity.packet import limit_group
 from drake_teleop.station.passivity.safe_state import (

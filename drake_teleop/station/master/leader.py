@@ -16,9 +16,9 @@ from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of, vector_at
+from drake_teleop.station.master.device_parameters import HAND_MASS
 from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, step_display
-from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
     GRAVITY_COLUMN,

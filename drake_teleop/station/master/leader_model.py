@@ -12,8 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
-from drake_teleop.station.master.numbers import (
+from drake_teleop.station.master.device_parameters import (
     HAND_INERTIA,
     HAND_MASS,
     IS_IN_TASK_SPACE,
@@ -21,6 +20,7 @@ from drake_teleop.station.master.numbers import (
     PEAK_FORCE,
     PEAK_TORQUE,
 )
+from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
 from drake_teleop.station.slave.arm import (
     PHI_COLUMN,
     ROTATION_COLUMN,
@@ -76,9 +76,8 @@ class Leader:
     def check(self, where: str) -> None:
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
-                raise DrakeTeleopError(
-                    "a leader arm requires this field", where=f"{where}.{name}", remedy="set it"
-                )
+                what = f"a leader arm requires a {name.replace('_', ' ')}"
+                raise DrakeTeleopError(what, where=f"{where}.{name}", remedy="set this field")
         for name in ("home", "friction", "damping", "torque_limit"):
             values = getattr(self, name)
             if not np.isfinite(values).all() or (name != "home" and min(values, default=0.0) < 0.0):
@@ -90,6 +89,7 @@ class Leader:
                 )
 
     def found_from(self, folder: Path) -> "Leader":
+        """Return a copy with paths resolved from the scenario's folder."""
         return dataclasses.replace(
             self,
             file=str((folder / self.file).resolve()) if self.file else "",
@@ -143,7 +143,7 @@ class Leader:
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(
-                f"has {len(values)} values, the leader arm has {n} joints",
+                f"{len(values)} values do not fit a leader arm with {n} joints",
                 where=f"master.leader.{name}",
                 remedy=f"give {n}, for {', '.join(arm.joint_names)}",
             )

@@ -29,7 +29,7 @@ from drake_teleop.common.vectors import (
     scale_vector,
     solve_by_cholesky,
 )
-from drake_teleop.station.master.numbers import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
+from drake_teleop.station.master.device_parameters import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
 
 GRAVITY = 9.81  # m/s^2, along -z_B
 

@@ -15,7 +15,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross, plus, scale_vector
-from drake_teleop.station.master.numbers import (
+from drake_teleop.station.master.device_parameters import (
     COULOMB,
     HALF_WORKSPACE,
     HAND_INERTIA,

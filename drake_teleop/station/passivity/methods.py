@@ -165,7 +165,7 @@ _DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
 @dataclass
-class _CommonConfig:
+class _CommonMethodConfig:
     method: str = choice(
         "none",
         (),
@@ -201,7 +201,7 @@ class _CommonConfig:
 
 @settings
 @dataclass
-class PassivityConfig(MethodConfigs, _CommonConfig):
+class PassivityConfig(MethodConfigs, _CommonMethodConfig):
     """Method that keeps the station passive, and the parameters of each method.
 
     The servo's force on the slave is K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
@@ -300,6 +300,7 @@ _master_step, _slave_step, _record_command = map(
 
 
 def steps_of(method: str) -> tuple[int, int, int]:
+    """Return the addresses of a method's compiled functions: master, slave, record."""
     return _addresses_of_functions(*METHODS[method][:3])
 
 

@@ -221,6 +221,7 @@ def _accelerometer_std(
 def motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return constants and initial memory of `estimate_sample_into`."""
     delays = path_delays(config, sensor, period)
     paths = np.array([delays.wrench, delays.acceleration, delays.encoders])
     used = np.array([True, config.source != "encoders", True])

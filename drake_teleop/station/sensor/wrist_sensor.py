@@ -558,7 +558,8 @@ class WristSensor(LeafSystem):
             1.0 + np.abs(vdot).max()
         ):
             raise DrakeTeleopError(
-                f"at {context.get_time():g} s a force moves the slave and is missing at the sensor",
+                f"at {context.get_time():g} s a force moves the slave, but the wrist sensor does "
+                "not receive it",
                 where="wrist_sensor.applied_wrench_W",
                 remedy="connect every wrench on the tool to this port",
             )
