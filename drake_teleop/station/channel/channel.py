@@ -59,7 +59,7 @@ _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 @settings
 @dataclass
 class Channel(NetworkConfig):
-    """Settings of the network between master and slave: a preset, or `custom` with other fields."""
+    """Settings of the network between master and slave: a preset, or `custom` and the fields."""
 
     network: str = choice(
         "custom", _NETWORK_NAMES, "a preset, or custom for the network of these fields"

@@ -20,7 +20,7 @@ class SlotAllocator:
         first, self._next = self._next, self._next + length
         if self._next > self._size:
             raise IndexError(
-                f"a vector of size {self._size} has no index {self._next - 1}; enlarge it"
+                f"vector size {self._size} is below the required {self._next}; raise it"
             )
         return slice(first, self._next)
 
