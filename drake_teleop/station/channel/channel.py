@@ -59,7 +59,7 @@ _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 @settings
 @dataclass
 class Channel(NetworkConfig):
-    """Settings of the network between master and slave: a preset, or `custom` and the fields."""
+    """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
     network: str = choice(
         "custom", _NETWORK_NAMES, "a preset, or custom for the network of these fields"
@@ -439,7 +439,7 @@ class TeleopChannel(LeafSystem):
         slave: NDArray[np.float64],
         fills: float,
     ) -> None:
-        """Restart in a running station, without packets in transit, at a constant slave command.
+        """Restart the channel in a running station, without packets, at a constant slave command.
 
         `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
         time in which the slave of method `wave` keeps its command.

@@ -15,7 +15,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 def read_pose_into(q, q_start, steps, device, pose):
     """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
 
-    `steps` (6,) are in m or rad; a step of 0 rounds nothing.
+    `steps` (6,) are in m or rad; 0 disables rounding.
     """
     read = np.empty(6)
     for i in range(6):
@@ -25,7 +25,7 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """Encoders of a haptic device, with whole `steps` (6,) [m, rad] of its axes; 0 is exact.
+    """Encoders of a haptic device, with whole `steps` (6,) [m, rad] of its axes; 0: no rounding.
 
     Steps count from the joint positions `q_start` (6,).
 

@@ -1,8 +1,8 @@
 """Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
 A Kalman filter estimates mass m, damping b, friction c and offset u_0 of the force without contact,
-m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). A difference of u beyond the
-threshold is contact.
+m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). A larger difference of u
+from it than the threshold is contact.
 """
 
 import math
@@ -58,7 +58,7 @@ class Perception:
     )
 
     def compiled_parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N], decay and smoothing factors of `dt` [s]."""
+        """Return (4,) Weber fraction, threshold [N], decay and smoothing factors per `dt` [s]."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])

@@ -17,7 +17,7 @@ _RIDGE_SHARE = 0.05
 def update_contact_fit(sums, force_change, displacement, speed_change, keep):
     """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m].
 
-    `sums` (NUM_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
+    `sums` (NUM_FIT_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
     """
     for i in range(NUM_FIT_SUMS):
         sums[i] *= keep

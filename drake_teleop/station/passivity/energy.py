@@ -74,9 +74,9 @@ def created_energy(energy: Array) -> Array:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Energy balance of a passivity method at one end of the channel.
+    """Energy balance at one channel end, each (..., 2) for translation and rotation [J].
 
-    Attributes, each (..., 2) for translation and rotation [J]:
+    Attributes:
         stored: energy that this end may still release.
         received, sent: total energy received from, and sent to, the other end.
         lost: energy removed from the loop (damper, overflow, withheld work).

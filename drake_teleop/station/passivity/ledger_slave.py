@@ -135,7 +135,7 @@ def wrench_component_along(a, b, p):
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return the work of a wrench (6,) over a displacement (6,) [J]; along a unit wrench [m]."""
+    """Return wrench (6,) times displacement (6,): work [J], for a unit wrench a length [m]."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 

@@ -369,7 +369,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         received, fresh, T, p, memory, packet: as for `master_step`, with the master's packet.
         pose, twist: (7,) and (6,) actual pose X_WS and twist [v; omega] of the slave, in W.
         dx: (6,) increment of this pose since the last step, in W.
-        wrench: (6,) wrench on the slave to render, from contact and the rendered load, in W.
+        wrench: (6,) wrench on the slave from contact and the rendered part of the load, in W.
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
             finite, it is the last pose with zero twist.
     """

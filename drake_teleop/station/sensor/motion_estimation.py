@@ -201,7 +201,7 @@ def estimated_motion_std(
 
 
 def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the standard deviation [rad] of S about any axis by the encoders' rounding."""
+    """Return the standard deviation [rad] of the rotation of S by the encoders' rounding."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 

@@ -278,7 +278,7 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 def calibration_matrices(
     config: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return matrices that add calibration errors to true values; `config.unit` is their seed.
+    """Return matrices from true values to values with calibration errors; seed: `config.unit`.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
     in A.

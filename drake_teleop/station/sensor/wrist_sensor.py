@@ -103,7 +103,7 @@ _NO_GIVEN_WRENCH = np.zeros(0)
 
 @njit(cache=True)
 def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Write wrench f, tau, specific force s, omega and alpha of S, all true, into `out` (15,).
+    """Write the true wrench, specific force, omega and alpha of S into `out` (15,).
 
     `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
     `phi` (10,) are the tool's inertial parameters.
