@@ -42,18 +42,19 @@ PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
 class JointFriction:
     """Friction torque of the Phantom's joints: coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
 
+    # Sources as in `phantom`: main axes P, wrist estimated.
     coulomb: list[float] = quantity(
-        [0.01, 0.01, 0.01, 0.001, 0.001, 0.001], "N m", 0.0, 1.0, "main axes P, wrist E"
+        [0.01, 0.01, 0.01, 0.001, 0.001, 0.001], "N m", 0.0, 1.0, "Coulomb friction of the joints"
     )
     viscous: list[float] = quantity(
-        [5e-4, 5e-4, 5e-4, 5e-5, 5e-5, 5e-5], "N m s/rad", 0.0, 10.0, "main axes P, wrist E"
+        [5e-4, 5e-4, 5e-4, 5e-5, 5e-5, 5e-5], "N m s/rad", 0.0, 10.0, "damping of the joints"
     )
 
 
 @settings
 @dataclass
 class DeviceFigures:
-    """Data sheet of a device for `task_space`; its base axis x points to the operator, z up."""
+    """Data sheet of a haptic device; x of its base frame points to the operator, z up."""
 
     apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "apparent mass at the grip")
     inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "inertia about every axis")

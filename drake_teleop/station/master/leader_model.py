@@ -42,11 +42,11 @@ JOINT_MODE = "joints"
 class Leader:
     """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
 
-    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder")
+    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml file, from the scenario's folder")
     package_paths: list[str] = plain(
         [], "folders for package:// addresses in it, from the scenario's folder"
     )
-    hand_frame: str = plain("", "frame or link at the grip")
+    hand_frame: str = plain("", "name of the frame or link at the grip")
     home: list[float] = plain(
         [], "joint positions at the start [rad, m]; by default 0, or the middle of their limits"
     )

@@ -65,7 +65,7 @@ class MinimumJerk:
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
-    translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "offset in B")
+    translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "displacement in B")
     rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the offset, about axes of B"
     )

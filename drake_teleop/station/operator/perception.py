@@ -45,8 +45,8 @@ class Perception:
     absolute_threshold: float = quantity(0.06, "N", 1e-3, 10.0, "smallest detectable force")
     masking_time: float = quantity(0.3, "s", 1e-3, 10.0, "decay time constant of masking")
     bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "bandwidth of perceived force and motion")
-    reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "from a force to the hand's reaction")
-    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "from vision to the hand's reaction")
+    reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "time from a force to the hand's reaction")
+    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "time from vision to the hand's reaction")
     vision_noise: float = quantity(
         0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
     )

@@ -53,7 +53,7 @@ class FourChannelConfig:
         "stiffness of C_m, the spring between the hand and the received pose of the slave",
     )
     damping: list[float] = quantity(
-        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damping of C_m, likewise"
+        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper of C_m, parallel to its spring"
     )
     slave_feedback: float = quantity(
         0.0,

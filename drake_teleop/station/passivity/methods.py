@@ -186,14 +186,18 @@ class _CommonMethodConfig:
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
     )
     servo_damping: list[float] = quantity(
-        [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
+        [3.5e3, 117.0],
+        "N s/m, N m s/rad",
+        0.0,
+        1e8,
+        "D of the slave's servo, in the slave's units (E)",
     )
     slave_mass: list[float] | None = quantity(
         None,
         "kg, kg m^2",
         1e-6,
         1e6,
-        "mass of arm and tool at the tool, likewise; null: 15.13, 0.5 (E), with ledger"
+        "mass of arm and tool at the tool, in the slave's units; null: 15.13, 0.5 (E), with ledger"
         " mass and servo of the station's arm at the start",
     )
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")

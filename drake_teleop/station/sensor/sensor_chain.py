@@ -109,10 +109,10 @@ class WristSensorConfig:
     )
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
-    force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white, 1 sigma of each raw sample")
-    torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "white, 1 sigma of each raw sample")
-    acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "white, 1 sigma")
-    angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "white, 1 sigma")
+    force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white noise of raw samples, 1 sigma")
+    torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "white noise of raw samples, 1 sigma")
+    acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "white noise, 1 sigma")
+    angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "white noise, 1 sigma")
     force_walk: float = quantity(0.002, "N/sqrt(s)", 0.0, 10.0, "random walk")
     torque_walk: float = quantity(4e-5, "N m/sqrt(s)", 0.0, 1.0, "random walk")
     acceleration_walk: float = quantity(6e-4, "m/s^2/sqrt(s)", 0.0, 10.0, "random walk")
@@ -136,19 +136,21 @@ class WristSensorConfig:
     encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
 
     saturates: bool = plain(True, "readings are limited to the ranges and flagged by `saturated`")
-    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "fx, fy, fz")
-    torque_range: list[float] = quantity([12.0, 12.0, 12.0], "N m", 0.01, 1e4, "about So")
-    acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "specific force")
-    angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "each axis")
+    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "range of fx, fy, fz")
+    torque_range: list[float] = quantity(
+        [12.0, 12.0, 12.0], "N m", 0.01, 1e4, "range of tx, ty, tz about So"
+    )
+    acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
+    angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
     force_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "of force and torque, rounded to whole samples"
+        0.0, "s", 0.0, 0.1, "latency of force and torque, rounded to whole samples"
     )
     acceleration_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "of accelerations, rounded to whole samples"
+        0.0, "s", 0.0, 0.1, "latency of accelerations, rounded to whole samples"
     )
     encoder_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "of joint angles, rounded to whole samples"
+        0.0, "s", 0.0, 0.1, "latency of joint angles, rounded to whole samples"
     )
 
     def noise_std(self) -> NDArray[np.float64]:
