@@ -13,6 +13,7 @@ class SlotAllocator:
         self._size, self._next = size, first
 
     def number(self) -> int:
+        """Reserve one place and return its index."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
@@ -25,6 +26,7 @@ class SlotAllocator:
         return slice(first, self._next)
 
     def rest(self) -> slice:
+        """Reserve the remaining places and return their slice."""
         return self.vector(self._size - self._next)
 
 
