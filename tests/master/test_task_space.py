@@ -160,7 +160,9 @@ def test_file_selects_device_and_overrides_figures():
     ):
         with pytest.raises(DrakeTeleopError, match=rf"mine\.yaml:master\.{where}"):
             ScenarioFromData({"master": block}, "mine.yaml")
-    with pytest.raises(DrakeTeleopError, match=r"master\.figures.*friction stops the device"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"master\.figures.*friction stops the haptic device"
+    ):
         MasterDevice(PERIOD, device(friction=50.0), np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0]))
     assert JointFriction() == Master().friction
 

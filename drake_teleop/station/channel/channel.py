@@ -91,10 +91,7 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
     def timeout_s(self, period: float) -> float:
-        """Return the time without packets [s] after which an end enters its safe state.
-
-        `period` [s] is the interval of the packets.
-        """
+        """Return the silence [s] before an end's safe state, for a packet every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         longest = [

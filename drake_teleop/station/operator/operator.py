@@ -322,9 +322,7 @@ class Operator(LeafSystem):
         moving = self._declare_intended_motion() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
-                raise ValueError(
-                    "an operator with a task requires the arguments training, arm and tip"
-                )
+                raise ValueError("a task requires the arguments training, arm and tip")
             moving.add(self._declare_task(config, config.task, training, arm, tip))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
