@@ -43,7 +43,7 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, mean_delay
 from drake_teleop.station.environment.solids import Box, Wall
 from drake_teleop.station.master.data_sheets import Master, data_sheet_of
-from drake_teleop.station.master.numbers import HAND_MASS
+from drake_teleop.station.master.device_parameters import HAND_MASS
 from drake_teleop.station.operator.operator import (
     GRIP_IMPEDANCES,
     MinimumJerk,

@@ -31,11 +31,11 @@ from drake_teleop.station.passivity import methods, two_layer, wave
 from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
-    DAMPING,
     DISSIPATED_ENERGY,
     RECEIVED_ENERGY,
     SENT_ENERGY,
-    STIFFNESS,
+    SERVO_D,
+    SERVO_K,
     STORED_ENERGY,
     WRENCH_LIMIT,
     own_memory,
@@ -168,7 +168,7 @@ def _run(steps, at_motor, p, memories, newest, motion, poses, wrenches, T, sent,
             # The pull of the slave's servo from now until the next step.
             pose_difference_into(command, poses[1, k], pull)
             for i in range(6):
-                motor[i] = p[STIFFNESS][i // 3] * pull[i] - p[DAMPING][i // 3] * twists[1, i]
+                motor[i] = p[SERVO_K][i // 3] * pull[i] - p[SERVO_D][i // 3] * twists[1, i]
         else:
             pose_difference_into(command, old, moved)
             old[:] = command[:7]
@@ -196,12 +196,12 @@ def _master(steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory,
         )
         return
     for i in range(6):
-        b = p[wave.IMPEDANCE][i // 3]  # the line's impedance
+        b = p[wave.WAVE_IMPEDANCE][i // 3]  # the line's impedance
         wrench[i] = math.sqrt(2.0 * b) * received[INTEGRAL][i] - b * dx[i] / T
     for g in range(2):
         limit_group(wrench, g, limits[g])
     for i in range(6):
-        b = p[wave.IMPEDANCE][i // 3]
+        b = p[wave.WAVE_IMPEDANCE][i // 3]
         packet[INTEGRAL][i] = (b * dx[i] / T - wrench[i]) / math.sqrt(2.0 * b)
 
 
@@ -214,7 +214,7 @@ def _slave(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, comman
         return
     step = memory[_STEP]
     for i in range(6):
-        b, u = p[wave.IMPEDANCE][i // 3], received[INTEGRAL][i]
+        b, u = p[wave.WAVE_IMPEDANCE][i // 3], received[INTEGRAL][i]
         step[i] = T * (math.sqrt(2.0 * b) * u + wrench[i]) / b
         packet[INTEGRAL][i] = u + math.sqrt(2.0 / b) * wrench[i]
     move_pose_into(memory[COMMAND_POSE], step, memory[COMMAND_POSE])

@@ -12,7 +12,12 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
 from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.environment.solids import Wall
-from drake_teleop.station.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
+from drake_teleop.station.master.phantom import (
+    FORCE_LIMIT,
+    HOME_POSTURE,
+    WRIST_TORQUE_LIMIT,
+    jacobian_into,
+)
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.oscillation import find_reversals, find_unexplained_oscillation
 from drake_teleop.station.passivity.ledger import LedgerConfig
@@ -62,7 +67,7 @@ def recorded(**changed):
         "slave_state": np.column_stack([joints(0.2 * smooth(T - LATE - 0.016)), joints(0 * T)]),
         "joint_torque": joints(np.full_like(T, 20.0)),
         "intent": pose(-0.07 * smooth(T)),
-        "master_state": np.tile([*HOME, *np.zeros(6)], (len(T), 1)),
+        "master_state": np.tile([*HOME_POSTURE, *np.zeros(6)], (len(T), 1)),
         "pose_master": pose(-0.07 * smooth(T - 0.02)),
         "pose_command": pose(-0.07 * smooth(T)),
         "joint_command": joints(0.2 * smooth(T - LATE)),
@@ -172,7 +177,7 @@ def test_ledger_reserve_warning_gives_the_required_energy():
 def test_wrist_motor_limit_uses_the_device_axes():
     q, J = np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]), np.empty((6, 6))
     jacobian_into.py_func(q, J)
-    posture = (slice(0, 6), q - HOME)
+    posture = (slice(0, 6), q - HOME_POSTURE)
     about = J[3:, 5]  # the last axis, that of the weakest motor
     for share, warnings in ((1.0, 1), (0.99, 0)):
         torque = share * WRIST_TORQUE_LIMIT[2] * during(1, 2)[:, np.newaxis] * about

@@ -24,7 +24,7 @@ from drake_teleop.common.vectors import (
     quaternion_product,
 )
 from drake_teleop.live.station_swap import add_cross_fade
-from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
+from drake_teleop.station.master.device_parameters import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master_side import CLUTCH_PERIOD_S
 from drake_teleop.station.operator.operator import HandImpedance
 from drake_teleop.station.passivity.packet import limit_group

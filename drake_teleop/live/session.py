@@ -171,7 +171,7 @@ class _Station:
             channel, context = self.block_and_context("channel")
             side = self.station.GetSubsystemByName("slave_side")
             pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))
-            channel.Begin(context, command, pose, wait_s)
+            channel.Restart(context, command, pose, wait_s)
         return wait_s + CROSS_FADE_S
 
 

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
-    """Build a scenario's channel; without network and passivity method it has only wires.
+    """Build the channel of a scenario: direct wires for an ideal network without passivity method.
 
     .. pydrake_system::
 
@@ -39,8 +39,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         output_ports:
         - pose_to_slave: (7,) X_WS, setpoint of the slave
         - wrench_to_master: (6,) F_E_B, wrench to render [N, N m]
-        - contact_at_hand: contact flag at the master (with contact detection)
-        - pose_received, ports: `station.signals` for the log (not for wires)
+        - contact_at_hand: signal for the log (with contact detection)
+        - pose_received, ports: signals for the log (not for wires)
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
@@ -58,10 +58,10 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _limit_method_to_device(scenario, passivity_with_arm_mass(scenario)),
+            _limit_wrench_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
-            _scale_of_contact_force(scenario),
+            _contact_force_scale(scenario),
             start_pose(scenario.slave),
             1 / scenario.rates.hand_hz,
             scenario.simulation.seed,
@@ -84,7 +84,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _limit_wrench_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
         passivity,
@@ -94,9 +94,9 @@ def _limit_method_to_device(scenario: Scenario, passivity: PassivityConfig) -> P
 
 
 def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
-    """Return the settings of the passivity method, with mass and servo of the arm if required.
+    """Return the scenario's passivity settings, with mass and servo of the arm if needed.
 
-    Then a DrakeTeleopError is raised for an arm with fewer than six joints (unbounded mass).
+    An arm with fewer than six joints, whose mass is then unbounded, raises a DrakeTeleopError.
     """
     passivity = scenario.passivity
     if not METHODS[passivity.method].needs_arm_mass or passivity.slave_mass is not None:
@@ -104,8 +104,8 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"the method requires an arm with 6 or more joints, not {slave.arm.num_joints} (its"
-            " mass is unbounded in directions in which it cannot move)",
+            f"'{passivity.method}' requires 6 or more joints, not {slave.arm.num_joints}: the mass of"
+            " the arm is unbounded in directions in which it cannot move",
             where="passivity.method",
             remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
@@ -121,9 +121,10 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def power_scale_of_scenario(scenario: Scenario) -> Array:
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
-    return _scale_of_contact_force(scenario) / np.where(scales > 0.0, scales, 1.0)
+    return _contact_force_scale(scenario) / np.where(scales > 0.0, scales, 1.0)
 
 
-def _scale_of_contact_force(scenario: Scenario) -> float:
+def _contact_force_scale(scenario: Scenario) -> float:
+    """Return force scale times gamma, the rendered share of contact; gamma 0 counts as 1."""
     scaling = scenario.force_scaling
     return scaling.force_scale * (scaling.scales().gamma or 1.0)

@@ -8,7 +8,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from drake_teleop.station.channel.network import mean_delay
-from drake_teleop.station.master.device import AddDevice
+from drake_teleop.station.master.device import AddHapticDevice
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.electronics import Encoders, SampleHold
 from drake_teleop.station.master.leader import LeaderDevice
@@ -40,10 +40,9 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         - pose_command: (7,) X_WS, setpoint of the slave
         - leader_joints: (n,) setpoint of the slave's joints (leader arm in joint mode) [rad]
         - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m]
-        - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: see
-          `station.signals`
+        - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: for logs
         - displayed_and_fault: force_to_master and fault_at_hand in one port, for the log
-        - task_state: see `station.signals` (with a task)
+        - task_state: for the log (with a task)
 
     Args:
         operator: custom operator, added as "live_hand"; None for the scenario's operator.
@@ -61,7 +60,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     operator = builder.AddNamedSystem(name, operator or _make_operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
     q_start = model.inverse_kinematics(start_B)
-    device, display = AddDevice(builder, period, model, q_start)
+    device, display = AddHapticDevice(builder, period, model, q_start)
     builder.Connect(operator.GetOutputPort("hand_wrench_E"), device.GetInputPort("hand_wrench_E"))
     builder.Connect(device.GetOutputPort("pose_master"), operator.GetInputPort("pose_master"))
     builder.Connect(device.GetOutputPort("twist_master"), operator.GetInputPort("twist_master"))

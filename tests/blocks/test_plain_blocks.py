@@ -25,7 +25,7 @@ from drake_teleop.station import blocks
 from drake_teleop.station.channel.channel import Channel, TeleopChannel
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.estimation import contact_detection, load_estimator
-from drake_teleop.station.master.force_display import display_into, initial_display_state
+from drake_teleop.station.master.force_display import initial_display_state, step_display
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 from drake_teleop.station.scaling.force_scaling import (
@@ -263,7 +263,7 @@ def test_force_display_equals_the_display_of_the_station():
     for row in rows:
         for _ in range(2):
             drive, memory[:6] = np.zeros(len(memory)), row["joint_position"]
-            display_into(row["wrench_command"], memory, device.numbers, T, J, drive)
+            step_display(row["wrench_command"], memory, device.numbers, T, J, drive)
             if _ == 0:
                 memory = drive.copy()
         expected.append(drive[:6])

@@ -14,7 +14,7 @@ from drake_teleop.station.channel.channel import (
     step_channel,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import DAMPING, HELD_WRENCH, STIFFNESS
+from drake_teleop.station.passivity.memory import HELD_WRENCH, SERVO_D, SERVO_K
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -91,7 +91,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         )  # fmt: skip
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
-        pull = p[STIFFNESS][0] * (received[4] - slave[4]) - p[DAMPING][0] * velocity
+        pull = p[SERVO_K][0] * (received[4] - slave[4]) - p[SERVO_D][0] * velocity
         found.servo[k] = pull, ends[SLAVE_METHOD_MEMORY][HELD_WRENCH][0]
     return found
 

@@ -31,7 +31,7 @@ from drake_teleop.station.channel.network import (
 from drake_teleop.station.passivity.packet import (
     ENERGY,
     INTEGRAL,
-    LOAD,
+    PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
     PACKET_SIZE,
     POSE,
@@ -292,9 +292,9 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
         return 0.6  # nothing is lost, all comes twice
 
     monkeypatch.setattr(network, "_random_uniform", uniform)
-    monkeypatch.setattr(network, "_delay_steps", network._delay_steps.py_func)
+    monkeypatch.setattr(network, "_draw_delay_steps", network._draw_delay_steps.py_func)
     for k in range(100, 120):
-        network._advance_chain.py_func(p, k, 0.0)
+        network._advance_loss_chain.py_func(p, k, 0.0)
     packets, draws = np.array(taken).T
     assert set(packets) == set(range(100, 120)) and set(draws) <= set(range(16))
     each = {"uniform": 1, "normal": 2, "gamma": 3}[distribution]
@@ -422,7 +422,7 @@ def test_silence(silence, silent):
     packet, received = lonely(silence, silent)
     expected = packet.copy()
     if silent and silence == "zero":
-        expected[VELOCITY] = expected[WRENCH] = expected[LOAD] = 0.0
+        expected[VELOCITY] = expected[WRENCH] = expected[PACKET_LOAD_WRENCH] = 0.0
     if silent and silence == "extrapolate":
         time = min(silent * PERIOD, MAX_EXTRAPOLATION_S)
         v, w = packet[VELOCITY][:3], packet[VELOCITY][3:]
@@ -434,20 +434,22 @@ def test_silence(silence, silent):
             expected[VELOCITY] = 0.0
     np.testing.assert_allclose(received, expected, rtol=0, atol=1e-14)
     # Whatever the policy, counters and integrals stand still: silence brings no energy.
-    for part in (INTEGRAL, slice(ENERGY.start, LOAD.start)):
+    for part in (INTEGRAL, slice(ENERGY.start, PACKET_LOAD_WRENCH.start)):
         np.testing.assert_array_equal(received[part], packet[part])
 
 
 def test_a_line_carries_as_many_numbers_as_its_receiver_reads_before_the_first():
     p = network_parameters(NetworkConfig(), 0, FORWARD, PERIOD)
     packets, received = random_packets(3), np.zeros(PACKET_SIZE)
-    state = initial_network_state(p, np.zeros(LOAD.start))
+    state = initial_network_state(p, np.zeros(PACKET_LOAD_WRENCH.start))
     assert len(state[1]) < len(initial_network_state(p, np.zeros(PACKET_SIZE))[1])
     for k, packet in enumerate(packets):
         send_packet(p, state, k, packet)
         receive_packet(p, state, k, received)
-        np.testing.assert_array_equal(received[: LOAD.start], packet[: LOAD.start])
-        assert not received[LOAD].any()
+        np.testing.assert_array_equal(
+            received[: PACKET_LOAD_WRENCH.start], packet[: PACKET_LOAD_WRENCH.start]
+        )
+        assert not received[PACKET_LOAD_WRENCH].any()
 
 
 @pytest.mark.parametrize("silence", ["hold", "zero", "extrapolate"])

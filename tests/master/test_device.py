@@ -39,20 +39,22 @@ def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
 def main_mass_matrix(q) -> np.ndarray:
     """Return the mass matrix (3, 3) of the main axes without wrist, motors and hand."""
     M = np.empty((6, 6))
-    phantom._main_mass_matrix_into(q, M)
+    phantom._main_axes_mass_matrix_into(q, M)
     return M[:3, :3]
 
 
 def main_gravity(q) -> np.ndarray:
     """Return the gravity torque (3,) of the main axes without wrist."""
-    return np.array([0.0, phantom._GRAVITY_2 * np.cos(q[1]), phantom._GRAVITY_3 * np.sin(q[2])])
+    return np.array(
+        [0.0, phantom._GRAVITY_TORQUE_2 * np.cos(q[1]), phantom._GRAVITY_TORQUE_3 * np.sin(q[2])]
+    )
 
 
 def potential_energy(q) -> float:
     """Return the potential energy of device and wrist [J]."""
     weight = phantom.WRIST_MASS * phantom.GRAVITY
-    height = (phantom._GRAVITY_2 + weight * phantom.L1) * np.sin(q[1])
-    return height - (phantom._GRAVITY_3 + weight * phantom.L2) * np.cos(q[2])
+    height = (phantom._GRAVITY_TORQUE_2 + weight * phantom.L1) * np.sin(q[1])
+    return height - (phantom._GRAVITY_TORQUE_3 + weight * phantom.L2) * np.cos(q[2])
 
 
 def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:
@@ -107,7 +109,7 @@ def test_main_axes_equal_the_closed_forms_of_the_literature():
 
 def test_stylus_is_level_and_points_to_operator_at_home():
     np.testing.assert_allclose(
-        phantom.forward_kinematics(phantom.HOME), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
+        phantom.forward_kinematics(phantom.HOME_POSTURE), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
     )
 
 
@@ -293,7 +295,7 @@ STOPS = [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5,
 @pytest.mark.parametrize(("joint", "side"), STOPS)
 def test_joint_stops_at_its_limit(joint, side):
     limit = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint]
-    q = phantom.HOME.copy()
+    q = phantom.HOME_POSTURE.copy()
     q[joint] = limit - side * 0.02
     if joint in (1, 2):
         q[3 - joint] = limit - side * 0.1  # the other link follows inside the five-bar's range
@@ -313,7 +315,7 @@ def test_joint_stops_at_its_limit(joint, side):
 
 @pytest.mark.parametrize(("joint", "side"), STOPS)
 def test_end_stop_pushes_but_never_pulls(joint, side):
-    q = phantom.HOME.copy()
+    q = phantom.HOME_POSTURE.copy()
     q[joint] = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint] + side * 0.01
     if joint in (1, 2):
         q[3 - joint] = q[joint] - side * 0.1
@@ -377,7 +379,7 @@ def test_ports_agree_with_the_state():
 
 def test_long_period_or_start_beyond_limit_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"master\.period"):
-        device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME)
+        device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME_POSTURE)
     with pytest.raises(DrakeTeleopError, match="joint 1"):
         device.MasterDevice(5e-4, Master().device(0.1, 1e-4), np.array([2.0, 0, 0, 0, 0, 0]))
 
@@ -389,7 +391,7 @@ def test_friction_too_large_for_the_step_is_rejected(name, slope):
     def made(last):
         friction = JointFriction(**{name: [*[0.0] * 5, slope * last]})
         model = Master(friction=friction).device(0.1, 1e-4)
-        device.MasterDevice(5e-4, model, phantom.HOME)
+        device.MasterDevice(5e-4, model, phantom.HOME_POSTURE)
 
     made(0.5)
     with pytest.raises(DrakeTeleopError, match=r"master\.friction"):

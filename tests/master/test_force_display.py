@@ -10,8 +10,8 @@ from drake_teleop.station.master import phantom
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.master.force_display import (
     ForceDisplay,
-    display_into,
     initial_display_state,
+    step_display,
 )
 from drake_teleop.station.passivity.safe_state import RESUME_TIME_S, STOP_TIME_S
 
@@ -81,9 +81,9 @@ def test_limited_wrench_keeps_its_direction(q):
 
 
 def test_force_and_torque_are_limited_separately():
-    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME)
+    _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME_POSTURE)
     np.testing.assert_allclose(displayed, [0, 0, 37.5, 0.01, 0, 0], rtol=1e-12)
-    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME)
+    _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME_POSTURE)
     np.testing.assert_allclose(displayed, [0, 0, 10.0, 0.17, 0.05, 0], rtol=1e-12)
 
 
@@ -111,10 +111,10 @@ def test_fault_has_its_own_port_and_a_combined_one():
 
 
 def test_huge_command_is_limited_and_invalid_command_is_zero():
-    _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME)
+    _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME_POSTURE)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5)
     assert displayed[5] == pytest.approx(0.515)
-    np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME)[1], 0)
+    np.testing.assert_array_equal(display([1e9, 0, 0, 0, 0, 0], phantom.HOME_POSTURE)[1], 0)
 
 
 WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
@@ -130,7 +130,7 @@ def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
         device[:6] = q
-        display_into(command, device, DEVICE.numbers, PERIOD, J, drive)
+        step_display(command, device, DEVICE.numbers, PERIOD, J, drive)
         torque[k], shown[k] = drive[:6], drive[12:19]
         device[6:] = drive[6:]
     return shown, torque

@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.files import models_dir
 from drake_teleop.station.master.data_sheets import Master
-from drake_teleop.station.master.device import AddDevice
+from drake_teleop.station.master.device import AddHapticDevice
 from drake_teleop.station.master.leader_model import Leader
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
@@ -43,7 +43,7 @@ class Held:
 
     def __init__(self, device):
         builder = DiagramBuilder()
-        self.block, self.display = AddDevice(builder, PERIOD, device, device.home)
+        self.block, self.display = AddHapticDevice(builder, PERIOD, device, device.home)
         builder.ExportInput(self.block.GetInputPort("hand_wrench_E"), "hand")
         builder.ExportInput(self.display.GetInputPort("wrench_command"), "command")
         self.diagram = builder.Build()
@@ -213,16 +213,22 @@ def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
 @pytest.mark.parametrize(
     ("leader", "said"),
     [
-        (None, "master.leader: a leader arm requires `model: leader`"),
-        (Leader(hand_frame="hand"), "master.leader.file: is required for a leader arm"),
+        (None, "master.leader: `model: leader` and the settings `leader` require each other"),
+        (Leader(hand_frame="hand"), "master.leader.file: a leader arm requires a file"),
         (
             dataclasses.replace(LEADER, friction=[-1.0]),
-            "master.leader.friction: contains a number that is negative",
+            "master.leader.friction: [-1.0] contains a number that is negative",
         ),
-        (dataclasses.replace(LEADER, home=[0.0]), "master.leader.home: has 1 numbers"),
+        (
+            dataclasses.replace(LEADER, home=[0.0]),
+            "master.leader.home: 1 values do not fit a leader arm with 6 joints",
+        ),
         (dataclasses.replace(LEADER, hand_frame="elbow"), "no frames are named 'elbow'"),
-        (dataclasses.replace(LEADER, home=[9.0, *HOME[1:]]), "joint yaw would be at 9"),
-        (dataclasses.replace(LEADER, friction=[1.0]), "the friction stops the device"),
+        (
+            dataclasses.replace(LEADER, home=[9.0, *HOME[1:]]),
+            "leader joint yaw would be at 9, outside its limits",
+        ),
+        (dataclasses.replace(LEADER, friction=[1.0]), "the friction stops the haptic device"),
     ],
 )
 def test_invalid_leader_gives_one_error(leader, said):

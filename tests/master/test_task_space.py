@@ -14,7 +14,7 @@ from drake_teleop.station.master import dynamics
 from drake_teleop.station.master.data_sheets import FIGURES, JointFriction, Master
 from drake_teleop.station.master.device import MasterDevice
 from drake_teleop.station.master.electronics import read_pose_into
-from drake_teleop.station.master.force_display import display_into, initial_display_state
+from drake_teleop.station.master.force_display import initial_display_state, step_display
 from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.scenario import LoadScenario, ScenarioFromData, replace
 from drake_teleop.station.simulation import simulate
@@ -135,7 +135,7 @@ def test_unactuated_axes_display_zero():
     for model, force, torque in (("geomagic_touch", 3.3, 0.0), ("virtuose_6d", 35.0, 3.1)):
         numbers, q = device(model).numbers, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
         start, drive = initial_display_state(q, numbers), np.empty(27)
-        display_into(np.full(6, 100.0), start, numbers, PERIOD, np.empty((6, 6)), drive)
+        step_display(np.full(6, 100.0), start, numbers, PERIOD, np.empty((6, 6)), drive)
         assert np.linalg.norm(drive[12:15]) == pytest.approx(force, rel=1e-12)
         np.testing.assert_allclose(drive[15:18], torque, rtol=1e-12)
         np.testing.assert_allclose(drive[:6], drive[12:18], atol=1e-12)  # no weight to hold
@@ -160,7 +160,9 @@ def test_file_selects_device_and_overrides_figures():
     ):
         with pytest.raises(DrakeTeleopError, match=rf"mine\.yaml:master\.{where}"):
             ScenarioFromData({"master": block}, "mine.yaml")
-    with pytest.raises(DrakeTeleopError, match=r"master\.figures.*friction stops the device"):
+    with pytest.raises(
+        DrakeTeleopError, match=r"master\.figures.*friction stops the haptic device"
+    ):
         MasterDevice(PERIOD, device(friction=50.0), np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0]))
     assert JointFriction() == Master().friction
 

@@ -87,7 +87,7 @@ def test_record_of_wrong_shape_is_rejected():
     with pytest.raises(DrakeTeleopError, match="velocity"):
         perceive_contact(T, np.zeros((len(T), 3)), np.zeros((len(T), 2)), HUMAN, 0.0)
     for times in (T[:1], T[::-1]):
-        with pytest.raises(DrakeTeleopError, match="t: is not increasing"):
+        with pytest.raises(DrakeTeleopError, match="t: times do not increase"):
             perceive_contact(
                 times, np.zeros((len(times), 3)), np.zeros((len(times), 3)), HUMAN, 0.0
             )

@@ -108,12 +108,12 @@ def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
     person = decision.pack_operator_parameters(training, Perception(), Movement())
     # As Python, so that nothing else is compiled.
     monkeypatch.setattr(
-        decision, "_contact_force_along_axis", decision._contact_force_along_axis.py_func
+        decision, "_contact_force_against_axis", decision._contact_force_against_axis.py_func
     )
     force_W, across = np.array([3.0, -5.0, 8.0]), np.zeros(3)
     packed, felt = decision.pack_task_parameters(task), 0.3 * R_WB.T @ force_W
     axis = np.array(task.translation) / np.linalg.norm(task.translation)
-    assert decision._contact_force_along_axis(packed, person, felt) == pytest.approx(
+    assert decision._contact_force_against_axis(packed, person, felt) == pytest.approx(
         -force_W @ axis
     )
     size = decision._lateral_force_into.py_func(packed, person, felt, across)
@@ -126,8 +126,10 @@ def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, len
     training = decision.OperatorTraining(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_operator_parameters(training, Perception(), movement), []
-    monkeypatch.setattr(decision, "_convert_to_hand", decision._convert_to_hand.py_func)
-    monkeypatch.setattr(decision, "_random_number", lambda *_: 0.0)
+    monkeypatch.setattr(
+        decision, "_convert_to_hand_motion", decision._convert_to_hand_motion.py_func
+    )
+    monkeypatch.setattr(decision, "_draw_normal_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
     took = decision._plan_submovement.py_func(
         person, None, 0, 1.0, np.array([0.0, 1.5 * length, 0.0])

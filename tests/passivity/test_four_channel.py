@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.station.passivity.four_channel import FourChannelConfig
-from drake_teleop.station.passivity.memory import DAMPING, STIFFNESS, WRENCH_LIMIT
+from drake_teleop.station.passivity.memory import SERVO_D, SERVO_K, WRENCH_LIMIT
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_method_memory,
@@ -75,7 +75,7 @@ def test_motion_and_force_of_both_ends_with_local_feedback():
         steps_of("four_channel"), packets[0], True, START, twist[1], zero, contact, T, p, memory[1],
         command, packets[1],
     )  # fmt: skip
-    K, D = (np.repeat(p[x], 3) for x in (STIFFNESS, DAMPING))
+    K, D = (np.repeat(p[x], 3) for x in (SERVO_K, SERVO_D))
     shift = np.empty(6)
     pose_difference_into(command[:7], pose, shift)
     np.testing.assert_allclose(K * shift, 1.3 * hand + 0.3 * contact + D * twist[0], rtol=1e-9)

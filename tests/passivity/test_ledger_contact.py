@@ -45,8 +45,8 @@ from drake_teleop.station.passivity.methods import (
     steps_of,
 )
 from drake_teleop.station.passivity.packet import (
-    LOAD,
     MAX_WRENCH_RATE,
+    PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
     PACKET_SIZE,
     POSE,
@@ -441,7 +441,7 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
             packet,
         )  # fmt: skip
         np.testing.assert_allclose(packet[WRENCH], contact, atol=1e-15)
-        np.testing.assert_allclose(packet[LOAD], load, atol=0.15)
+        np.testing.assert_allclose(packet[PACKET_LOAD_WRENCH], load, atol=0.15)
         assert k > 400 or not memory[IN_CONTACT], "nothing is touched yet"
     np.testing.assert_allclose(memory[NORMAL], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12)
     stiffness = packet[CONTACT_STIFFNESS]
@@ -452,7 +452,7 @@ def test_weight_of_the_load_is_rendered_beside_a_contact():
     )
     assert books == pytest.approx(1.8 * 0.01 - 0.5 * 200.0 * depth**2, rel=3e-3)
     hand = Hand(packet[WRENCH], stiffness)
-    hand.packet[LOAD] = load
+    hand.packet[PACKET_LOAD_WRENCH] = load
     np.testing.assert_allclose(hand.rest(2500), load + packet[WRENCH], atol=1e-9)
     for _ in range(50):
         hand.step([0.0, 0.0, -2e-5, 0.0, 0.0, 0.0])

@@ -17,15 +17,15 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.master.data_sheets import Master
-from drake_teleop.station.passivity.force_limit import _LOCAL_LIMIT, ForceLimitConfig
+from drake_teleop.station.passivity.force_limit import _HAND_WRENCH_LIMIT, ForceLimitConfig
 from drake_teleop.station.passivity.memory import (
-    DAMPING,
     HELD_WRENCH,
-    MASS,
     MEMORY_SIZE,
     MOTION_SCALE,
     SENT_ENERGY,
-    STIFFNESS,
+    SERVO_D,
+    SERVO_K,
+    SLAVE_MASS,
     STORED_ENERGY,
     WRENCH_LIMIT,
 )
@@ -248,8 +248,8 @@ def test_limits_and_servo_have_their_own_scales(power, motion, limits):
     )
     p = method_parameters(config, power, motion)
     np.testing.assert_allclose(p[WRENCH_LIMIT] * motion, limits)
-    np.testing.assert_allclose(p[_LOCAL_LIMIT] * motion, np.multiply(limits, [0.5, 2.0]))
-    for part, values in ((STIFFNESS, (11, 12)), (DAMPING, (13, 14)), (MASS, (15, 16))):
+    np.testing.assert_allclose(p[_HAND_WRENCH_LIMIT] * motion, np.multiply(limits, [0.5, 2.0]))
+    for part, values in ((SERVO_K, (11, 12)), (SERVO_D, (13, 14)), (SLAVE_MASS, (15, 16))):
         np.testing.assert_allclose(p[part] / power, values)
     np.testing.assert_array_equal(p[MOTION_SCALE], motion)
 

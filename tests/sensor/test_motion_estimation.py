@@ -19,7 +19,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    _update_filters,
+    _update_fusion_filters,
     estimate_sample_into,
     estimated_motion_std,
     fusion_filters,
@@ -332,7 +332,7 @@ def test_filter_errors_equal_the_predicted_deviations():
     kept, bias, estimates, innovations = np.zeros(12), np.zeros(3), [], []
     for k in range(1, steps):
         acceleration, moved = measured[k] - bias, angle[k] - angle[k - 1]
-        _update_filters(found.gains, T, moved, acceleration, kept)
+        _update_fusion_filters(found.gains, T, moved, acceleration, kept)
         bias -= moved
         kept[6:9] = acceleration + moved
         estimates.append(angle[k] - kept[:3])

@@ -454,18 +454,22 @@ REFUSED = {
     ),
     "other plant": (
         lambda c: setattr(c, "place", moving().weld),
-        "'wrist' belongs to another plant",
+        "joint or frame 'wrist' belongs to another plant",
     ),
     "a name": (lambda c: setattr(c, "place", "wrist"), "expected Joint or Frame, found 'wrist'"),
     "half steps": (
         lambda c: c.options.update(period=1.5e-3),
-        "period: 0.0015 s is no multiple of the plant's time step 0.001 s",
+        "period: sampling period 0.0015 s is no multiple of the plant's time step 0.001 s",
     ),
     "too fast": (lambda c: c.options.update(period=1e-4), "such as 0.001 s"),
-    "no period": (lambda c: c.options.update(period=-1.0), "period: -1.0 s is not positive"),
+    "no period": (
+        lambda c: c.options.update(period=-1.0),
+        "a sampling period of -1.0 s is not positive",
+    ),
     "bandwidth": (
         lambda c: c.options.update(config=WristSensorConfig()),
-        "AddWristSensor.bandwidth_hz: 500 Hz is too near to half of the sensor's rate (1000 Hz)",
+        "AddWristSensor.bandwidth_hz: a bandwidth of 500 Hz is too near to half of the sensor's "
+        "rate (1000 Hz)",
     ),
 }
 

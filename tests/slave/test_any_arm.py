@@ -268,7 +268,7 @@ def test_ledger_rejects_arm_with_five_joints(folder, scenario):
     assert "held: j6, j7, to_finger" in NominalSlave(five.slave).assumptions
     MakeTeleopStation(five, load_estimate=true_load(five))
     over = replace(five, channel=Channel(network="lan"), passivity__method="ledger")
-    with pytest.raises(DrakeTeleopError, match="requires an arm with 6 or more joints, not 5"):
+    with pytest.raises(DrakeTeleopError, match="requires 6 or more joints, not 5"):
         MakeTeleopStation(over, load_estimate=true_load(five))
 
 

@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 from drake_teleop.common.blocks import DoubleOnly, weak_callback
 from drake_teleop.common.numeric import Array, finite_array
 from drake_teleop.station.master.dynamics import DisplayDevice
-from drake_teleop.station.master.force_display import DISPLAYED, display_into, initial_display_state
+from drake_teleop.station.master.force_display import DISPLAYED, initial_display_state, step_display
 
 
 class ForceDisplay(DoubleOnly, LeafSystem):
@@ -69,7 +69,7 @@ class ForceDisplay(DoubleOnly, LeafSystem):
         device = context.get_discrete_state(0).CopyToVector()
         device[:6] = self._position.Eval(context)
         drive, command = step.get_mutable_value(), self._command.Eval(context)
-        display_into(command, device, self._numbers, self._period, self._jacobian, drive)
+        step_display(command, device, self._numbers, self._period, self._jacobian, drive)
 
     def _display_state(self, context: Context) -> Array:
         drive: Array = self.get_cache_entry(self._step).Eval(context)

@@ -18,7 +18,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.packet import LOAD, PACKET_SIZE
+from drake_teleop.station.passivity.packet import PACKET_LOAD_WRENCH, PACKET_SIZE
 
 
 class NetworkChannel(DoubleOnly, LeafSystem):
@@ -59,10 +59,10 @@ class NetworkChannel(DoubleOnly, LeafSystem):
     ) -> None:
         super().__init__()
         config = NetworkConfig() if config is None else config
-        if config.silence != "hold" and size not in (LOAD.start, PACKET_SIZE):
+        if config.silence != "hold" and size not in (PACKET_LOAD_WRENCH.start, PACKET_SIZE):
             raise DrakeTeleopError(
-                f"'{config.silence}' requires packets of a passivity method ({LOAD.start} or"
-                f" {PACKET_SIZE} numbers), but size is {size}",
+                f"'{config.silence}' requires packets of a passivity method"
+                f" ({PACKET_LOAD_WRENCH.start} or {PACKET_SIZE} numbers), but size is {size}",
                 where="NetworkChannel.silence",
                 remedy="set silence: hold, or use a passivity method",
             )

@@ -1,4 +1,4 @@
-"""Channel between master and slave: network and passivity method at both ends (long: one step)."""
+"""Channel between master and slave (long: one file for one compiled step of both ends)."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.memory import (
-    FILL_TIME,
+    CHANNEL_FILL_TIME,
     LOAD_WRENCH,
     MEMORY_SIZE,
     WRENCH_LIMIT,
@@ -33,7 +33,7 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import (
     CONTACT_FLAG,
     INPUTS_FINITE,
-    LOAD,
+    PACKET_LOAD_WRENCH,
     PACKET_SIZE,
     dot_of_group,
     pose_difference_into,
@@ -59,7 +59,7 @@ _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 @settings
 @dataclass
 class Channel(NetworkConfig):
-    """Network between master and slave: a preset, or `custom` with the fields of this block."""
+    """Settings of the network between master and slave: a preset, or `custom` with its fields."""
 
     network: str = choice(
         "custom", _NETWORK_NAMES, "a preset, or custom for the network of these fields"
@@ -84,14 +84,14 @@ class Channel(NetworkConfig):
             return own, own if self.backward is None else self.backward
         if own != NetworkConfig() or self.backward is not None:
             raise DrakeTeleopError(
-                f"preset '{self.network}' cannot be combined with other fields",
+                f"preset '{self.network}' cannot be combined with other channel fields",
                 where=f"{where}.network",
                 remedy="remove these fields, or set network: custom",
             )
         return PRESETS[self.network], PRESETS[self.network]
 
     def timeout_s(self, period: float) -> float:
-        """Return the silence [s] that starts the safe state, for a packet every `period` [s]."""
+        """Return the silence [s] before an end's safe state, for a packet every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         longest = [
@@ -102,51 +102,44 @@ class Channel(NetworkConfig):
 
 
 # State of both ends in one array.
-_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_MONITOR_SIZE
-_slots = SlotAllocator(_STATE_SIZE)
-_STEP_COUNT = _slots.number()  # number of the step
-_LAST_POSE_AT_MASTER = _slots.vector(
-    8
-)  # last finite command (7); 1 if the newest command is not finite
-_LAST_POSE_AT_SLAVE = _slots.vector(8)  # pose of the slave, likewise
-_RENDERED_WRENCH = _slots.vector(6)  # wrench rendered since the last step
-_VALID_WRENCH_AT_SLAVE = _slots.vector(6)  # slave's wrench at the last step
-_VALID_TIME = _slots.number()  # time with valid wrenches [s]
-_MASTER_SILENCE_MONITOR, _SLAVE_SILENCE_MONITOR = (
-    _slots.vector(MASTER_MONITOR_SIZE),
-    _slots.vector(SLAVE_MONITOR_SIZE),
-)
-MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _slots.vector(MEMORY_SIZE), _slots.vector(MEMORY_SIZE)
+_ENDS_STATE_SIZE = 2 + 2 * (8 + 6 + MEMORY_SIZE) + MASTER_MONITOR_SIZE + SLAVE_MONITOR_SIZE
+_layout = SlotAllocator(_ENDS_STATE_SIZE)
+_STEP_COUNT = _layout.number()  # number of the step
+# Last finite command (7); 1 if the newest command is not finite.
+_LAST_POSE_AT_MASTER = _layout.vector(8)
+_LAST_POSE_AT_SLAVE = _layout.vector(8)  # pose of the slave, likewise
+_RENDERED_WRENCH = _layout.vector(6)  # wrench rendered since the last step
+_VALID_WRENCH_AT_SLAVE = _layout.vector(6)  # slave's wrench at the last step
+_VALID_WRENCH_TIME = _layout.number()  # time with valid wrenches [s]
+_MASTER_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
+_SLAVE_SILENCE_MONITOR = _layout.vector(SLAVE_MONITOR_SIZE)
+MASTER_METHOD_MEMORY, SLAVE_METHOD_MEMORY = _layout.vector(MEMORY_SIZE), _layout.vector(MEMORY_SIZE)
 # Transformation of a wrench at the hand to the world, one array.
-_slots = SlotAllocator(11)
-_ROTATION = _slots.vector(9)  # R_WB by rows
-_SCALES = _slots.vector(2)  # of translation and rotation
+_layout = SlotAllocator(11)
+_R_WB_ROWS = _layout.vector(9)  # R_WB by rows
+_MOTION_SCALES = _layout.vector(2)  # of translation and rotation
 # Recorded values, see `ports` of `TeleopChannel`.
 NUM_PORT_SIGNALS = 8
-_slots = SlotAllocator(NUM_PORT_SIGNALS)
-_WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH, _SILENCE = (
-    _slots.vector(2),
-    _slots.vector(2),
-    _slots.vector(2),
-)
-_WORK_ALONG_COMMAND = _slots.vector(2)
+_layout = SlotAllocator(NUM_PORT_SIGNALS)
+_WORK_OF_HAND, _WORK_OF_SLAVE_WRENCH = _layout.vector(2), _layout.vector(2)
+_SILENCE_TIMES, _WORK_ALONG_COMMAND = _layout.vector(2), _layout.vector(2)
 # Received values at the master.
-_slots = SlotAllocator(7)
-_RENDERED, _CONTACT_FLAG = _slots.vector(6), _slots.number()
+_layout = SlotAllocator(7)
+_RECEIVED_WRENCH, _CONTACT_FLAG = _layout.vector(6), _layout.number()
 
 # Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
 # takes its step before the slave.
-_MIN_DELAY = 1
+_MIN_DELAY_STEPS = 1
 _NO_LOAD_WRENCH = np.zeros(6)
 
 
 def initial_state_of_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the state of both ends before their first step; `start` (7,) is the slave's X_WS."""
-    ends = np.zeros(_STATE_SIZE)
+    """Return the state of both channel ends before the first step, for slave pose X_WS `start`."""
+    ends = np.zeros(_ENDS_STATE_SIZE)
     ends[_LAST_POSE_AT_MASTER][:7] = ends[_LAST_POSE_AT_SLAVE][:7] = start
-    ends[_VALID_TIME] = STOP_TIME_S
+    ends[_VALID_WRENCH_TIME] = STOP_TIME_S
     ends[_MASTER_SILENCE_MONITOR] = initial_master_monitor()
     ends[_SLAVE_SILENCE_MONITOR] = initial_slave_monitor(start)
     memory = methods.initial_method_memory(method, parameters, start)
@@ -180,6 +173,7 @@ def step_channel(
     """Run one step of both ends and of both directions of the network.
 
     Args:
+        steps: addresses of the passivity method's compiled functions.
         pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
             `TeleopChannel`.
         T: time between steps [s].
@@ -187,7 +181,7 @@ def step_channel(
         frame: (11,) R_WB by rows, scale of translation and of rotation.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
-        ports: (PORTS,) port energies, updated; times without packets, written.
+        ports: (8,) output port `ports` of `TeleopChannel`: energies updated, times written.
         wrench_received: (7,) written: F_E_B to render, and contact flag of the newest packet.
     """
     k = int(ends[_STEP_COUNT])
@@ -205,10 +199,8 @@ def step_channel(
         parameters, ends, pose_received, ports, packet,
     )  # fmt: skip
     network.send_packet(backward_parameters, backward, k, packet)
-    ports[_SILENCE][0], ports[_SILENCE][1] = (
-        ends[_MASTER_SILENCE_MONITOR][SILENCE_S],
-        ends[_SLAVE_SILENCE_MONITOR][SILENCE_S],
-    )
+    ports[_SILENCE_TIMES][0] = ends[_MASTER_SILENCE_MONITOR][SILENCE_S]
+    ports[_SILENCE_TIMES][1] = ends[_SLAVE_SILENCE_MONITOR][SILENCE_S]
 
 
 @njit(cache=True)
@@ -224,14 +216,14 @@ def step_master_end(
     before, held = ends[_LAST_POSE_AT_MASTER], ends[_RENDERED_WRENCH]
     watch, memory = ends[_MASTER_SILENCE_MONITOR], ends[MASTER_METHOD_MEMORY]
     dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
-    valid = _increment_into(pose_command, before, dx)
+    valid = _pose_increment_into(pose_command, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
         work[g] -= dot_of_group(held, dx, g)
     hand[:] = 0.0
     if all_in_range(hand_B):
-        _wrench_to_world(hand_B, frame, hand)
+        _convert_wrench_to_world(hand_B, frame, hand)
     else:
         valid = False
     healthy = fresh and received[INPUTS_FINITE] > 0.5
@@ -243,7 +235,7 @@ def step_master_end(
     )  # fmt: skip
     if not valid:
         packet[INPUTS_FINITE] = 0.0
-    _wrench_to_master(held, frame, wrench_received[_RENDERED])
+    _convert_wrench_to_master(held, frame, wrench_received[_RECEIVED_WRENCH])
     wrench_received[_CONTACT_FLAG] = received[CONTACT_FLAG]
 
 
@@ -252,17 +244,13 @@ def step_slave_end(
     steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
     parameters, ends, pose_received, ports, packet,
 ):  # fmt: skip
-    """Run one step of the slave's end; arguments are those of `step_channel` and"
-    " `step_master_end`."""
+    """Run one step of the slave's end; arguments as for `step_channel` and `step_master_end`."""
     before, held = ends[_LAST_POSE_AT_SLAVE], ends[_VALID_WRENCH_AT_SLAVE]
-    watch, memory, work = (
-        ends[_SLAVE_SILENCE_MONITOR],
-        ends[SLAVE_METHOD_MEMORY],
-        ports[_WORK_OF_SLAVE_WRENCH],
-    )
+    watch, memory = ends[_SLAVE_SILENCE_MONITOR], ends[SLAVE_METHOD_MEMORY]
+    work = ports[_WORK_OF_SLAVE_WRENCH]
     dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
     command, left = np.empty(13), pose_received.copy()
-    valid = _increment_into(slave_pose, before, dx)
+    valid = _pose_increment_into(slave_pose, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
@@ -270,19 +258,19 @@ def step_slave_end(
     load = memory[LOAD_WRENCH]
     if not (all_in_range(wrench_B) and all_in_range(load_B)):
         valid = False
-        ends[_VALID_TIME] = 0.0
+        ends[_VALID_WRENCH_TIME] = 0.0
     elif saturated:
-        ends[_VALID_TIME] = 0.0
+        ends[_VALID_WRENCH_TIME] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
-        _wrench_to_world(wrench_B, frame, wrench)
-        share = T / max(STOP_TIME_S - ends[_VALID_TIME], T)
+        _convert_wrench_to_world(wrench_B, frame, wrench)
+        share = T / max(STOP_TIME_S - ends[_VALID_WRENCH_TIME], T)
         for i in range(6):
             held[i] = (1.0 - share) * held[i] + share * wrench[i]
-        _wrench_to_world(load_B, frame, wrench)
+        _convert_wrench_to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_VALID_TIME] += T
+        ends[_VALID_WRENCH_TIME] += T
     copy_into(wrench, 0, held, 0, 6)
     healthy = fresh and received[INPUTS_FINITE] > 0.5
     methods.slave_step(
@@ -301,8 +289,8 @@ def step_slave_end(
 
 
 @njit(cache=True)
-def _increment_into(pose, before, dx):
-    """Write the increment `dx` (6,) since the last finite pose; return whether `pose` is finite."""
+def _pose_increment_into(pose, before, dx):
+    """Write the change `dx` (6,) since the last finite pose; return whether `pose` is finite."""
     valid = all_in_range(pose)
     if valid:
         pose_difference_into(pose, before, dx)
@@ -314,8 +302,8 @@ def _increment_into(pose, before, dx):
 
 
 @njit(cache=True)
-def _wrench_to_world(wrench_B, frame, out):
-    R, scales = frame[_ROTATION], frame[_SCALES]
+def _convert_wrench_to_world(wrench_B, frame, out):
+    R, scales = frame[_R_WB_ROWS], frame[_MOTION_SCALES]
     for g in range(2):
         for i in range(3):
             total = 0.0
@@ -325,8 +313,8 @@ def _wrench_to_world(wrench_B, frame, out):
 
 
 @njit(cache=True)
-def _wrench_to_master(wrench, frame, out):
-    R, scales = frame[_ROTATION], frame[_SCALES]
+def _convert_wrench_to_master(wrench, frame, out):
+    R, scales = frame[_R_WB_ROWS], frame[_MOTION_SCALES]
     for g in range(2):
         for i in range(3):
             total = 0.0
@@ -350,13 +338,13 @@ class TeleopChannel(LeafSystem):
         - pose_slave: (7,) actual X_WS of the slave
         - saturated: (1,) 1 while the wrench is invalid
         - contact: (1,) flag of the slave's contact detector; 0 if unconnected
-        - load_wrench_B: (6,) the load's part of wrench_B, for `ledger`; 0 if unconnected
+        - load_wrench_B: (6,) part of wrench_B from the load, for method `ledger`; 0 if unconnected
         output_ports:
         - pose_received: (7,) X_WS command of the slave
         - wrench_received: (6,) F_E_B to render at the hand [N, N m]
-        - ports: (8,) energy input of the hand by translation and rotation, and of the slave's
-          wrench [J]; time without packets at master and slave [s]; energy input of the slave's
-          wrench along the command [J]
+        - ports: (8,) energy input of the hand (2) and of the slave's wrench (2), by translation and
+          rotation [J]; time without packets at master and slave (2) [s]; energy input of the
+          slave's wrench along the slave's command (2) [J]
         - contact_at_hand: (1,) contact flag of the newest packet at the master
 
     Args:
@@ -383,7 +371,7 @@ class TeleopChannel(LeafSystem):
         # A motion scale of zero transfers no energy; any unit is valid.
         scales = np.where(scales > 0.0, scales, 1.0)
         lines = [
-            network.network_parameters(line, seed, direction, period, least=_MIN_DELAY)
+            network.network_parameters(line, seed, direction, period, least=_MIN_DELAY_STEPS)
             for line, direction in zip(channel.networks_of_directions(), _DIRECTIONS, strict=True)
         ]
         parameters = methods.method_parameters(passivity, list(force_scale / scales), list(scales))
@@ -406,7 +394,7 @@ class TeleopChannel(LeafSystem):
         self._contact = self.DeclareVectorInputPort("contact", 1)
         self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
         ends = initial_state_of_ends(passivity.method, parameters, start)
-        carried = np.zeros(PACKET_SIZE if self._uses_load else LOAD.start)
+        carried = np.zeros(PACKET_SIZE if self._uses_load else PACKET_LOAD_WRENCH.start)
         receivers, in_transit = zip(
             *(network.initial_network_state(p, carried) for p in lines), strict=True
         )
@@ -437,24 +425,24 @@ class TeleopChannel(LeafSystem):
             "wrench_received", 6, weak_callback(self._calc_wrench), step_ticket
         )
         self.DeclareVectorOutputPort(
-            "contact_at_hand", 1, weak_callback(self._calc_contact), step_ticket
+            "contact_at_hand", 1, weak_callback(self._calc_contact_flag), step_ticket
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_state)
 
-    def Begin(
+    def Restart(
         self,
         context: Context,
         command: NDArray[np.float64],
         slave: NDArray[np.float64],
         fills: float,
     ) -> None:
-        """Start in a running station, without packets in transit and with a constant slave command.
+        """Restart the channel in a running station, without packets, at a constant slave command.
 
         `command` and `slave` (7,) are commanded and actual X_WS of the slave. `fills` [s] is the
         time in which the slave of method `wave` keeps its command.
         """
         ends = initial_state_of_ends(*self._initial_arguments, command)
-        ends[_LAST_POSE_AT_SLAVE][:7], ends[SLAVE_METHOD_MEMORY][FILL_TIME] = slave, fills
+        ends[_LAST_POSE_AT_SLAVE][:7], ends[SLAVE_METHOD_MEMORY][CHANNEL_FILL_TIME] = slave, fills
         context.SetDiscreteState(self._groups[2], ends)
         context.SetDiscreteState(self._groups[3], command)
 
@@ -484,15 +472,15 @@ class TeleopChannel(LeafSystem):
             received,
         )
 
-    def _step_result(self, context: Context) -> list[NDArray[np.float64]]:
+    def _evaluate_step(self, context: Context) -> list[NDArray[np.float64]]:
         return self.get_cache_entry(self._step).Eval(context)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._step_result(context)[-1][_RENDERED])
+        output.SetFromVector(self._evaluate_step(context)[-1][_RECEIVED_WRENCH])
 
-    def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._step_result(context)[-1][_CONTACT_FLAG]
+    def _calc_contact_flag(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._evaluate_step(context)[-1][_CONTACT_FLAG]
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._step_result(context), self._groups, strict=False):
+    def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
+        for part, group in zip(self._evaluate_step(context), self._groups, strict=False):
             discrete_state.set_value(group, part)

@@ -17,7 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.noise import random_bits
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.packet import (
-    LOAD,
+    PACKET_LOAD_WRENCH,
     POSE,
     VELOCITY,
     WRENCH,
@@ -42,7 +42,7 @@ _MINUTE_S, _SILENCE_SEED = 60.0, 20090101  # [s]; seed for the silence of a netw
 @settings
 @dataclass
 class NetworkConfig:
-    """One direction of a network; the default is ideal: packet k arrives at step k."""
+    """Settings of one direction of a network; the default is ideal: packet k arrives at step k."""
 
     delay: float = quantity(0.0, "s", 0.0, MAX_DELAY_S, "mean one-way delay")
     jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) standard deviations over the mean delay")
@@ -74,7 +74,7 @@ class NetworkConfig:
         check_ranges(self, where)
         if self.loss > self.burst_loss:
             raise DrakeTeleopError(
-                f"{self.loss:g} is above burst_loss {self.burst_loss:g}, the loss of the bad state",
+                f"mean loss {self.loss:g} is above burst_loss {self.burst_loss:g} of the bad state",
                 where=f"{where}.loss" if ":" in where else f"{where}:loss",
                 remedy="raise burst_loss to at least the mean loss",
             )
@@ -128,7 +128,7 @@ def network_parameters(
     least: int = 0,
     delays: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the parameters of one direction for the compiled functions below.
+    """Return the parameters of one direction for `send_packet` and `receive_packet`.
 
     Args:
         direction: FORWARD or BACKWARD, with independent random numbers.
@@ -180,7 +180,7 @@ def mean_delay(config: NetworkConfig) -> float:
 
 
 def longest_delay(config: NetworkConfig) -> float:
-    """Return the largest age of a packet when it is used [s]."""
+    """Return the largest age of an arriving packet when the receiver uses it [s]."""
     longest = config.delay * (1 + _MAX_DELAY_DEVIATIONS[config.distribution] * config.jitter)
     if config.trace is not None:
         longest = float(_read_trace(Path(config.trace), _TRACE_STEP_S).max()) * _TRACE_STEP_S
@@ -225,8 +225,8 @@ def _random_uniform(p, k, draw):
 
 
 @njit(cache=True)
-def _delay_steps(p, k, draw):
-    """Return the delay of packet k [steps], -1 if the trace lost it; use three random numbers."""
+def _draw_delay_steps(p, k, draw):
+    """Return the delay of packet k [steps] from random numbers `draw` to `draw` + 2; -1: lost."""
     if p.shape[0] > _TRACE:
         steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
         return int(max(steps, p[_MIN_DELAY])) if steps >= 0.0 else -1
@@ -246,8 +246,8 @@ def _delay_steps(p, k, draw):
 
 
 @njit(cache=True)
-def _advance_chain(p, k, bad):
-    """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none)."""
+def _advance_loss_chain(p, k, bad):
+    """Return the loss state (1: bad) at step k; delays of packet and copy [steps] (-1: none)."""
     if p[_BAD_SHARE] > 0.0:
         likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
         bad = 1.0 if _random_uniform(p, k, 0) <= likely else 0.0
@@ -255,10 +255,10 @@ def _advance_chain(p, k, bad):
         return bad, -1, -1
     if bad == 1.0 and _random_uniform(p, k, 1) <= p[_BURST_LOSS]:
         return bad, -1, -1
-    first = _delay_steps(p, k, 2)
+    first = _draw_delay_steps(p, k, 2)
     second = -1
     if first >= 0 and p[_DUPLICATE] > 0.0 and _random_uniform(p, k, 5) <= p[_DUPLICATE]:
-        second = _delay_steps(p, k, 6)
+        second = _draw_delay_steps(p, k, 6)
     return bad, first, second
 
 
@@ -276,10 +276,10 @@ def initial_network_state(
 
 @njit(cache=True)
 def send_packet(p, state, k, packet):
-    """Send the packet of step `k` and update `state`; steps count from 0 without gaps."""
+    """Send `packet` at step `k` and update `state`; call this for every step from 0 on."""
     receiver, in_transit = state
     slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
-    receiver[_BAD_STATE], first, second = _advance_chain(p, k, receiver[_BAD_STATE])
+    receiver[_BAD_STATE], first, second = _advance_loss_chain(p, k, receiver[_BAD_STATE])
     for travel in (first, second):
         if travel >= 0:
             if p[_REDUNDANT] == 0.0:
@@ -292,9 +292,9 @@ def send_packet(p, state, k, packet):
 
 @njit(cache=True)
 def receive_packet(p, state, k, packet):
-    """Write the newest packet (N,) at step `k` into `packet`, after `send` of the same step.
+    """Write the newest packet (N,) that has arrived by step `k` into `packet`.
 
-    Return the step at which it was sent, or -1, and True if it is new.
+    Return the step at which it was sent (-1: none), and True if it is new.
     """
     receiver, in_transit = state
     slots, size = int(p[_NUM_SLOTS]), receiver.shape[0] - _LAST_PACKET
@@ -311,16 +311,16 @@ def receive_packet(p, state, k, packet):
         receiver[_SILENT_STEPS] += 1.0
     copy_into(packet, 0, receiver, _LAST_PACKET, size)
     if not fresh:
-        _fill_silence(p[_POLICY], receiver[_SILENT_STEPS] * p[_PERIOD], packet)
+        _apply_silence_policy(p[_POLICY], receiver[_SILENT_STEPS] * p[_PERIOD], packet)
     return int(receiver[_NEWEST_READ]), fresh
 
 
 @njit(cache=True)
-def _fill_silence(policy, silent, packet):
+def _apply_silence_policy(policy, silent, packet):
     velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _POLICY_ZERO:
         velocity[:] = 0.0
-        packet[WRENCH] = packet[LOAD] = 0.0
+        packet[WRENCH] = packet[PACKET_LOAD_WRENCH] = 0.0
     elif policy == _POLICY_EXTRAPOLATE and has_arrived(packet):
         move_pose_into(pose, velocity * min(silent, MAX_EXTRAPOLATION_S), pose)
         if silent > MAX_EXTRAPOLATION_S:
@@ -330,15 +330,15 @@ def _fill_silence(policy, silent, packet):
 def packet_delays(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive."""
-    return _compute_delays(network_parameters(config, seed, direction, period), steps)
+    """Return the delays (steps, 2) of packets and their copies [steps]; -1: does not arrive."""
+    return _compute_packet_delays(network_parameters(config, seed, direction, period), steps)
 
 
 @njit(cache=True)
-def _compute_delays(p, steps):
+def _compute_packet_delays(p, steps):
     delays, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
     for k in range(steps):
-        bad, delays[k, 0], delays[k, 1] = _advance_chain(p, k, bad)
+        bad, delays[k, 0], delays[k, 1] = _advance_loss_chain(p, k, bad)
     return delays
 
 
@@ -348,7 +348,7 @@ def newest_packets(
     """Return the number of the newest received packet at each step, (steps,); -1 for none."""
     p = network_parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT_TIME])
-    for travel in _compute_delays(p, steps).T:
+    for travel in _compute_packet_delays(p, steps).T:
         used = travel if config.redundant else np.maximum(travel, playout)
         seen = (travel >= 0) & (sent + used < steps)
         np.maximum.at(arrived, (sent + used)[seen], sent[seen])

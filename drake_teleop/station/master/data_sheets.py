@@ -1,4 +1,4 @@
-"""Haptic devices by name: the paper's Phantom, and others by data sheets."""
+"""Haptic devices by name: the Phantom of the paper, and others from data sheets."""
 
 import copy
 import dataclasses
@@ -14,24 +14,24 @@ from numpy.typing import NDArray
 from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.registry import Registry
-from drake_teleop.station.master.dynamics import HapticDevice
-from drake_teleop.station.master.leader import LeaderDevice
-from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
-from drake_teleop.station.master.numbers import (
-    CENTRE_OF_WORKSPACE,
+from drake_teleop.station.master.device_parameters import (
     COULOMB,
-    HALF_SIZE,
+    HALF_WORKSPACE,
     HAND_INERTIA,
     HAND_MASS,
-    IN_TASK_SPACE,
     INERTIA,
+    IS_IN_TASK_SPACE,
     MASS,
     MAX_ROTATION,
     NUM_DEVICE_PARAMETERS,
     PEAK_FORCE,
     PEAK_TORQUE,
     VISCOUS,
+    WORKSPACE_CENTRE,
 )
+from drake_teleop.station.master.dynamics import HapticDevice
+from drake_teleop.station.master.leader import LeaderDevice
+from drake_teleop.station.master.leader_model import JOINT_MODE, Leader
 from drake_teleop.station.master.phantom import FORCE_LIMIT, WRIST_TORQUE_LIMIT
 
 PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
@@ -42,18 +42,19 @@ PHANTOM_NAME, LEADER_NAME = "phantom_premium_15", "leader"
 class JointFriction:
     """Friction torque of the Phantom's joints: coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
 
+    # Sources as in `phantom`: main axes P, wrist estimated.
     coulomb: list[float] = quantity(
-        [0.01, 0.01, 0.01, 0.001, 0.001, 0.001], "N m", 0.0, 1.0, "main axes P, wrist E"
+        [0.01, 0.01, 0.01, 0.001, 0.001, 0.001], "N m", 0.0, 1.0, "Coulomb friction of the joints"
     )
     viscous: list[float] = quantity(
-        [5e-4, 5e-4, 5e-4, 5e-5, 5e-5, 5e-5], "N m s/rad", 0.0, 10.0, "main axes P, wrist E"
+        [5e-4, 5e-4, 5e-4, 5e-5, 5e-5, 5e-5], "N m s/rad", 0.0, 10.0, "damping of the joints"
     )
 
 
 @settings
 @dataclass
 class DeviceFigures:
-    """Data sheet of a device in task space; x of its base frame points to the operator, z up."""
+    """Data sheet of a haptic device; x of its base frame points to the operator, z up."""
 
     apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "apparent mass at the grip")
     inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "inertia about every axis")
@@ -92,11 +93,9 @@ class DeviceFigures:
 
 
 _FREE_ROTATION, _NO_ROTATION = DeviceFigures().turn, [0.0, 0.0, 0.0]
-_OMEGA_SIZE_M, _OMEGA_ANGLES_RAD = (
-    [0.11, 0.113, 0.113],
-    np.radians([120.0, 70.0, 160.0]).tolist(),
-)
-_OMEGA_STEP_RAD = math.radians(0.09)
+_OMEGA_SIZE_M = [0.11, 0.113, 0.113]
+_OMEGA_ANGLES_RAD = np.radians([120.0, 70.0, 160.0]).tolist()
+_ENCODER_STEP_RAD = math.radians(0.09)
 
 # Apparent mass, Coulomb friction, peak force, size of the workspace, largest turns, steps of
 # position and rotation, update rate. The manufacturers' values, from memory, are peak forces,
@@ -107,14 +106,14 @@ _OMEGA_STEP_RAD = math.radians(0.09)
 _DATA_SHEETS: dict[str, tuple[Any, ...]] = {
     # name            kg     N     N     m                   rad         m        rad          Hz
     "geomagic_touch": (0.045, 0.26, 3.3, [0.07, 0.16, 0.12], _FREE_ROTATION, 5.5e-5, 2e-3, 1000.0),
-    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_ROTATION, 1e-5, _OMEGA_STEP_RAD, 4000.0),
-    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
-    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _OMEGA_STEP_RAD, 4000.0),
+    "omega_3": (0.25, 0.3, 12.0, _OMEGA_SIZE_M, _NO_ROTATION, 1e-5, _ENCODER_STEP_RAD, 4000.0),
+    "omega_6": (0.3, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
+    "omega_7": (0.35, 0.3, 12.0, _OMEGA_SIZE_M, _OMEGA_ANGLES_RAD, 1e-5, _ENCODER_STEP_RAD, 4000.0),
     "falcon": (0.2, 0.5, 8.9, [0.102] * 3, _NO_ROTATION, 6.35e-5, 0.0, 1000.0),
     "haply_inverse3": (0.2, 0.15, 10.0, [0.2, 0.34, 0.19], _FREE_ROTATION, 2e-5, 2e-3, 4000.0),
     "virtuose_6d": (1.0, 1.0, 35.0, [0.26] * 3, _FREE_ROTATION, 2e-5, 2e-4, 1000.0),
 }  # fmt: skip
-_COLUMNS = (
+_DATA_SHEET_FIELDS = (
     *("apparent_mass", "friction", "peak_force", "size"),
     *("turn", "resolution", "turn_resolution", "rate_hz"),
 )
@@ -122,7 +121,7 @@ _COLUMNS = (
 FIGURES = Registry(
     "device",
     {
-        name: DeviceFigures(**dict(zip(_COLUMNS, copy.deepcopy(row), strict=True)))
+        name: DeviceFigures(**dict(zip(_DATA_SHEET_FIELDS, copy.deepcopy(row), strict=True)))
         for name, row in _DATA_SHEETS.items()
     },
 )
@@ -134,7 +133,7 @@ FIGURES["virtuose_6d"] = dataclasses.replace(
 @settings
 @dataclass
 class Master:
-    """Haptic device and its start position."""
+    """Settings of the haptic device, with its start position."""
 
     model: str = choice(
         PHANTOM_NAME,
@@ -160,12 +159,12 @@ class Master:
             numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = FORCE_LIMIT, WRIST_TORQUE_LIMIT
             return HapticDevice(numbers, self.model)
         figures = self._data_sheet()
-        numbers[IN_TASK_SPACE] = 1.0
+        numbers[IS_IN_TASK_SPACE] = 1.0
         numbers[COULOMB] = np.repeat([figures.friction, figures.friction_torque], 3)
         numbers[VISCOUS] = np.repeat([figures.damping, figures.turning_damping], 3)
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = figures.peak_force, figures.peak_torque
         numbers[MASS], numbers[INERTIA] = figures.apparent_mass, figures.inertia
-        numbers[CENTRE_OF_WORKSPACE], numbers[HALF_SIZE] = (
+        numbers[WORKSPACE_CENTRE], numbers[HALF_WORKSPACE] = (
             figures.centre,
             0.5 * np.array(figures.size),
         )
@@ -180,7 +179,7 @@ class Master:
         """Raise a DrakeTeleopError that names the caller `what` if a leader arm commands joints."""
         if self.is_joint_leader:
             raise DrakeTeleopError(
-                f"{what} supports pose mode only",
+                f"{what} cannot use a leader arm that commands joints",
                 where="master.leader.leads",
                 remedy="set it to pose: the rendered force is the same",
             )
@@ -214,6 +213,7 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def with_absolute_paths(self, folder: Path) -> "Master":
+        """Return a copy with paths resolved from the scenario's folder."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.with_absolute_paths(folder))
@@ -224,19 +224,19 @@ class Master:
     def check(self, where: str) -> None:
         if self.model == PHANTOM_NAME and self.figures is not None:
             raise DrakeTeleopError(
-                "the model of the Phantom is fixed and has no data sheet",
+                "the Phantom has fixed dynamics and accepts no data sheet",
                 where=f"{where}.figures",
                 remedy="leave them out, or choose another model, such as custom",
             )
         if self.model != PHANTOM_NAME and self.friction != JointFriction():
             raise DrakeTeleopError(
-                f"only the Phantom has joint friction, not '{self.model}'",
+                f"only the Phantom accepts joint friction, not model '{self.model}'",
                 where=f"{where}.friction",
                 remedy="leave it out, and set figures.friction and figures.damping",
             )
         if (self.leader is None) == (self.model == LEADER_NAME):
             raise DrakeTeleopError(
-                "a leader arm requires `model: leader`, and this model a leader arm",
+                "`model: leader` and the settings `leader` require each other",
                 where=f"{where}.leader",
                 remedy="give both, with leader.file and leader.hand_frame, or none",
             )

@@ -16,7 +16,7 @@ from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDi
 
 _MAX_PERIOD_S = 1e-3  # s, slower than any haptic device
 # A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
-_MAX_FRICTION_STEP = 2.0
+_MAX_RATE_TIMES_PERIOD = 2.0
 
 
 @njit(cache=True, borrows=True)
@@ -35,17 +35,18 @@ def check_period(
     """Raise a DrakeTeleopError if one step per period [s] is unstable at the joint positions q."""
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
-            f"a period of {period:g} s is too long for the haptic device",
+            f"the haptic device's period of {period:g} s is not above 0 and at most "
+            f"{_MAX_PERIOD_S:g} s",
             where="master.period",
-            remedy=f"choose at most {_MAX_PERIOD_S:g} s (1 kHz); the paper uses above 2 kHz",
+            remedy="choose a hand rate of 1 kHz or more; the paper uses above 2 kHz",
         )
     device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
-    if rate * period > _MAX_FRICTION_STEP:
+    if rate * period > _MAX_RATE_TIMES_PERIOD:
         raise DrakeTeleopError(
-            f"the friction stops the device within {1e3 / rate:.2g} ms, too fast for a "
-            f"period of {1e3 * period:g} ms",
+            f"the friction stops the haptic device within {1e3 / rate:.2g} ms, so that its "
+            f"simulation with a period of {1e3 * period:g} ms is unstable",
             where=device.friction_field,
             remedy="choose less friction, or a higher hand rate",
         )
@@ -77,7 +78,7 @@ class MasterDevice(DeviceBlock):
         super().__init__(period, device, q_initial, _advance_device, constants)
 
 
-def AddDevice(
+def AddHapticDevice(
     builder: DiagramBuilder,
     period: float,
     device: HapticDevice | LeaderDevice,

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.master import phantom, task_space
-from drake_teleop.station.master.numbers import (
+from drake_teleop.station.master.device_parameters import (
     COULOMB,
     HAND_INERTIA,
     HAND_MASS,
-    IN_TASK_SPACE,
+    IS_IN_TASK_SPACE,
     PEAK_FORCE,
     PEAK_TORQUE,
     VISCOUS,
@@ -24,7 +24,7 @@ from drake_teleop.station.master.numbers import (
 @njit(cache=True)
 def jacobian_into(q, device, J):
     """Write the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B, into J."""
-    if device[IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE] != 0.0:
         task_space.jacobian_into(q, J)
     else:
         phantom.jacobian_into(q, J)
@@ -33,7 +33,7 @@ def jacobian_into(q, device, J):
 @njit(cache=True)
 def gravity_torque_into(q, device, out):
     """Write the joint torques or forces (6,) that compensate the device's weight into `out`."""
-    if device[IN_TASK_SPACE] != 0.0:
+    if device[IS_IN_TASK_SPACE] != 0.0:
         out[:6] = 0.0
     else:
         phantom.gravity_torque_into(q, out)
@@ -41,8 +41,8 @@ def gravity_torque_into(q, device, out):
 
 @njit(cache=True)
 def pose_into(q, device, pose):
-    """Write the stylus pose X_BE (7,) into `pose`."""
-    if device[IN_TASK_SPACE] != 0.0:
+    """Write the stylus pose X_BE (7,) at the joint positions q (6,) into `pose`."""
+    if device[IS_IN_TASK_SPACE] != 0.0:
         task_space.pose_into(q, pose)
     else:
         phantom.pose_into(q, pose)
@@ -63,14 +63,14 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
     """Advance `state` (12,) [q; v] in place by one Runge-Kutta step of `period` [s].
 
     `hand_wrench` (6,) is [f; tau] of the hand on the stylus at E, in B; `motor` (6,) are the motor
-    torques or forces at the joints.
+    torques or forces at the joints; `work` and `stages` are scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
     copy_into(stage, 0, state, 0, 12)
     total[:] = 0.0
     for i in range(4):
         copy_into(slope, 0, stage, 6, 6)
-        if device[IN_TASK_SPACE] != 0.0:
+        if device[IS_IN_TASK_SPACE] != 0.0:
             task_space.acceleration_into(
                 stage[:6], stage[6:], hand_wrench, motor, device, work, slope[6:]
             )
@@ -88,7 +88,7 @@ def step_device(state, hand_wrench, motor, device, period, work, stages):
 
 
 class DisplayDevice:
-    """Base class of haptic devices; `numbers` (NUMBERS,) contains the parameters."""
+    """Base class of haptic devices; `numbers` are the parameters of `device_parameters`."""
 
     numbers: NDArray[np.float64]
 
@@ -105,7 +105,7 @@ class DisplayDevice:
 
 @dataclass(frozen=True)
 class HapticDevice(DisplayDevice):
-    """Haptic device (Phantom or in task space) with the hand's passive mass.
+    """Dynamics of a haptic device (Phantom or `task_space`) with the hand's passive mass.
 
     Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
     """
@@ -124,7 +124,7 @@ class HapticDevice(DisplayDevice):
 
     @property
     def is_phantom(self) -> bool:
-        return not self.numbers[IN_TASK_SPACE]
+        return not self.numbers[IS_IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the joint positions (6,) for a stylus pose X_BE (7,)."""

@@ -15,7 +15,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 def read_pose_into(q, q_start, steps, device, pose):
     """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
 
-    `steps` (6,) are in m or rad; 0 is exact.
+    `steps` (6,) are in m or rad; 0 disables rounding.
     """
     read = np.empty(6)
     for i in range(6):
@@ -25,7 +25,7 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """Encoders of a haptic device: round the stylus pose to whole steps (6,) [m, rad]; 0 is exact.
+    """Encoders of a haptic device, with whole `steps` (6,) [m, rad] of its axes; 0: no rounding.
 
     Steps count from the joint positions `q_start` (6,).
 
@@ -35,7 +35,7 @@ class Encoders(LeafSystem):
         input_ports:
         - master_state: (12,) state of the device
         output_ports:
-        - pose_read: (7,) X_BE
+        - pose_read: (7,) X_BE of the rounded positions
     """
 
     __slots__ = ONE_DICT
@@ -47,9 +47,9 @@ class Encoders(LeafSystem):
         self._constants = q_start, steps, device.numbers
         self._state = self.DeclareVectorInputPort("master_state", 12)
         inputs = {self._state.ticket()}
-        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._round_pose), inputs)
+        self.DeclareVectorOutputPort("pose_read", 7, weak_callback(self._calc_rounded_pose), inputs)
 
-    def _round_pose(self, context: Context, output: BasicVector) -> None:
+    def _calc_rounded_pose(self, context: Context, output: BasicVector) -> None:
         q = self._state.Eval(context)[:6]
         read_pose_into(q, *self._constants, output.get_mutable_value())
 
@@ -72,7 +72,7 @@ class SampleHold(LeafSystem):
         super().__init__()
         self._value = self.DeclareVectorInputPort("value", len(start))
         self.DeclareStateOutputPort("held", self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._take_sample)
 
-    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _take_sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(0, self._value.Eval(context))

@@ -13,8 +13,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_teleop.common.blocks import ONE_DICT, Fault, all_in_range, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
+from drake_teleop.station.master.device_parameters import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
-from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.passivity.memory import SlotAllocator
 from drake_teleop.station.passivity.packet import limit_group
 from drake_teleop.station.passivity.safe_state import (
@@ -28,11 +28,11 @@ from drake_teleop.station.passivity.safe_state import (
 # displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
-_slots = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
-_POSITIONS, _LAST_POSITIONS, DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
-_FAULT, _IS_WRENCH_REDUCED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
-_SILENCE_MONITOR = _slots.vector(MASTER_MONITOR_SIZE)
-_DISPLAYED_AND_FAULT = slice(DISPLAYED.start, _FAULT + 1)
+_layout = SlotAllocator(6 + 6 + 7 + 1 + 1 + MASTER_MONITOR_SIZE)
+_POSITIONS, _LAST_POSITIONS, DISPLAYED = _layout.vector(6), _layout.vector(6), _layout.vector(6)
+_FAULT, _IS_WRENCH_REDUCED, _TIME_SINCE_FAULT = _layout.number(), _layout.number(), _layout.number()
+_SILENCE_MONITOR = _layout.vector(MASTER_MONITOR_SIZE)
+_DISPLAYED_WRENCH_AND_FAULT = slice(DISPLAYED.start, _FAULT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING_FAULT = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
 )
@@ -75,7 +75,7 @@ def limit_wrench_into(wrench, numbers, J, displayed):
 
 @njit(cache=True)
 def motor_torque_into(displayed, q, numbers, J, torque):
-    """Write J^T F plus gravity compensation (6,) at q (6,) into `torque`; F is `displayed` (6,)."""
+    """Write motor torques (6,), J^T `displayed` plus gravity compensation at q, into `torque`."""
     gravity_torque_into(q, numbers, torque)
     for i in range(6):
         for k in range(6):
@@ -83,10 +83,10 @@ def motor_torque_into(displayed, q, numbers, J, torque):
 
 
 @njit(cache=True, borrows=True)
-def display_into(wrench, device, numbers, period, J, drive):
+def step_display(wrench, device, numbers, period, J, drive):
     """Advance the force display by one `period` [s] for the wrench F_E_B (6,) to render.
 
-    `device` (27,) is the port `for_display` of `MasterDevice`; `drive` (27,) is written.
+    `device` (27,) is port `for_display` of `MasterDevice`; `drive` (27,), its input, is written.
     """
     q, fault = device[_POSITIONS], _NO_FAULT
     copy_into(drive, 6, device, 6, _SILENCE_MONITOR.stop - 6)
@@ -100,12 +100,12 @@ def display_into(wrench, device, numbers, period, J, drive):
     jacobian_into(q, numbers, J)
     limit_wrench_into(wrench, numbers, J, displayed)
     if fault != _NO_FAULT or device[_IS_WRENCH_REDUCED] != 0.0:
-        _fade_after_fault(device, numbers, period, drive)
+        _fade_wrench_after_fault(device, numbers, period, drive)
     motor_torque_into(displayed, q, numbers, J, drive[:6])
 
 
 @njit(cache=True)
-def _fade_after_fault(device, numbers, period, drive):
+def _fade_wrench_after_fault(device, numbers, period, drive):
     displayed, last = drive[DISPLAYED], device[DISPLAYED]
     limits, full = np.empty(2), _peak_wrench_of_device(numbers)
     fault = drive[_FAULT] != _NO_FAULT
@@ -125,9 +125,9 @@ def _fade_after_fault(device, numbers, period, drive):
 
 
 class DeviceBlock(LeafSystem):
-    """Base class of haptic devices as blocks, at rest at `q_initial` at the start.
+    """Base class of Drake blocks of haptic devices, which start at rest at `q_initial`.
 
-    `advance` writes the states after one period.
+    The compiled function `advance` steps the states by one period.
     """
 
     __slots__ = ONE_DICT
@@ -154,9 +154,9 @@ class DeviceBlock(LeafSystem):
             ("for_display", display),
         ):
             self.DeclareStateOutputPort(name, self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance_states)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _advance_states(self, context: Context, discrete_state: DiscreteValues) -> None:
         self._advance(
             *self._constants,
             discrete_state.get_mutable_value(0),
@@ -172,8 +172,7 @@ class DeviceBlock(LeafSystem):
 class ForceDisplay(LeafSystem):
     """Block that converts the wrench to render into motor torques of the master.
 
-    With invalid data, the displayed wrench fades to zero in 50 ms and returns as after silence in a
-    channel.
+    While data are invalid, the displayed wrench fades to zero in 50 ms; then it ramps up again.
 
     .. pydrake_system::
 
@@ -184,7 +183,7 @@ class ForceDisplay(LeafSystem):
         output_ports:
         - drive: (27,) for the device: J_M^T F + gravity compensation (6) [N m], memory
         - force_to_master: (6,) wrench F, displayed within the device's limits [N, N m]
-        - fault_at_hand: a `Fault`
+        - fault_at_hand: code of `blocks.Fault`
         - displayed_and_fault: (7,) the last two ports in one vector
     """
 
@@ -210,7 +209,7 @@ class ForceDisplay(LeafSystem):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), inputs)
 
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
-        display_into(
+        step_display(
             self._command.Eval(context),
             self._device.Eval(context),
             self._numbers,
@@ -226,4 +225,4 @@ class ForceDisplay(LeafSystem):
         output[0] = self._drive.Eval(context)[_FAULT]
 
     def _calc_force_and_fault(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_AND_FAULT])
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_WRENCH_AND_FAULT])

@@ -1,6 +1,6 @@
 """Leader arm: any serial arm that the operator holds at E as a haptic device.
 
-M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
+M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F_displayed + weight
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from drake_teleop.common.blocks import all_in_range
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import copy_into, cross, quaternion_of_matrix, vector_at
+from drake_teleop.station.master.device_parameters import HAND_MASS
 from drake_teleop.station.master.dynamics import DisplayDevice
-from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, display_into
-from drake_teleop.station.master.numbers import HAND_MASS
+from drake_teleop.station.master.force_display import DeviceBlock, ForceDisplay, step_display
 from drake_teleop.station.slave.arm import (
     DAMPING_COLUMN,
     GRAVITY_COLUMN,
@@ -56,7 +56,7 @@ _END_STOP_FREQUENCY_HZ = 12.0
 def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
     """Write the joint accelerations (n,) [rad/s^2] of leader and hand into `vdot`.
 
-    `applied` (6,) is the hand's wrench minus its weight [f; tau] on E, in B.
+    `applied` (6,) is the hand's wrench minus the hand's weight, [f; tau] on E, in B.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -78,7 +78,7 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
 
 
 @njit(cache=True)
-def _pose_and_twist(arm, q, v, pose, twist):
+def _update_pose_and_twist(arm, q, v, pose, twist):
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
     jacobian_and_pose(arm, q, J, x)
@@ -100,7 +100,7 @@ def _pose_and_twist(arm, q, v, pose, twist):
 def motor_torques_into(bare, arm, joints, q, F, torque):
     """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
 
-    F (6,) is the wrench at E; `bare` is the arm's table without the hand.
+    F (6,) is the wrench at E; `bare` is `ArmModel.table` without the hand.
     """
     n = q.shape[0]
     J, still = np.empty((6, n)), np.zeros(n)
@@ -148,13 +148,13 @@ def step_leader(
                 stage[k] = state[k] + ahead * period * slope[k]
         for k in range(2 * n):
             state[k] += period * total[k]
-        _pose_and_twist(arm, state[:n], state[n:], pose, twist)
+        _update_pose_and_twist(arm, state[:n], state[n:], pose, twist)
     for i in range(3):  # position for the display
         display[i] = pose[4 + i] if all_in_range(state) else math.nan
 
 
 @njit(cache=True)
-def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
+def _limit_wrench_to_motors(bare, arm, joints, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     motor_torques_into(bare, arm, joints, q, np.zeros(6), weight)
@@ -181,7 +181,7 @@ class LeaderDevice(DisplayDevice):
             and upper limits [rad], stiffness and damping of the end stops, torque limits [N m],
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
-        numbers: (NUMBERS,) parameters for the force display.
+        numbers: (NUM_DEVICE_PARAMETERS,) parameters for the force display.
     """
 
     arm: ArmModel
@@ -207,14 +207,14 @@ class LeaderDevice(DisplayDevice):
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """Return joint positions (n,) for X_BE (7,), searched from home."""
+        """Return joint positions (n,) for the pose X_BE (7,), by a search from home."""
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
         if status != IkStatus.OK:
             raise DrakeTeleopError(
-                f"the leader cannot reach ({', '.join(f'{x:.3g}' for x in pose[4:])}) m"
-                f" ({status.name})",
+                f"the leader arm cannot reach ({', '.join(f'{x:.3g}' for x in pose[4:])}) m in B"
+                f" (inverse kinematics: {status.name})",
                 where="pose_master",
                 remedy="choose a pose that its joints reach, or another home",
             )
@@ -222,14 +222,14 @@ class LeaderDevice(DisplayDevice):
 
     def forward_kinematics(self, q: Array) -> Array:
         pose = np.array([1.0, *np.zeros(6)])
-        _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
+        _update_pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
 
     def check_limits(self, q: Array) -> None:
         for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
             raise DrakeTeleopError(
-                f"joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, its limits are"
-                f" {self.joints[_LOWER, k]:.3g} and {self.joints[_UPPER, k]:.3g}",
+                f"leader joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, outside its limits"
+                f" {self.joints[_LOWER, k]:.3g} and {self.joints[_UPPER, k]:.3g} (rad or m)",
                 where="master.leader.home",
                 remedy="start within the limits of its joints",
             )
@@ -304,7 +304,7 @@ class LeaderDisplay(ForceDisplay):
         output_ports:
         - drive: for `LeaderArm`
         - force_to_master: (6,) wrench F, displayed within the limits [N, N m]
-        - fault_at_hand: a `Fault`
+        - fault_at_hand: code of `blocks.Fault`
         - displayed_and_fault: (7,) the last two ports in one vector
     """
 
@@ -319,9 +319,9 @@ class LeaderDisplay(ForceDisplay):
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _limit_to_motors(*self._constants, q, wrench, self._shortened)
+            _limit_wrench_to_motors(*self._constants, q, wrench, self._shortened)
             wrench = self._shortened
-        display_into(
+        step_display(
             wrench,
             self._device.Eval(context),
             self._numbers,

@@ -1,4 +1,4 @@
-"""Leader arm from a model file, as a part of the scenario."""
+"""Settings of a leader arm from a model file."""
 
 import dataclasses
 import math
@@ -12,15 +12,15 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
-from drake_teleop.station.master.numbers import (
+from drake_teleop.station.master.device_parameters import (
     HAND_INERTIA,
     HAND_MASS,
-    IN_TASK_SPACE,
+    IS_IN_TASK_SPACE,
     NUM_DEVICE_PARAMETERS,
     PEAK_FORCE,
     PEAK_TORQUE,
 )
+from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
 from drake_teleop.station.slave.arm import (
     PHI_COLUMN,
     ROTATION_COLUMN,
@@ -40,13 +40,13 @@ JOINT_MODE = "joints"
 @settings
 @dataclass
 class Leader:
-    """Arm that the operator moves; its base is placed so that E is at `position` at home."""
+    """Settings of a leader arm; its base is placed so that E is at `master.position` at home."""
 
-    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder")
+    file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml file, from the scenario's folder")
     package_paths: list[str] = plain(
         [], "folders for package:// addresses in it, from the scenario's folder"
     )
-    hand_frame: str = plain("", "frame or link at the grip")
+    hand_frame: str = plain("", "name of the frame or link at the grip")
     home: list[float] = plain(
         [], "joint positions at the start [rad, m]; by default 0, or the middle of their limits"
     )
@@ -76,20 +76,20 @@ class Leader:
     def check(self, where: str) -> None:
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
-                raise DrakeTeleopError(
-                    "is required for a leader arm", where=f"{where}.{name}", remedy="set it"
-                )
+                what = f"a leader arm requires a {name.replace('_', ' ')}"
+                raise DrakeTeleopError(what, where=f"{where}.{name}", remedy="set this field")
         for name in ("home", "friction", "damping", "torque_limit"):
             values = getattr(self, name)
             if not np.isfinite(values).all() or (name != "home" and min(values, default=0.0) < 0.0):
                 least, fault = ("", "") if name == "home" else (" of 0 or more", "negative or ")
                 raise DrakeTeleopError(
-                    f"contains a number that is {fault}not finite",
+                    f"{values} contains a number that is {fault}not finite",
                     where=f"{where}.{name}",
                     remedy=f"give finite numbers{least}",
                 )
 
     def with_absolute_paths(self, folder: Path) -> "Leader":
+        """Return a copy with paths resolved from the scenario's folder."""
         return dataclasses.replace(
             self,
             file=str((folder / self.file).resolve()) if self.file else "",
@@ -123,27 +123,27 @@ class Leader:
         phi[[4, 7, 9]] += hand_inertia
         held = bare.with_load(phi)
         coulomb, viscous = (
-            self._value_per_joint(name, arm, 0.0) for name in ("friction", "damping")
+            self._values_per_joint(name, arm, 0.0) for name in ("friction", "damping")
         )
-        limit = self._value_per_joint("torque_limit", arm, arm.effort_limit)
+        limit = self._values_per_joint("torque_limit", arm, arm.effort_limit)
         joints = joint_parameters(held, home, coulomb, viscous, limit, self.weight_carried)
         numbers = np.zeros(NUM_DEVICE_PARAMETERS)
         numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = self.peak_force, self.peak_torque
-        numbers[IN_TASK_SPACE] = 1.0
+        numbers[IS_IN_TASK_SPACE] = 1.0
         return LeaderDevice(held, bare, joints, home, numbers)
 
     def _home_positions(self, arm: ArmModel) -> Array:
         if self.home:
-            return self._value_per_joint("home", arm, 0.0)
+            return self._values_per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
         return np.where(within, 0.0, arm.middle_positions)
 
-    def _value_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
+    def _values_per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(
-                f"has {len(values)} numbers, the arm has {n} joints",
+                f"{len(values)} values do not fit a leader arm with {n} joints",
                 where=f"master.leader.{name}",
                 remedy=f"give {n}, for {', '.join(arm.joint_names)}",
             )

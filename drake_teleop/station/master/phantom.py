@@ -29,7 +29,7 @@ from drake_teleop.common.vectors import (
     scale_vector,
     solve_by_cholesky,
 )
-from drake_teleop.station.master.numbers import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
+from drake_teleop.station.master.device_parameters import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
 
 GRAVITY = 9.81  # m/s^2, along -z_B
 
@@ -41,7 +41,7 @@ INERTIA_C = (0.959e-4, 0.959e-4, 0.0051e-4)
 INERTIA_BE = (11.09e-4, 10.06e-4, 0.591e-4)
 INERTIA_DF = (7.11e-4, 0.629e-4, 6.246e-4)
 INERTIA_BASE_YY = 11.87e-4
-TRANSMISSION = (13.3, 11.2, 11.2)  # P
+GEAR_RATIOS = (13.3, 11.2, 11.2)  # P
 MOTOR_INERTIA = 1.08e-6  # kg m^2, P
 WRIST_MASS = 0.15  # kg, three links, each with its centre of mass at E, estimate
 WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, estimate
@@ -55,7 +55,7 @@ FORCE_LIMIT = 37.5  # N, peak at the gimbal point, D
 WRIST_TORQUE_LIMIT = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
 
 #: Posture with R_BE = identity, in the middle of the workspace.
-HOME = np.zeros(6)
+HOME_POSTURE = np.zeros(6)
 
 # Coulomb friction is proportional to tanh(velocity / FRICTION_SPEED): a slower device creeps.
 FRICTION_SPEED = 0.01  # rad/s, estimate
@@ -63,17 +63,17 @@ FRICTION_SPEED = 0.01  # rad/s, estimate
 _STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
 _WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
 
-# M11 = _YAW_CONSTANT + _YAW_2 cos 2 q2 + _YAW_3 cos 2 q3 + 2 _COUPLING cos q2 sin q3.
-_YAW_CONSTANT = INERTIA_BASE_YY + 0.5 * (
+# M11 = _M11_CONSTANT + _M11_Q2 cos 2 q2 + _M11_Q3 cos 2 q3 + 2 _M23_MAX cos q2 sin q3.
+_M11_CONSTANT = INERTIA_BASE_YY + 0.5 * (
     sum(sum(inertia[1:]) for inertia in (INERTIA_A, INERTIA_BE, INERTIA_C, INERTIA_DF))
     + L1**2 * (MASS_A + MASS_C / 4)
     + L2**2 * MASS_A / 4
     + L3**2 * MASS_C
 )
-_YAW_2 = 0.5 * (
+_M11_Q2 = 0.5 * (
     INERTIA_BE[1] - INERTIA_BE[2] + INERTIA_C[1] - INERTIA_C[2] + L1**2 * (MASS_A + MASS_C / 4)
 )
-_YAW_3 = 0.5 * (
+_M11_Q3 = 0.5 * (
     INERTIA_A[1]
     - INERTIA_A[2]
     + INERTIA_DF[1]
@@ -81,26 +81,26 @@ _YAW_3 = 0.5 * (
     - L2**2 * MASS_A / 4
     - L3**2 * MASS_C
 )
-_COUPLING = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
+_M23_MAX = 0.5 * L1 * (L2 * MASS_A + L3 * MASS_C)
 _M22 = INERTIA_BE[0] + INERTIA_C[0] + L1**2 * (MASS_A + MASS_C / 4)
 _M33 = INERTIA_A[0] + INERTIA_DF[0] + L2**2 * MASS_A / 4 + L3**2 * MASS_C
-_MOTOR_1, _MOTOR_2, _MOTOR_3 = (gear**2 * MOTOR_INERTIA for gear in TRANSMISSION)
-_GRAVITY_2 = 0.5 * GRAVITY * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
-_GRAVITY_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
+_MOTOR_1, _MOTOR_2, _MOTOR_3 = (gear**2 * MOTOR_INERTIA for gear in GEAR_RATIOS)
+_GRAVITY_TORQUE_2 = 0.5 * GRAVITY * (2 * L1 * MASS_A + 2 * L5 * MASS_BE + L1 * MASS_C)
+_GRAVITY_TORQUE_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 
 @njit(cache=True)
-def _main_mass_matrix_into(q, M):
+def _main_axes_mass_matrix_into(q, M):
     M[:, :] = 0.0
     M[0, 0] = (
-        _YAW_CONSTANT
-        + _YAW_2 * math.cos(2.0 * q[1])
-        + _YAW_3 * math.cos(2.0 * q[2])
-        + 2.0 * _COUPLING * math.cos(q[1]) * math.sin(q[2])
+        _M11_CONSTANT
+        + _M11_Q2 * math.cos(2.0 * q[1])
+        + _M11_Q3 * math.cos(2.0 * q[2])
+        + 2.0 * _M23_MAX * math.cos(q[1]) * math.sin(q[2])
     )
     M[1, 1] = _M22
     M[2, 2] = _M33
-    M[1, 2] = M[2, 1] = -_COUPLING * math.sin(q[1] - q[2])
+    M[1, 2] = M[2, 1] = -_M23_MAX * math.sin(q[1] - q[2])
 
 
 @njit(cache=True)
@@ -128,7 +128,7 @@ def jacobian_into(q, J):
 @njit(cache=True)
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix (6, 6) with wrist, hand and motors into M; J is the Jacobian."""
-    _main_mass_matrix_into(q, M)
+    _main_axes_mass_matrix_into(q, M)
     M[0, 0] += _MOTOR_1
     M[1, 1] += _MOTOR_2
     M[2, 2] += _MOTOR_3
@@ -148,17 +148,17 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 def gravity_torque_into(q, out):
     weight = WRIST_MASS * GRAVITY
     out[0] = 0.0
-    out[1] = (_GRAVITY_2 + weight * L1) * math.cos(q[1])
-    out[2] = (_GRAVITY_3 + weight * L2) * math.sin(q[2])
+    out[1] = (_GRAVITY_TORQUE_2 + weight * L1) * math.cos(q[1])
+    out[2] = (_GRAVITY_TORQUE_3 + weight * L2) * math.sin(q[2])
     out[3:6] = 0.0
 
 
 @njit(cache=True)
 def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
     # Main axes: Christoffel symbols of their closed-form M.
-    coupling = _COUPLING * math.cos(q[1] - q[2])
-    yaw_2 = -2.0 * (_YAW_2 * math.sin(2.0 * q[1]) + _COUPLING * math.sin(q[1]) * math.sin(q[2]))
-    yaw_3 = -2.0 * (_YAW_3 * math.sin(2.0 * q[2]) - _COUPLING * math.cos(q[1]) * math.cos(q[2]))
+    coupling = _M23_MAX * math.cos(q[1] - q[2])
+    yaw_2 = -2.0 * (_M11_Q2 * math.sin(2.0 * q[1]) + _M23_MAX * math.sin(q[1]) * math.sin(q[2]))
+    yaw_3 = -2.0 * (_M11_Q3 * math.sin(2.0 * q[2]) - _M23_MAX * math.cos(q[1]) * math.cos(q[2]))
     torque[0] -= (yaw_2 * v[1] + yaw_3 * v[2]) * v[0]
     torque[1] -= coupling * v[2] * v[2] - 0.5 * yaw_2 * v[0] * v[0]
     torque[2] -= -coupling * v[1] * v[1] - 0.5 * yaw_3 * v[0] * v[0]
@@ -199,7 +199,7 @@ def _end_stop_torque(angle, rate, lower, upper, stiffness, damping):
 
 
 @njit(cache=True)
-def _add_friction_and_stops(q, v, coulomb, viscous, torque):
+def _add_friction_and_end_stops(q, v, coulomb, viscous, torque):
     for i in range(6):
         torque[i] -= coulomb[i] * math.tanh(v[i] / FRICTION_SPEED) + viscous[i] * v[i]
         stiffness = _STOP_STIFFNESS if i < 3 else _WRIST_STOP_STIFFNESS
@@ -234,7 +234,7 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
         for k in range(6):
             vdot[i] += J[k, i] * hand_wrench[k]
     _subtract_coriolis(q, v, J, device[HAND_MASS], device[HAND_INERTIA], vdot)
-    _add_friction_and_stops(q, v, device[COULOMB], device[VISCOUS], vdot)
+    _add_friction_and_end_stops(q, v, device[COULOMB], device[VISCOUS], vdot)
     solve_by_cholesky(M, vdot, 6)
 
 
@@ -293,7 +293,7 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     cosine = (reach**2 + z**2 - L1**2 - L2**2) / (2 * L1 * L2)
     if abs(cosine) > 1:
         raise DrakeTeleopError(
-            f"the master cannot reach ({x:g}, {y:g}, {z:g}) m",
+            f"the Phantom's stylus cannot reach ({x:g}, {y:g}, {z:g}) m",
             where="pose_master",
             remedy="choose a start pose inside the device's workspace, in its base frame B",
         )
@@ -310,7 +310,7 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6)."""
+    """Return the joint angles of `phantom.sdf` for q (..., 6): its third is q3 - q2."""
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
     return serial
@@ -327,14 +327,14 @@ def check_limits(q: NDArray[np.float64]) -> None:
     for i in range(6):
         if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:
             raise DrakeTeleopError(
-                f"joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
+                f"Phantom joint {i + 1} would be at {np.degrees(q[i]):.1f} degrees, its range is "
                 f"{np.degrees(JOINT_LOWER[i]):.1f} to {np.degrees(JOINT_UPPER[i]):.1f}",
                 where="pose_master",
                 remedy="choose a start pose inside the device's workspace",
             )
     if not FIVE_BAR_RANGE[0] - margin <= q[1] - q[2] <= FIVE_BAR_RANGE[1] + margin:
         raise DrakeTeleopError(
-            f"q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, its range is -55 to 65",
+            f"Phantom angle q2 - q3 would be {np.degrees(q[1] - q[2]):.1f} degrees, not -55 to 65",
             where="pose_master",
             remedy="choose a start pose inside the device's workspace",
         )

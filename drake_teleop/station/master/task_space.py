@@ -15,16 +15,16 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross, plus, scale_vector
-from drake_teleop.station.master.numbers import (
-    CENTRE_OF_WORKSPACE,
+from drake_teleop.station.master.device_parameters import (
     COULOMB,
-    HALF_SIZE,
+    HALF_WORKSPACE,
     HAND_INERTIA,
     HAND_MASS,
     INERTIA,
     MASS,
     MAX_ROTATION,
     VISCOUS,
+    WORKSPACE_CENTRE,
 )
 
 # Coulomb friction is proportional to tanh(speed / FRICTION_SPEED): a slower device creeps.
@@ -85,7 +85,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     drag = _friction_factor(v[:3], device[COULOMB.start], device[VISCOUS.start], FRICTION_SPEED)
     for i in range(3):
         beyond = _penetration_into_end_stop(
-            q[i] - device[CENTRE_OF_WORKSPACE][i], device[HALF_SIZE][i]
+            q[i] - device[WORKSPACE_CENTRE][i], device[HALF_WORKSPACE][i]
         )
         stop = _end_stop_force(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
@@ -155,8 +155,8 @@ def inverse_kinematics(
 def _outside_workspace(
     q: NDArray[np.float64], device: NDArray[np.float64], margin: float
 ) -> NDArray[np.bool_]:
-    centre = np.append(device[CENTRE_OF_WORKSPACE], np.zeros(3))
-    return np.abs(q - centre) > np.append(device[HALF_SIZE], device[MAX_ROTATION]) + margin
+    centre = np.append(device[WORKSPACE_CENTRE], np.zeros(3))
+    return np.abs(q - centre) > np.append(device[HALF_WORKSPACE], device[MAX_ROTATION]) + margin
 
 
 def is_at_end_stop(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -168,13 +168,13 @@ def is_at_end_stop(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArr
 def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
     if _outside_workspace(q, device, 1e-9).any():
         low, high = (
-            device[CENTRE_OF_WORKSPACE] - device[HALF_SIZE],
-            device[CENTRE_OF_WORKSPACE] + device[HALF_SIZE],
+            device[WORKSPACE_CENTRE] - device[HALF_WORKSPACE],
+            device[WORKSPACE_CENTRE] + device[HALF_WORKSPACE],
         )
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
         turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[MAX_ROTATION]))
         raise DrakeTeleopError(
-            f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, turned by "
+            f"the grip would be at ({', '.join(f'{x:.3g}' for x in q[:3])}) m, yaw, pitch, roll "
             f"({', '.join(f'{x:.0f}' for x in np.degrees(q[3:]))}) degrees; the device's workspace "
             f"is {axes} m, +-({turns}) degrees",
             where="pose_master",

@@ -46,7 +46,7 @@ DECISION_PERIOD_S = 0.005
 # Indices of a packed task.
 _TASK_KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _TARGET_RADIUS, _DWELL = 0, 1, 2, 3, 6, 9, 10
 _STANDOFF, _FORCE, _TOLERANCE, _DEPTH, _TASK_SIZE = 11, 12, 13, 14, 15
-_RANDOM_STREAM = 2  # random stream; the network's lines use others
+_OPERATOR_RANDOM_STREAM = 2  # random stream; the network's lines use others
 # Indices of a packed person: training, movement and perception.
 _SCALE, _FORCE_GAIN, _VISION_WAIT, _FORCE_WAIT, _RANDOM_KEY = 0, 1, 2, 3, 4
 _ACCELERATION, _MIN_DURATION, _NOISE, _APPROACH_SPEED, _GENTLE_FORCE = range(5, 10)
@@ -78,7 +78,7 @@ def pack_operator_parameters(
 ) -> Array:
     there_and_back = training.forward + training.backward + _EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
-    key = float(random_bits(np.uint64(training.seed % 2**64), _RANDOM_STREAM))
+    key = float(random_bits(np.uint64(training.seed % 2**64), _OPERATOR_RANDOM_STREAM))
     return np.array(
         [
             *(training.translation_scale, training.force_gain),
@@ -143,7 +143,7 @@ _MAX_PENETRATION_M = 0.03
 _MIN_TRUST = 0.1  # trust with vision only, estimate
 # Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_STIFFNESS, _MIN_STIFFNESS, _MAX_STIFFNESS = 2000.0, 200.0, 50000.0
-_MAX_PRESS_M = 0.003  # m, longest correction of the force, at the tool, estimate
+_MAX_PRESS_CORRECTION_M = 0.003  # m, longest correction of the force, at the tool, estimate
 _STUCK_FORCE_SHARE = 0.5  # share of the push force above which the peg is stuck, estimate
 # Compliance to lateral force [N/m], largest yield [m], estimates.
 _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M = 5000.0, 0.0015
@@ -159,7 +159,7 @@ def initial_memory() -> Array:
 
 
 @njit(cache=True)
-def _convert_to_hand(person, vector_W, out):
+def _convert_to_hand_motion(person, vector_W, out):
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
@@ -167,7 +167,7 @@ def _convert_to_hand(person, vector_W, out):
 
 
 @njit(cache=True)
-def _random_number(person, step, draw):
+def _draw_normal_number(person, step, draw):
     return random_normal(np.uint64(person[_RANDOM_KEY]), 16 * step + draw)
 
 
@@ -178,27 +178,26 @@ def observe_tool_into(person, step, displacement_W, seen_W):
     Its random error is constant for 50 steps, a fixation of the eyes.
     """
     for i in range(3):
-        noise = person[_VISION_NOISE] * _random_number(person, step // _FIXATION_STEPS, 4 + i)
+        noise = person[_VISION_NOISE] * _draw_normal_number(person, step // _FIXATION_STEPS, 4 + i)
         seen_W[i] = displacement_W[i] + noise
 
 
 @njit(cache=True)
 def _plan_submovement(person, memory, step, time, error_W):
     change = np.empty(3)
-    _convert_to_hand(person, error_W, change)
+    _convert_to_hand_motion(person, error_W, change)
     length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
     # The peak acceleration of a minimum-jerk movement determines its shortest duration.
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person[_ACCELERATION])
     duration = max(duration, person[_MIN_DURATION])
     for i in range(3):
-        change[i] += person[_NOISE] * length * _random_number(person, step, i)
+        change[i] += person[_NOISE] * length * _draw_normal_number(person, step, i)
     plan_move(memory, time, duration, change, np.zeros(3))
     return duration
 
 
 @njit(cache=True)
-def _contact_force_along_axis(task, person, felt):
-    """Return the contact force on the tool against the axis [N]."""
+def _contact_force_against_axis(task, person, felt):
     along = 0.0
     for i in range(3):
         axis_B = 0.0
@@ -230,14 +229,14 @@ def _enter_phase(state, memory, phase, ready):
 
 @njit(cache=True)
 def update_decision(task, person, time, seen_W, felt, state, memory):
-    """Update the operator's decisions by one step of `PERIOD`.
+    """Update the operator's decisions by one step of `DECISION_PERIOD_S`.
 
     Args:
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
         felt: (5,) output of `update_perception_into`, delayed by the reaction time.
         state: (5,) phase; 1 done or -1 given up; 1 while contact is detected; detection threshold
             [N]; trust (0.1 to 1) in detecting contact; updated.
-        memory: (MEMORY,) from `initial_memory`, updated.
+        memory: (MEMORY_SIZE,) from `initial_memory`, updated.
     """
     step = int(memory[_STEP])
     memory[_STEP] += 1.0
@@ -275,22 +274,22 @@ def update_decision(task, person, time, seen_W, felt, state, memory):
 
 
 @njit(cache=True)
-def _seen_target(task, person, out):
+def _perceived_target_into(task, person, out):
     depth = (
         0.0
         if task[_TASK_KIND] == KIND_REACH
-        else person[_DEPTH_ERROR] * _random_number(person, 0, 15)
+        else person[_DEPTH_ERROR] * _draw_normal_number(person, 0, 15)
     )
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
         if task[_TASK_KIND] == KIND_INSERT and i < 2:
-            out[i] += person[_AIM_ERROR] * _random_number(person, 0, 13 + i)
+            out[i] += person[_AIM_ERROR] * _draw_normal_number(person, 0, 13 + i)
 
 
 @njit(cache=True)
-def _seen_depth(task, person, seen_W):
+def _perceived_depth(task, person, seen_W):
     target, beyond = np.empty(3), -task[_STANDOFF]
-    _seen_target(task, person, target)
+    _perceived_target_into(task, person, target)
     for i in range(3):
         beyond += (seen_W[i] - target[i]) * task[_AXIS + i]
     return beyond
@@ -299,7 +298,7 @@ def _seen_depth(task, person, seen_W):
 @njit(cache=True)
 def _move_by_vision(task, person, step, time, seen_W, state, memory):
     error = np.empty(3)
-    _seen_target(task, person, error)
+    _perceived_target_into(task, person, error)
     off = 0.0
     for i in range(3):
         error[i] -= seen_W[i]
@@ -323,7 +322,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
 @njit(cache=True)
 def _approach_contact(task, person, time, seen_W, felt, state, memory):
     if task[_TASK_KIND] == KIND_INSERT:
-        if state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_stuck(task, person, felt):
+        if state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt):
             plan_stop(memory, time)
             _enter_phase(
                 state, memory, PHASE_SEARCHING_SLOT, time + STOP_DURATION_S + person[_FORCE_WAIT]
@@ -333,13 +332,13 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
         plan_stop(memory, time)
         _enter_phase(state, memory, PHASE_STOPPING, time + STOP_DURATION_S + person[_FORCE_WAIT])
         return
-    if _seen_depth(task, person, seen_W) > task[_DEPTH] + _MAX_PENETRATION_M:
+    if _perceived_depth(task, person, seen_W) > task[_DEPTH] + _MAX_PENETRATION_M:
         _finish_task(state, memory, time, -1.0)
     elif time >= memory[_NEXT_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         for i in range(3):
             velocity_W[i] = state[TRUST_INDEX] * person[_APPROACH_SPEED] * task[_AXIS + i]
-        _convert_to_hand(person, velocity_W, speed)
+        _convert_to_hand_motion(person, velocity_W, speed)
         plan = memory[PLAN_START : PLAN_START + PLAN_SIZE]
         for i in range(3):
             change[i] = 0.5 * _APPROACH_UPDATE_S * (evaluate_plan(plan, time, i)[1] + speed[i])
@@ -348,29 +347,28 @@ def _approach_contact(task, person, time, seen_W, felt, state, memory):
 
 
 @njit(cache=True)
-def _perceived_force(task, person, felt, memory):
-    error = person[_WEBER_FRACTION] * _random_number(
+def _perceived_contact_force(task, person, felt, memory):
+    error = person[_WEBER_FRACTION] * _draw_normal_number(
         person, int(memory[_NEXT_TIME] / DECISION_PERIOD_S), 3
     )
-    return (1.0 + error) * _contact_force_along_axis(task, person, felt)
+    return (1.0 + error) * _contact_force_against_axis(task, person, felt)
 
 
 @njit(cache=True)
-def _press_displacement(task, memory, force):
-    """Return the displacement towards the set force along the axis [m]; update the stiffness."""
+def _displacement_to_set_force(task, memory, force):
     effect = force - memory[_LAST_FORCE]
     if effect * memory[_LAST_MOVE] > 0.0:
         stiffness = 0.5 * (memory[_STIFFNESS] + effect / memory[_LAST_MOVE])
         memory[_STIFFNESS] = min(max(stiffness, _MIN_STIFFNESS), _MAX_STIFFNESS)
     move = (task[_FORCE] - force) / memory[_STIFFNESS]
-    move = min(max(move, -_MAX_PRESS_M), _MAX_PRESS_M)
+    move = min(max(move, -_MAX_PRESS_CORRECTION_M), _MAX_PRESS_CORRECTION_M)
     memory[_LAST_FORCE], memory[_LAST_MOVE] = force, move
     return move
 
 
 @njit(cache=True)
 def _control_force(task, person, step, time, felt, state, memory):
-    force = _perceived_force(task, person, felt, memory)
+    force = _perceived_contact_force(task, person, felt, memory)
     error = abs(task[_FORCE] - force)
     met = _is_criterion_met(
         memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE]
@@ -378,14 +376,14 @@ def _control_force(task, person, step, time, felt, state, memory):
     if met and time - memory[_MET_SINCE] >= task[_DWELL]:
         _finish_task(state, memory, time, 1.0)
     elif not met and time >= memory[_NEXT_TIME]:
-        move = _press_displacement(task, memory, force)
+        move = _displacement_to_set_force(task, memory, force)
         duration = _plan_submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
         memory[_NEXT_TIME] = time + duration + person[_FORCE_WAIT]
 
 
 @njit(cache=True)
 def _lateral_force_into(task, person, felt, out):
-    along, size = _contact_force_along_axis(task, person, felt), 0.0
+    along, size = _contact_force_against_axis(task, person, felt), 0.0
     for i in range(3):
         out[i] = along * task[_AXIS + i]
         for k in range(3):
@@ -396,23 +394,23 @@ def _lateral_force_into(task, person, felt, out):
 
 
 @njit(cache=True)
-def _is_stuck(task, person, felt):
+def _is_tool_stuck(task, person, felt):
     limit = _STUCK_FORCE_SHARE * task[_FORCE]
     sideways = _lateral_force_into(task, person, felt, np.empty(3))
-    return _contact_force_along_axis(task, person, felt) >= limit or sideways >= limit
+    return _contact_force_against_axis(task, person, felt) >= limit or sideways >= limit
 
 
 @njit(cache=True)
 def _search_slot(task, person, step, time, seen_W, felt, state, memory):
-    force = _perceived_force(task, person, felt, memory)
-    if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_stuck(task, person, felt)):
+    force = _perceived_contact_force(task, person, felt, memory)
+    if not (state[CONTACT_PERCEIVED_INDEX] > 0.0 and _is_tool_stuck(task, person, felt)):
         _enter_phase(state, memory, PHASE_APPROACHING, time)
         return
-    deep = _seen_depth(task, person, seen_W) >= _DEPTH_SHARE_AT_FLOOR * task[_DEPTH]
+    deep = _perceived_depth(task, person, seen_W) >= _DEPTH_SHARE_AT_FLOOR * task[_DEPTH]
     if deep and abs(force - task[_FORCE]) <= _STUCK_FORCE_SHARE * task[_FORCE]:
         _enter_phase(state, memory, PHASE_STOPPING, time)
         return
-    move, push = np.empty(3), _press_displacement(task, memory, force)
+    move, push = np.empty(3), _displacement_to_set_force(task, memory, force)
     sideways = _lateral_force_into(task, person, felt, move)
     if sideways >= state[FORCE_LIMIT_INDEX] / person[_FORCE_GAIN]:
         share = min(1.0 / _LATERAL_YIELD_STIFFNESS, _MAX_LATERAL_YIELD_M / sideways)

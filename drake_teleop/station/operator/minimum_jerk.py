@@ -41,13 +41,13 @@ def add_plan_into(memory, time, pose, twist):
 
 
 @njit(cache=True)
-def plan_move(memory, time, length, change, end_speed):
-    """Plan a minimum-jerk motion by `change` (3,) [m] in the time `length` [s].
+def plan_move(memory, time, duration, change, end_speed):
+    """Plan a minimum-jerk motion by `change` (3,) [m] in `duration` [s].
 
     It continues the present motion and ends with the velocity `end_speed` (3,), without
     acceleration.
     """
-    plan, h = memory[PLAN_START : PLAN_START + PLAN_SIZE], length
+    plan, h = memory[PLAN_START : PLAN_START + PLAN_SIZE], duration
     for i in range(3):
         x, v, a = evaluate_plan(plan, time, i)
         v, a, w, d = v * h, a * h * h, end_speed[i] * h, change[i]
@@ -61,7 +61,7 @@ def plan_move(memory, time, length, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
-    """Plan a stop of the hand within `STOP` seconds."""
+    """Plan a stop of the hand within `STOP_DURATION_S`."""
     plan, change = memory[PLAN_START : PLAN_START + PLAN_SIZE], np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP_DURATION_S * evaluate_plan(plan, time, i)[1]

@@ -61,11 +61,11 @@ GRIP_IMPEDANCES = {
 @settings
 @dataclass
 class MinimumJerk:
-    """Displacement on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
+    """Minimum-jerk move; its share at u = (t - t_start) / duration is 10 u^3 - 15 u^4 + 6 u^5."""
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
-    translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "offset in B")
+    translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "displacement in B")
     rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the offset, about axes of B"
     )
@@ -74,7 +74,7 @@ class MinimumJerk:
 @settings
 @dataclass
 class Sine:
-    """Oscillation with minimum-jerk ramps at both ends (C2).
+    """Oscillation with minimum-jerk ramps at both ends.
 
     Between the ramps the offset is amplitude * sin(2 pi frequency (t - t_start) + phase).
     """
@@ -93,7 +93,7 @@ class Sine:
 @settings
 @dataclass
 class OperatorConfig:
-    """Grip, intended motion and task of the operator."""
+    """Settings of the operator: grip, intended motion and task."""
 
     grip: str = choice("medium", tuple(GRIP_IMPEDANCES), "stiffness, damping and mass of the hand")
     intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
@@ -112,8 +112,8 @@ class OperatorConfig:
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
     """Return the segments of the intended motion as an array (n, 12) for compiled functions.
 
-    Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
-    (3), rotation (3).
+    Columns: start and length of the ramp in and of the ramp out, 2 pi frequency, phase,
+    translation (3), rotation (3).
     """
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
@@ -173,7 +173,7 @@ def intended_motion_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write the pose (7,) with unit quaternion into `out`; return whether the input is valid."""
+    """Write the pose (7,) with unit quaternion into `out`; return whether both inputs are valid."""
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -190,7 +190,7 @@ def unit_pose_into(pose, twist, out):
 
 
 @njit(cache=True)
-def _limit_length(vector, limit):
+def _limit_vector_length(vector, limit):
     length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
     if length > limit:
         for k in range(3):
@@ -213,8 +213,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit_length(wrench[:3], _MAX_FORCE_N)
-    _limit_length(wrench[3:], _MAX_TORQUE_NM)
+    _limit_vector_length(wrench[:3], _MAX_FORCE_N)
+    _limit_vector_length(wrench[3:], _MAX_TORQUE_NM)
 
 
 @njit(cache=True)
@@ -292,8 +292,8 @@ class Operator(LeafSystem):
         - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold of
           the rendered force [N], trust (with a task)
 
-    The intent is relative to `start` (7,), X_BE. A task requires training, the slave's arm, and
-    `tip` (6,), the position of the tool's tip in S and at the start in W [m].
+    The intended motion is relative to the pose X_BE `start` (7,). A task requires training, the
+    slave's arm, and `tip` (6,), the position of the tool's tip in S and at the start in W [m].
     """
 
     __slots__ = ONE_DICT
@@ -322,7 +322,7 @@ class Operator(LeafSystem):
         moving = self._declare_intended_motion() | {self.time_ticket()}
         if config.task is not None:
             if training is None or arm is None or tip is None:
-                raise ValueError("a task needs training, arm and tip")
+                raise ValueError("a task requires the arguments training, arm and tip")
             moving.add(self._declare_task(config, config.task, training, arm, tip))
         calc, held = weak_callback(self._calc_wrench), {self._pose.ticket(), self._twist.ticket()}
         self._wrench = self.DeclareVectorOutputPort("hand_wrench_E", 6, calc, held | moving)
@@ -386,7 +386,7 @@ class Operator(LeafSystem):
             *state,
         )
 
-    def _discrete_memory(self, context: Context) -> NDArray[np.float64]:
+    def _decision_memory(self, context: Context) -> NDArray[np.float64]:
         if not self._has_task:
             return self._no_memory
         return context.get_discrete_state(self._groups[1]).value()
@@ -408,7 +408,7 @@ class Operator(LeafSystem):
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _hand_wrench_at(
             *self._evaluate_intended_motion(context),
-            self._discrete_memory(context),
+            self._decision_memory(context),
             context.get_time(),
             self._impedance,
             self._intent_pose,
@@ -422,7 +422,7 @@ class Operator(LeafSystem):
         time, pose, memory = (
             context.get_time(),
             output.get_mutable_value(),
-            self._discrete_memory(context),
+            self._decision_memory(context),
         )
         _intended_or_planned_motion_into(
             *self._evaluate_intended_motion(context), memory, time, pose, self._intent_twist

@@ -1,7 +1,8 @@
 """Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
-A Kalman filter estimates the expected force m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 without
-contact (`docs/operator.md`). A larger force beyond the threshold is contact.
+A Kalman filter estimates mass m, damping b, friction c and offset u_0 of the force without contact,
+m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0 (`docs/operator.md`). A larger difference of u
+from it than the threshold is contact.
 """
 
 import math
@@ -19,8 +20,8 @@ Array = NDArray[np.float64]
 
 # Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
 _PARAMETER_DRIFT_STD = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
-_INITIAL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
-_NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
+_INITIAL_PARAMETER_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
+_FORCE_NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
 _FRICTION_SPEED = 0.01  # m/s, v_0, about the value of the device's friction
 _NUM_PARAMETERS = 6
 
@@ -44,8 +45,8 @@ class Perception:
     absolute_threshold: float = quantity(0.06, "N", 1e-3, 10.0, "smallest detectable force")
     masking_time: float = quantity(0.3, "s", 1e-3, 10.0, "decay time constant of masking")
     bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "bandwidth of perceived force and motion")
-    reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "from a force to the hand's reaction")
-    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "from vision to the hand's reaction")
+    reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "time from a force to the hand's reaction")
+    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "time from vision to the hand's reaction")
     vision_noise: float = quantity(
         0.5e-3, "m", 0.0, 0.1, "standard deviation of a perceived position, at the tool"
     )
@@ -57,7 +58,7 @@ class Perception:
     )
 
     def compiled_parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N], and decay and smoothing factors per step."""
+        """Return (4,) Weber fraction, threshold [N], decay and smoothing factors per `dt` [s]."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
@@ -65,7 +66,7 @@ class Perception:
 
 def initial_memory() -> Array:
     memory = np.zeros(MEMORY_SIZE)
-    memory[_COVARIANCE_START:] = np.diag(_INITIAL_STD**2).ravel()
+    memory[_COVARIANCE_START:] = np.diag(_INITIAL_PARAMETER_STD**2).ravel()
     return memory
 
 
@@ -114,7 +115,7 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
     noticed = attentive and math.sqrt(excess_square) >= out[THRESHOLD_INDEX]
     out[CONTACT_NOTICED_INDEX] = 1.0 if noticed else 0.0
     if not noticed:
-        _update_expectation(
+        _update_expected_force(
             theta,
             memory[_COVARIANCE_START:].reshape(_NUM_PARAMETERS, _NUM_PARAMETERS),
             rows,
@@ -124,13 +125,13 @@ def update_perception_into(memory, parameters, dt, hand_mass, hand_force, veloci
 
 
 @njit(cache=True)
-def _update_expectation(theta, P, rows, excess, dt):
+def _update_expected_force(theta, P, rows, excess, dt):
     gain = np.empty(_NUM_PARAMETERS)
     for j in range(_NUM_PARAMETERS):
         P[j, j] += _PARAMETER_DRIFT_STD[j] * _PARAMETER_DRIFT_STD[j] * dt
     before = theta.copy()
     for i in range(3):
-        residual, variance = excess[i], _NOISE_DENSITY * _NOISE_DENSITY / dt
+        residual, variance = excess[i], _FORCE_NOISE_DENSITY * _FORCE_NOISE_DENSITY / dt
         for j in range(_NUM_PARAMETERS):
             residual -= rows[i, j] * (theta[j] - before[j])
             gain[j] = 0.0
@@ -180,7 +181,7 @@ def perceive_contact(
     steps = np.diff(times)
     if not len(steps) or steps.min() <= 0.0:
         raise DrakeTeleopError(
-            "is not increasing", where="t", remedy="give at least two samples in order of time"
+            "times do not increase", where="t", remedy="give at least two samples in order of time"
         )
     dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
     parameters = perception.compiled_parameters(dt)

@@ -11,9 +11,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 @dataclass
 class _Task:
     t_start: float = quantity(0.5, "s", 0.0, 1e6, "start, from the start of the simulation")
-    timeout: float = quantity(10.0, "s", 0.1, 3600.0, "after which the operator gives up")
+    timeout: float = quantity(10.0, "s", 0.1, 3600.0, "time after which the operator gives up")
     translation: list[float] = quantity(
-        [0.0, 0.0, -0.1], "m", -2.0, 2.0, "from the tool at the start to the target, in W"
+        [0.0, 0.0, -0.1], "m", -2.0, 2.0, "displacement from the tool's start to the target, in W"
     )
 
     @property
@@ -25,10 +25,10 @@ class _Task:
 @settings
 @dataclass
 class Reach(_Task):
-    """Task: move the tool's tip into a sphere in free space and keep it there (Fitts)."""
+    """Task of Fitts: move the tool's tip into a sphere in free space and keep it there."""
 
     width: float = quantity(0.01, "m", 5e-4, 0.5, "diameter of the target")
-    dwell: float = quantity(0.3, "s", 0.0, 10.0, "time in the target")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "required time in the target")
 
 
 @settings
@@ -39,7 +39,7 @@ class Touch(_Task):
     standoff: float = quantity(
         0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
     )
-    dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest after the stop")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest after the stop")
 
 
 @settings
@@ -58,15 +58,15 @@ class Press(_Task):
 @settings
 @dataclass
 class Insert(_Task):
-    """Task: insert the tool into a slot whose mouth is the target, and push it to the floor."""
+    """Task: insert the tool into a slot with its mouth at the target, down to the slot's floor."""
 
-    timeout: float = quantity(20.0, "s", 0.1, 3600.0, "after which the operator gives up")
+    timeout: float = quantity(20.0, "s", 0.1, 3600.0, "time after which the operator gives up")
     standoff: float = quantity(
         0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
     )
     depth: float = quantity(0.04, "m", 1e-3, 0.5, "depth of the slot")
-    push: float = quantity(10.0, "N", 0.1, 500.0, "force down, tool in slot")
-    dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest on the floor")
+    push: float = quantity(10.0, "N", 0.1, 500.0, "downward force of the tool in the slot")
+    dwell: float = quantity(0.3, "s", 0.0, 10.0, "time at rest on the floor")
 
 
 Task: TypeAlias = Reach | Touch | Press | Insert
@@ -105,11 +105,12 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Raise a DrakeTeleopError if the target's radius or standoff contains the tool's start."""
+    """Raise a DrakeTeleopError if the tool starts within radius or standoff of the target."""
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:
         raise DrakeTeleopError(
-            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m",
+            f"the target is {task.distance:g} m from the tool's start, not above {least:g} m (its "
+            "radius or standoff)",
             where=f"{where}.translation",
             remedy="choose a target farther from the tool's start",
         )

@@ -7,26 +7,26 @@ from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 
-NUM_SUMS = 5  #: number of sums of the fit; all are 0 at the start
+NUM_FIT_SUMS = 5  #: number of sums of the fit; all are 0 at the start
 # Relative increase of the squared speed changes: where speed and displacement are proportional, the
 # fit then assigns the force to stiffness.
-_RIDGE = 0.05
+_RIDGE_SHARE = 0.05
 
 
 @njit(cache=True)
 def update_contact_fit(sums, force_change, displacement, speed_change, keep):
-    """Add one displacement [m] to the fit; return stiffness [N/m] and damping [N s/m].
+    """Add one `displacement` [m] to the fit; return stiffness [N/m] and damping [N s/m].
 
-    `sums` (NUM_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
+    `sums` (NUM_FIT_SUMS,) is updated; `keep`, 0 to 1, is the weight of its previous values.
     """
-    for i in range(NUM_SUMS):
+    for i in range(NUM_FIT_SUMS):
         sums[i] *= keep
     sums[0] += displacement * displacement
     sums[1] += displacement * speed_change
     sums[2] += speed_change * speed_change
     sums[3] += force_change * displacement
     sums[4] += force_change * speed_change
-    square = (1.0 + _RIDGE) * sums[2]
+    square = (1.0 + _RIDGE_SHARE) * sums[2]
     determinant = sums[0] * square - sums[1] * sums[1]
     damping = sums[0] * sums[4] - sums[1] * sums[3]
     if not damping > 0.0:  # after this branch the determinant is not 0
@@ -38,8 +38,9 @@ def update_contact_fit(sums, force_change, displacement, speed_change, keep):
 def remove_slip_steps(displayed, component, explained, share, max_slip):
     """Return the contact force to render [N], without the steps that stick-slip friction causes.
 
-    `component` [N] is the measured force. Its changes that depth and speed explain (`explained`)
-    are rendered at once; of the others only a `share`, up to the size `max_slip`.
+    `displayed` [N] is the last rendered force, `component` [N] the measured force. Its change
+    `explained` by depth and speed is rendered at once. The remaining difference, at most
+    `max_slip`, is reduced by `share`.
     """
     displayed += explained
     displayed += min(share, 1.0) * (component - displayed)
@@ -48,7 +49,7 @@ def remove_slip_steps(displayed, component, explained, share, max_slip):
 
 @njit(cache=True)
 def force_change_by_slip(force_change, largest_change, max_slip):
-    """Return the part of a force change [N] that a slip may cause, at most `max_slip`.
+    """Return the part of a force change [N] that slip may cause, at most `max_slip`.
 
     `largest_change` [N] is the change that the largest stiffness would cause.
     """

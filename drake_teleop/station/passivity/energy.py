@@ -30,7 +30,7 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
-        pair: wrench of step k: `held` f_(k-1), `backward` f_k or `mean` of both.
+        pair: wrench over the step to k: `held` f_(k-1), `backward` f_k or `mean` of both.
 
     Raises:
         DrakeTeleopError: for an unknown pair or arrays of wrong shape.
@@ -44,17 +44,17 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     wrench, pose = np.ascontiguousarray(wrench, float), np.ascontiguousarray(pose, float)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or pose.shape != (len(wrench), 7):
         raise DrakeTeleopError(
-            f"wrench has the shape {wrench.shape} and pose {pose.shape}",
+            f"expected shapes (N, 6) and (N, 7), found {wrench.shape} and {pose.shape}",
             where="wrench, pose",
-            remedy="give (N, 6) and (N, 7)",
+            remedy="give one wrench and one pose per sample",
         )
     work = np.zeros((len(wrench), 2))
-    _work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)
+    _accumulate_work_into(wrench, pose, WEIGHT_OF_PRESENT_WRENCH[pair], work)
     return work
 
 
 @njit(cache=True)
-def _work_into(wrench, pose, share, work):
+def _accumulate_work_into(wrench, pose, share, work):
     dx, f = np.zeros(6), np.zeros(6)
     for k in range(1, len(wrench)):
         pose_difference_into(pose[k], pose[k - 1], dx)
@@ -74,10 +74,10 @@ def created_energy(energy: Array) -> Array:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Energy balance of a passivity method at one end of the channel, each (..., 2) [J].
+    """Energy balance at one channel end, each (..., 2) for translation and rotation [J].
 
     Attributes:
-        stored: energy that this end may still release, for translation and rotation.
+        stored: energy that this end may still release.
         received, sent: total energy received from, and sent to, the other end.
         lost: energy removed from the loop (damper, overflow, withheld work).
     """
@@ -89,13 +89,15 @@ class EnergyBalance:
 
 
 def energy_balance(memory: Array) -> EnergyBalance:
-    """Return the energy balance of one end's memory (..., MEMORY), 0 for methods without one.
+    """Return the energy balance in one end's `memory` (..., MEMORY_SIZE), 0 if a method has none.
 
     A wrong shape raises a DrakeTeleopError.
     """
     if memory.shape[-1] != MEMORY_SIZE:
         raise DrakeTeleopError(
-            f"has the shape {memory.shape}", where="memory", remedy=f"give (..., {MEMORY_SIZE})"
+            f"expected shape (..., {MEMORY_SIZE}), found {memory.shape}",
+            where="memory",
+            remedy="give the memory of one channel end",
         )
     stored, received, sent, lost = (
         memory[..., places].copy()

@@ -1,4 +1,4 @@
-"""Passivity method "local_force_limit": bounds force and torque rendered at the hand.
+"""Passivity method "force_limit": bounds force and torque rendered at the hand.
 
 Without an energy balance, an unstable loop stays unstable, but its limit cycle is bounded.
 """
@@ -16,26 +16,26 @@ from drake_teleop.station.passivity import none
 from drake_teleop.station.passivity.memory import HELD_WRENCH, MOTION_SCALE, own_parameters
 from drake_teleop.station.passivity.packet import limit_group
 
-_LOCAL_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
+_HAND_WRENCH_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
 
 
 @settings
 @dataclass
 class ForceLimitConfig:
-    """Parameters of the local force limit."""
+    """Parameters of the passivity method "force_limit"."""
 
     force: float = quantity(1.0, "N", 0.0, 1e4, "largest force at the hand")
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[_LOCAL_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
+        p[_HAND_WRENCH_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
-        limit_group(wrench, g, p[_LOCAL_LIMIT][g])
+        limit_group(wrench, g, p[_HAND_WRENCH_LIMIT][g])
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
 
 

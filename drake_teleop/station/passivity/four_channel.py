@@ -16,9 +16,9 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    DAMPING,
     HELD_WRENCH,
-    STIFFNESS,
+    SERVO_D,
+    SERVO_K,
     own_memory,
     own_parameters,
 )
@@ -34,10 +34,10 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters; pairs are for translation and rotation.
-_places = own_parameters()
-_SPRING, _DAMPER = _places.vector(2), _places.vector(2)
-_SLAVE_FEEDBACK, _HAND_FEEDBACK = _places.number(), _places.number()
-_DIFFERENCE = own_memory().vector(6)
+_layout = own_parameters()
+_SPRING, _DAMPER = _layout.vector(2), _layout.vector(2)
+_SLAVE_FEEDBACK, _HAND_FEEDBACK = _layout.number(), _layout.number()
+_POSE_DIFFERENCE = own_memory().vector(6)
 
 
 @settings
@@ -53,7 +53,7 @@ class FourChannelConfig:
         "stiffness of C_m, the spring between the hand and the received pose of the slave",
     )
     damping: list[float] = quantity(
-        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damping of C_m, likewise"
+        [10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "damper of C_m, parallel to its spring"
     )
     slave_feedback: float = quantity(
         0.0,
@@ -77,8 +77,7 @@ class FourChannelConfig:
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Compute the rendered wrench and the packet, which contains the hand's measured wrench."""
-    difference = memory[_DIFFERENCE]
+    difference = memory[_POSE_DIFFERENCE]
     difference[:] = 0.0
     connected = has_arrived(received)
     if connected:
@@ -98,13 +97,13 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     if has_arrived(received):
-        shift = memory[_DIFFERENCE]
+        shift = memory[_POSE_DIFFERENCE]
         for i in range(6):
             g = i // 3
             force = (1.0 + p[_SLAVE_FEEDBACK]) * received[WRENCH][i] + p[_SLAVE_FEEDBACK] * wrench[
                 i
             ]
-            shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
+            shift[i] = (force + p[SERVO_D][g] * received[VELOCITY][i]) / p[SERVO_K][g]
         move_pose_into(received[POSE], shift, memory[COMMAND_POSE])
         copy_into(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     copy_into(command, 0, memory, COMMAND.start, 13)

@@ -1,4 +1,4 @@
-"""Master's end of the passivity method "ledger", whose energy balance is at the slave's motion.
+"""Master's end of the passivity method "ledger", which balances energy at the slave's motion.
 
 docs/theory.md, "The energy ledger", has its equations and the steps M1 to M7 and S1 to S6.
 """
@@ -26,7 +26,6 @@ from drake_teleop.station.passivity.ledger_slave import (
     MASS_FACTOR,
     MASTER_RESERVE,
     MEAN_WRENCH,
-    METRIC,
     NEWEST_SLAVE_PACKET,
     NORMAL,
     OWN_VELOCITY,
@@ -36,6 +35,7 @@ from drake_teleop.station.passivity.ledger_slave import (
     SHARED_RESERVE,
     SLAVE_RESERVE,
     TORQUE_PER_FORCE,
+    WRENCH_METRIC,
     filter_velocity,
     is_in_contact,
     receive_energy,
@@ -53,8 +53,8 @@ from drake_teleop.station.passivity.memory import (
 )
 from drake_teleop.station.passivity.packet import (
     ENERGY,
-    LOAD,
     MAX_WRENCH_RATE,
+    PACKET_LOAD_WRENCH,
     PACKET_NUMBER,
     POSE,
     VELOCITY,
@@ -72,52 +72,52 @@ from drake_teleop.station.passivity.packet import (
 _VELOCITY_FILTER_S = 4e-3
 _STIFFNESS_MARGIN = 1.1
 _MAX_STIFFNESS, _MIN_STIFFNESS = 2500.0, 50.0  # N/m
-_LEAD_STEPS = 2.0
+_PREDICTION_LEAD_STEPS = 2.0
 _OFFSET_FADE_S = 0.3
 _FRICTION_MEMORY_S = 1.0
 _FRICTION_LAG_S, _SLIP_SPEED = 0.1, 1e-3
 _TORQUE_LAG_S, _TORQUE_LAG_ROUND_TRIPS = 0.6, 30.0
 _TORQUE_STIFFNESS_FACTOR, _MAX_CONE = 4.0, 1.0
 _MIN_WRENCH_NORM_WEIGHT = 1e-12  # the metric of rotation is 0 where rotation is not transmitted
-_MAX_PREDICTION_N = 3.0
-_MAX_REMEMBERED_N = 10.0
+_MAX_PREDICTED_RISE_N = 3.0
+_MAX_WALL_FORCE_N = 10.0
 _SAME_WALL_M, _SAME_WALL_COSINE = 5e-3, 0.7
 _REMOVED_DEPTH_M, _REMOVED_FORCE_N, _REMOVED_MIN_DEPTH_M = 3e-3, 1.0, 1e-3
 _NO_CONTACT_DEPTH_M, _NO_CONTACT_IMPULSE_NS = 0.3e-3, 0.03
-_FORWARD_LEVEL = 0.5  # of the master's reserve
-_MIN_LEVEL = 0.05  # of the master's reserve
+_FORWARDING_LEVEL = 0.5  # of the master's reserve
+_MIN_RESERVE_LEVEL = 0.05  # of the master's reserve
 _DRAIN_RATE = 50.0  # 1/s
-_RELEASE_M = 0.03
-_RECOVERY_S = 0.1
+_RELEASE_DISTANCE_M = 0.03
+_WRENCH_RECOVERY_S = 0.1
 _HAND_ACCELERATION = 5.0  # m/s^2
-_DRAG_SPEED = 0.02  # m/s
+_FULL_DRAG_SPEED = 0.02  # m/s
 _HAND_REST_S = 0.1
 _LOW_LEVEL, _FULL_LEVEL = 1.0 - SHARED_RESERVE, 1.0 - 1e-9  # of a reserve, the latter for rounding
 _BRAKE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 
 # Memory. The first places are those of `ledger_slave`, up to `NORMAL`.
-_places = own_memory()
-_places.vector(NORMAL.stop - OWN_VELOCITY.start)
+_layout = own_memory()
+_layout.vector(NORMAL.stop - OWN_VELOCITY.start)
 # Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
 # stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
-_OFFSET, _WALL_DIRECTION = _places.vector(6), _places.vector(6)
-_WALL_STIFFNESS, _WALL_DEPTH, _LOST_IMPULSE = _places.number(), _places.number(), _places.number()
+_OFFSET, _WALL_DIRECTION = _layout.vector(6), _layout.vector(6)
+_WALL_STIFFNESS, _WALL_DEPTH, _LOST_IMPULSE = _layout.number(), _layout.number(), _layout.number()
 # Modelled friction at the motion of the hand and of the slave; measured minus modelled friction.
-_FRICTION_AT_HAND, _FRICTION_AT_SLAVE = _places.vector(6), _places.vector(6)
-_FRICTION_REST, _FRICTION_CONE = _places.vector(6), _places.vector(2)
-_RETREAT_DISTANCE = _places.number()  # of the hand out of the wall since its last rest
-_LAST_SLAVE_POSE, _SLAVE_STEP = _places.vector(7), _places.vector(6)
+_FRICTION_AT_HAND, _FRICTION_AT_SLAVE = _layout.vector(6), _layout.vector(6)
+_FRICTION_REST, _FRICTION_CONE = _layout.vector(6), _layout.vector(2)
+_RETREAT_DISTANCE = _layout.number()  # of the hand out of the wall since its last rest
+_LAST_SLAVE_POSE, _SLAVE_STEP = _layout.vector(7), _layout.vector(6)
 # Work on the hand since it last rested; withheld share of the wrench.
-_WORK_ON_HAND, _WITHHELD_SHARE = _places.vector(2), _places.vector(2)
-_DRAG_ACTIVE = _places.vector(2)
+_WORK_ON_HAND, _WITHHELD_SHARE = _layout.vector(2), _layout.vector(2)
+_DRAG_ACTIVE = _layout.vector(2)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
-_NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _places.number(), _places.vector(2), _places.vector(6)
+_NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _layout.number(), _layout.vector(2), _layout.vector(6)
 
 
 @settings
 @dataclass
 class LedgerConfig:
-    """Parameters of the energy ledger."""
+    """Parameters of the passivity method "ledger"."""
 
     initial: list[float] = quantity(
         [0.12, 0.011],
@@ -151,7 +151,7 @@ class LedgerConfig:
         )
         p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
         p[CONTACT_THRESHOLD] = np.divide(self.touch, p[MOTION_SCALE])
-        p[METRIC] = np.square(np.divide(ANGLE_PER_LENGTH * p[MOTION_SCALE], p[MOTION_SCALE][0]))
+        p[WRENCH_METRIC] = (ANGLE_PER_LENGTH * p[MOTION_SCALE] / p[MOTION_SCALE][0]) ** 2
 
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
@@ -183,13 +183,13 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         pose_difference_into(pose, received[POSE], offset_to_slave)
     _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench)
     for i in range(6):
-        wrench[i] += received[LOAD][i]
+        wrench[i] += received[PACKET_LOAD_WRENCH][i]
     newest = received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET] + 1.0:
         memory[_CROSS_FADING] = 1.0
     memory[_NEWEST_PACKET] = newest
     for g in range(2):
-        _cross_fade(g, T, p, memory, wrench)
+        _cross_fade_wrench(g, T, p, memory, wrench)
         limit_group(wrench, g, limits[g])
         _limit_wrench_to_energy(g, dx, T, p, memory, wrench)
         level = p[MASTER_RESERVE][g]
@@ -213,7 +213,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 def _update_hand_ledger(g, dx, in_contact, p, memory):
     work, ledger = dot_of_group(memory[HELD_WRENCH], dx, g), memory[STORED_ENERGY]
     memory[_WORK_ON_HAND][g] = max(memory[_WORK_ON_HAND][g] + work, 0.0)
-    if work < 0.0 and in_contact and ledger[g] > _FORWARD_LEVEL * p[MASTER_RESERVE][g]:
+    if work < 0.0 and in_contact and ledger[g] > _FORWARDING_LEVEL * p[MASTER_RESERVE][g]:
         memory[SENT_ENERGY][g] -= work
     else:
         ledger[g] -= work
@@ -221,7 +221,7 @@ def _update_hand_ledger(g, dx, in_contact, p, memory):
 
 @njit(cache=True)
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
-    """Write the predicted contact wrench (M2, M3) into `wrench`.
+    """Write the predicted contact wrench (docs/theory.md, M2, M3) into `wrench`.
 
     `offset_to_slave` (6,) is the pose of the hand minus the slave's pose [m, rad].
     """
@@ -242,7 +242,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
             memory[_CROSS_FADING][:] = memory[_WORK_ON_HAND][:] = 0.0
         if slave_depth > removal_depth or memory[_LOST_IMPULSE] > _NO_CONTACT_IMPULSE_NS:
             memory[_WALL_STIFFNESS] = 0.0
-        inside = min(memory[_WALL_STIFFNESS] * max(memory[_WALL_DEPTH], 0.0), _MAX_REMEMBERED_N)
+        inside = min(memory[_WALL_STIFFNESS] * max(memory[_WALL_DEPTH], 0.0), _MAX_WALL_FORCE_N)
         for i in range(6):
             wrench[i] = -inside * inward[i]
         return
@@ -273,18 +273,18 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
         offset[i] *= fade
         offset_to_slave[i] -= offset[i]
     hand_speed = work_along(normal, memory[OWN_VELOCITY])
-    penetration = work_along(normal, offset_to_slave) + _LEAD_STEPS * T * hand_speed
+    penetration = work_along(normal, offset_to_slave) + _PREDICTION_LEAD_STEPS * T * hand_speed
     force = size
     if size > 0.0:
         change = k * penetration + damper * (hand_speed - speed)
-        force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTION_N)
+        force = min(max(size - change, 0.0), 2.0 * size + _MAX_PREDICTED_RISE_N)
     # A hand that was let go moves out of a soft wall without end, so its force fades.
     retreat = max(memory[_RETREAT_DISTANCE] + work_along(normal, dx), 0.0)
-    if abs(hand_speed) < _DRAG_SPEED:
+    if abs(hand_speed) < _FULL_DRAG_SPEED:
         retreat *= 1.0 - min(T / _HAND_REST_S, 1.0)
     memory[_RETREAT_DISTANCE] = retreat
-    force *= min(max(3.0 * (1.0 - retreat / _RELEASE_M), 0.0), 1.0)
-    _find_slave_step(received, memory)
+    force *= min(max(3.0 * (1.0 - retreat / _RELEASE_DISTANCE_M), 0.0), 1.0)
+    _update_slave_step(received, memory)
     _render_friction(T, max(size, 1e-12), min(force, size), received, dx, p, memory, wrench)
     for i in range(6):
         wrench[i] += force * normal[i]
@@ -295,7 +295,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 
 @njit(cache=True)
-def _find_slave_step(received, memory):
+def _update_slave_step(received, memory):
     last = memory[_LAST_SLAVE_POSE]
     pose_difference_into(received[POSE], last, memory[_SLAVE_STEP])
     copy_into(last, 0, received, POSE.start, 7)
@@ -303,9 +303,9 @@ def _find_slave_step(received, memory):
 
 @njit(cache=True)
 def _render_friction(T, size, force, received, dx, p, memory, wrench):
-    """Write the wall's friction, as rendered to the hand, into `wrench` (6,) (T68).
+    """Write the wall's friction, as rendered to the hand, into `wrench` (6,), docs/theory.md (T68).
 
-    It is a model at the hand's motion, plus what the model misses at the slave, which arrives late.
+    It is modelled at the hand's motion, plus measured minus modelled friction at the slave.
     """
     near, far, rest = memory[_FRICTION_AT_HAND], memory[_FRICTION_AT_SLAVE], memory[_FRICTION_REST]
     slave_step, cone = memory[_SLAVE_STEP], memory[_FRICTION_CONE]
@@ -315,7 +315,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
     _remove_normal_component(wrench, p, memory)
     decay = min(T / max(_FRICTION_MEMORY_S, 3.0 * received[ROUND_TRIP]), 1.0)
     for g in range(2):
-        metric = max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
+        metric = max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
         spring, largest = _friction_stiffness(g, p), _MAX_CONE / math.sqrt(metric)
         cone[g] = max(cone[g] * (1.0 - decay), min(length_of_group(wrench, g) / size, largest))
         lag = max(cone[g] * size / (_MAX_STIFFNESS * _SLIP_SPEED), _FRICTION_LAG_S)
@@ -333,7 +333,7 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
         limit_group(far, g, cone[g] * size)
         limit_group(near, g, cone[g] * force)
         for i in range(3 * g, 3 * g + 3):
-            across = dx[i] - step * max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT) * normal[i]
+            across = dx[i] - step * max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT) * normal[i]
             wrench[i] = near[i] + rest[i] - _friction_stiffness(g, p) * across
     _remove_normal_component(wrench, p, memory)
     for g in range(2):
@@ -342,9 +342,8 @@ def _render_friction(T, size, force, received, dx, p, memory, wrench):
 
 @njit(cache=True)
 def _friction_stiffness(g, p):
-    """Return the stiffness k_h of the friction at the hand (T68) [N/m; N m/rad for g = 1]."""
     factor = 1.0 if g == 0 else _TORQUE_STIFFNESS_FACTOR
-    return factor * _MAX_STIFFNESS / max(p[METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
+    return factor * _MAX_STIFFNESS / max(p[WRENCH_METRIC][g], _MIN_WRENCH_NORM_WEIGHT)
 
 
 @njit(cache=True)
@@ -356,7 +355,7 @@ def _remove_normal_component(wrench, p, memory):
 
 
 @njit(cache=True)
-def _cross_fade(g, T, p, memory, wrench):
+def _cross_fade_wrench(g, T, p, memory, wrench):
     last, fading = memory[_LAST_WRENCH], memory[_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
@@ -379,20 +378,20 @@ def _limit_wrench_to_energy(g, dx, T, p, memory, wrench):
         if displacement >= 0.0:
             cost += size * _HAND_ACCELERATION * ANGLE_PER_LENGTH[g] * T * T
     most = min(T * _DRAIN_RATE, 1.0) * max(
-        memory[STORED_ENERGY][g] - _MIN_LEVEL * p[MASTER_RESERVE][g], 0.0
+        memory[STORED_ENERGY][g] - _MIN_RESERVE_LEVEL * p[MASTER_RESERVE][g], 0.0
     )
-    share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _RECOVERY_S)
+    share = min(1.0, 1.0 - memory[_WITHHELD_SHARE][g] + T / _WRENCH_RECOVERY_S)
     if share * cost > most:
         share = most / cost
     memory[_WITHHELD_SHARE][g] = 1.0 - share
     if not cost > 0.0:
-        share *= _permitted_opposing_share(g, dx, T, p, memory)
+        share *= _permitted_braking_share(g, dx, T, p, memory)
     scale_group(wrench, g, share)
 
 
 @njit(cache=True)
-def _permitted_opposing_share(g, dx, T, p, memory):
-    if memory[STORED_ENERGY][g] >= _MIN_LEVEL * p[MASTER_RESERVE][g]:
+def _permitted_braking_share(g, dx, T, p, memory):
+    if memory[STORED_ENERGY][g] >= _MIN_RESERVE_LEVEL * p[MASTER_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]
     along, speed = dot_of_group(velocity, dx, g), length_of_group(velocity, g)
@@ -417,15 +416,15 @@ def _add_drag_force(g, received, dx, T, p, memory, wrench):
         active[g] = 0.0
     if active[g] > 0.0:
         drag = p[DRAG][g]
-    if speed < _DRAG_SPEED * ANGLE_PER_LENGTH[g]:
+    if speed < _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g]:
         memory[_WORK_ON_HAND][g] *= 1.0 - min(T / _HAND_REST_S, 1.0)
     if memory[_WORK_ON_HAND][g] > 0.0:
         excess = speed / ANGLE_PER_LENGTH[g] - _NO_BRAKE_SPEED
         share = excess / (_FULL_BRAKE_SPEED - _NO_BRAKE_SPEED)
         drag = max(drag, _BRAKE_N * TORQUE_PER_FORCE[g] * min(share, 1.0))
-    drag *= _permitted_opposing_share(g, dx, T, p, memory)
+    drag *= _permitted_braking_share(g, dx, T, p, memory)
     for i in range(3 * g, 3 * g + 3):
-        wrench[i] -= drag * velocity[i] / max(speed, _DRAG_SPEED * ANGLE_PER_LENGTH[g])
+        wrench[i] -= drag * velocity[i] / max(speed, _FULL_DRAG_SPEED * ANGLE_PER_LENGTH[g])
 
 
 slave_step, record_command = ledger_slave.slave_step, ledger_slave.record_command

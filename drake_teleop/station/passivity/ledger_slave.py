@@ -1,4 +1,7 @@
-"""Slave's end of the method "ledger" (long: all steps of one end): S1 to S6 of docs/theory.md."""
+"""Slave's end of the passivity method "ledger" (long: one file for steps S1 to S6).
+
+docs/theory.md, "The energy ledger", has the equations of these steps.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import math
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.contact_fit import (
-    NUM_SUMS,
+    NUM_FIT_SUMS,
     force_change_by_slip,
     remove_slip_steps,
     update_contact_fit,
@@ -16,15 +19,15 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    DAMPING,
     DISSIPATED_ENERGY,
     HELD_WRENCH,
     LOAD_WRENCH,
-    MASS,
     RECEIVED_ENERGY,
     SENT_ENERGY,
+    SERVO_D,
+    SERVO_K,
+    SLAVE_MASS,
     STEP_COUNT,
-    STIFFNESS,
     STORED_ENERGY,
     own_memory,
     own_parameters,
@@ -32,9 +35,9 @@ from drake_teleop.station.passivity.memory import (
 from drake_teleop.station.passivity.packet import (
     ENERGY,
     INTEGRAL,
-    LOAD,
-    OTHER_ENERGY,
+    PACKET_LOAD_WRENCH,
     POSE,
+    SECOND_ENERGY,
     VELOCITY,
     WRENCH,
     credit_new_energy,
@@ -56,12 +59,12 @@ SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold i
 _MIN_KEPT_RESERVE = 0.05
 _STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
 _ENERGY_CAPACITY = 4.0  # over the reserve
-_FILTER_S = 3e-3
+_SLAVE_FILTER_S = 3e-3
 _REST_SPEED = 0.05  # m/s
 _REST_SEND_RATE, _SEND_RATE = 5.0, 50.0  # 1/s
-_MAXIMUM_DECAY_S = 5.0
+_MAXIMA_DECAY_S = 5.0
 _MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
-_PRESS_SPEED = 0.06  # m/s
+_PRESSING_SPEED = 0.06  # m/s
 _STRETCH_M, _FAST_STRETCH_M = 2e-4, 2e-3
 _MIN_FIT_M, _MAX_FIT_M = 1e-3, 1e-2
 _FAST_SPEED = 0.15  # m/s
@@ -74,45 +77,45 @@ _COMMAND_FILTER_S, _MAX_ACCELERATION, _BRAKING_FACTOR = 0.01, 30.0, 0.7  # s, m/
 _MAX_FEEDFORWARD_SILENCE_S = 0.02
 _SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
 _STOP_HORIZON_S = 4e-3
-_FREE_FORCE_N = 5.0
+_FREE_CONTACT_FORCE_N = 5.0
 _STANDSTILL_SPEED, _DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
 # Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
 # ledger. Of the master's packet: number of the newest packet from the slave.
 CONTACT_STIFFNESS, CONTACT_DAMPING, ROUND_TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
-LEDGER_LEVEL = OTHER_ENERGY
+LEDGER_LEVEL = SECOND_ENERGY
 NEWEST_SLAVE_PACKET = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
-_places = own_parameters()
-INITIAL, SLAVE_RESERVE, MASTER_RESERVE = _places.vector(2), _places.vector(2), _places.vector(2)
-DRAG, CONTACT_THRESHOLD = _places.vector(2), _places.vector(2)
-METRIC = _places.vector(2)  #: weights of squared force and squared torque in the norm of a wrench
+_layout = own_parameters()
+INITIAL, SLAVE_RESERVE, MASTER_RESERVE = _layout.vector(2), _layout.vector(2), _layout.vector(2)
+DRAG, CONTACT_THRESHOLD = _layout.vector(2), _layout.vector(2)
+WRENCH_METRIC = _layout.vector(2)  #: weights of squared force and torque in a wrench's norm
 # Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
-_places = own_memory()
-OWN_VELOCITY, IN_CONTACT = _places.vector(6), _places.number()
-MEAN_WRENCH, NORMAL = _places.vector(6), _places.vector(6)
-SERVO_MODEL, _SERVO_MODEL_TWIST = _places.vector(7), _places.vector(6)
-_MOTOR_WRENCH = _places.vector(6)
-_BALANCE, _CONTACT_INPUT = _places.vector(2), _places.vector(2)  # A, Q
+_layout = own_memory()
+OWN_VELOCITY, IN_CONTACT = _layout.vector(6), _layout.number()
+MEAN_WRENCH, NORMAL = _layout.vector(6), _layout.vector(6)
+SERVO_MODEL, _SERVO_MODEL_TWIST = _layout.vector(7), _layout.vector(6)
+_MOTOR_WRENCH = _layout.vector(6)
+_BALANCE, _CONTACT_INPUT = _layout.vector(2), _layout.vector(2)  # A, Q
 # k and b of the contact; rho and its goal; c - 1; depth of the slave in the wall.
-_CONTACT_STIFFNESS, _CONTACT_DAMPING = _places.number(), _places.number()
-_DISPLAYED_SHARE, _SHARE_GOAL, _EXTRA_GAIN, _WALL_DEPTH = (_places.number() for _ in range(4))
+_CONTACT_STIFFNESS, _CONTACT_DAMPING = _layout.number(), _layout.number()
+_DISPLAYED_SHARE, _SHARE_GOAL, _EXTRA_GAIN, _WALL_DEPTH = (_layout.number() for _ in range(4))
 # Fit of k and b: filtered force; force and speed at the start of the stretch; its length and the
 # lag of its filter; length of the fit and its sums.
-_FILTERED_FORCE, _STRETCH_FORCE, _STRETCH_SPEED = (_places.number() for _ in range(3))
-_STRETCH_LENGTH, _FILTER_LAG, _FIT_LENGTH = (_places.number() for _ in range(3))
-_FIT_SUMS = _places.vector(NUM_SUMS)
+_FILTERED_FORCE, _STRETCH_FORCE, _STRETCH_SPEED = (_layout.number() for _ in range(3))
+_STRETCH_LENGTH, _FILTER_LAG, _FIT_LENGTH = (_layout.number() for _ in range(3))
+_FIT_SUMS = _layout.vector(NUM_FIT_SUMS)
 # Present and longest time without packets, longest round trip, period [s].
-_SILENCE, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_places.number() for _ in range(4))
-_CONTACT_WRENCH, _LOAD = _places.vector(6), _places.vector(6)
+_SILENCE, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_layout.number() for _ in range(4))
+_CONTACT_WRENCH, _LOAD = _layout.vector(6), _layout.vector(6)
 # Rendered force along n; last speed into the wall; largest friction.
-_DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(3))
+_DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_layout.number() for _ in range(3))
 
 
 @njit(cache=True)
 def filter_velocity(twist, share, memory):
-    """Low-pass the velocity in `memory`; `share` is the weight of the new `twist`."""
+    """Low-pass filter the velocity in `memory`; `share` is the weight of the new `twist`."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -127,12 +130,12 @@ def is_in_contact(wrench, p):
 @njit(cache=True)
 def wrench_component_along(a, b, p):
     """Return the component of the wrench `a` (6,) along the unit wrench `b` (6,) [N]."""
-    return p[METRIC][0] * dot_of_group(a, b, 0) + p[METRIC][1] * dot_of_group(a, b, 1)
+    return p[WRENCH_METRIC][0] * dot_of_group(a, b, 0) + p[WRENCH_METRIC][1] * dot_of_group(a, b, 1)
 
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return the work of a wrench (6,) over a displacement (6,) [J]; for a unit wrench [m]."""
+    """Return wrench (6,) times displacement (6,): work [J], for a unit wrench a length [m]."""
     return dot_of_group(wrench, displacement, 0) + dot_of_group(wrench, displacement, 1)
 
 
@@ -174,11 +177,11 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     memory[_PERIOD] = T
     memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
     silence = memory[_SILENCE] if connected else 0.0
-    kept = 1.0 - T / _MAXIMUM_DECAY_S
+    kept = 1.0 - T / _MAXIMA_DECAY_S
     memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
     trip = max((memory[STEP_COUNT] - received[NEWEST_SLAVE_PACKET]) * T, 0.0) if connected else 0.0
     memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
-    filter_velocity(twist, min(T / _FILTER_S, 1.0), memory)
+    filter_velocity(twist, min(T / _SLAVE_FILTER_S, 1.0), memory)
     contact, load, filtered_load = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_LOAD]
     for i in range(6):
         contact[i] = wrench[i] - load[i]
@@ -207,11 +210,11 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         correction = memory[_DISPLAYED_FORCE] - wrench_component_along(contact, memory[NORMAL], p)
         for i in range(6):
             packet[WRENCH][i] += correction * memory[NORMAL][i]
-    copy_into(packet, LOAD.start, filtered_load, 0, 6)
+    copy_into(packet, PACKET_LOAD_WRENCH.start, filtered_load, 0, 6)
     k, compliance = memory[_CONTACT_STIFFNESS], 0.0
     for g in range(2):
         size = length_of_group(memory[NORMAL], g)
-        compliance += size * size / (_STIFFNESS_FACTOR * p[STIFFNESS][g])
+        compliance += size * size / (_STIFFNESS_FACTOR * p[SERVO_K][g])
         packet[ENERGY][g] = memory[SENT_ENERGY][g]
         packet[LEDGER_LEVEL][g] = memory[STORED_ENERGY][g] - memory[RECEIVED_ENERGY][g]
     packet[CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
@@ -232,7 +235,7 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
     ledger[g] += work
     input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
     speed = length_of_group(twist, g)
-    kinetic = 0.5 * MASS_FACTOR * p[MASS][g] * speed * speed
+    kinetic = 0.5 * MASS_FACTOR * p[SLAVE_MASS][g] * speed * speed
     # At rest in contact the hand needs the energy, otherwise motion needs it.
     keep, hold, rate = reserve, p[MASTER_RESERVE][g], _SEND_RATE
     free, missing, returned = ledger[g] - kinetic, hold - received[LEDGER_LEVEL][g], 0.0
@@ -252,14 +255,13 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
 
 @njit(cache=True)
 def _servo_lag(p):
-    return 2.0 * math.sqrt(p[MASS][0] / p[STIFFNESS][0])
+    return 2.0 * math.sqrt(p[SLAVE_MASS][0] / p[SERVO_K][0])
 
 
 @njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
-    """Return k_d (S3), the largest contact stiffness that is rendered to the hand [N/m]."""
     normal, fill_level = memory[NORMAL], 0.0
-    depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
+    depth, base = _PRESSING_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
         travel, reserve = (
             ANGLE_PER_LENGTH[g] * length_of_group(normal, g) * depth,
@@ -267,7 +269,7 @@ def _max_displayed_stiffness(received, T, p, memory):
         )
         base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
         level = min(max(received[LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
-        fill_level += p[METRIC][g] * dot_of_group(normal, normal, g) * level
+        fill_level += p[WRENCH_METRIC][g] * dot_of_group(normal, normal, g) * level
     max_silence = max(
         _MAX_FEEDFORWARD_SILENCE_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP]
     )
@@ -296,7 +298,7 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     size = update_contact_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
     k_d = _max_displayed_stiffness(received, T, p, memory)
     max_slip = _max_slip_change(wrench, size, T, p, memory)
-    inward, rate = -work_along(normal, dx), min(T / _FILTER_S, 1.0)
+    inward, rate = -work_along(normal, dx), min(T / _SLAVE_FILTER_S, 1.0)
     speed = -work_along(normal, velocity)
     if memory[_FILTERED_FORCE] == 0.0:
         # Start at the first sample in contact, because the step to it was partly outside.
@@ -376,7 +378,7 @@ def _generate_command(received, connected, T, p, memory, error):
     feeds_forward = connected and memory[_SILENCE] < _MAX_FEEDFORWARD_SILENCE_S
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
-            error[i] += compliance * beyond_wall * p[METRIC][g] * normal[i]
+            error[i] += compliance * beyond_wall * p[WRENCH_METRIC][g] * normal[i]
         distance, acceleration = length_of_group(error, g), _MAX_ACCELERATION * ANGLE_PER_LENGTH[g]
         rate = 1.0 / _COMMAND_FILTER_S
         if distance > 0.0:
@@ -384,9 +386,9 @@ def _generate_command(received, connected, T, p, memory, error):
         for i in range(3 * g, 3 * g + 3):
             error[i] *= rate
             if feeds_forward:
-                error[i] += feed[i] + compliance * inward_speed * p[METRIC][g] * normal[i]
+                error[i] += feed[i] + compliance * inward_speed * p[WRENCH_METRIC][g] * normal[i]
         available = max(memory[STORED_ENERGY][g] - RESERVE_MARGIN * p[SLAVE_RESERVE][g], 0.0)
-        limit_group(error, g, math.sqrt(2.0 * available / (MASS_FACTOR * p[MASS][g])))
+        limit_group(error, g, math.sqrt(2.0 * available / (MASS_FACTOR * p[SLAVE_MASS][g])))
         for i in range(3 * g, 3 * g + 3):
             error[i] -= velocity[i]
         limit_group(error, g, acceleration * T)
@@ -396,11 +398,11 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved."""
+    """Move the command (7,) so that the motors' energy suffices; return whether it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     pose_difference_into(command, pose, motor_wrench)
     for g in range(2):
-        K, D = _STIFFNESS_FACTOR * p[STIFFNESS][g], _DAMPING_FACTOR * p[DAMPING][g]
+        K, D = _STIFFNESS_FACTOR * p[SERVO_K][g], _DAMPING_FACTOR * p[SERVO_D][g]
         for i in range(3 * g, 3 * g + 3):
             motor_wrench[i] = K * motor_wrench[i] - D * twist[i]
         if _limit_motor_wrench(g, D, twist, p, memory):
@@ -426,7 +428,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     size, speed, mass = (
         length_of_group(motor_wrench, g),
         length_of_group(twist, g),
-        MASS_FACTOR * p[MASS][g],
+        MASS_FACTOR * p[SLAVE_MASS][g],
     )
     stands = length_of_group(velocity, g) < _STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
     margin, balance, changed = RESERVE_MARGIN * p[SLAVE_RESERVE][g], memory[_BALANCE][g], False
@@ -436,7 +438,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
     pressed, available, permitted = length_of_group(contact, g), balance, 0.0
     if is_in_contact(contact, p) and dot_of_group(motor_wrench, contact, g) < 0.0:
         free, k = (
-            _FREE_FORCE_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
+            _FREE_CONTACT_FORCE_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
             memory[_CONTACT_STIFFNESS],
         )
         spring = (1.0 + memory[_EXTRA_GAIN]) * free * free / (2.0 * max(k, 1.0))
@@ -467,7 +469,8 @@ def _step_servo_model(received, connected, T, p, memory, error):
     if connected:
         pose_difference_into(received[POSE], model, error)
     for i in range(6):
-        stiff, damped = p[STIFFNESS][i // 3] / p[MASS][i // 3], p[DAMPING][i // 3] / p[MASS][i // 3]
+        mass = p[SLAVE_MASS][i // 3]
+        stiff, damped = p[SERVO_K][i // 3] / mass, p[SERVO_D][i // 3] / mass
         velocity[i] = (velocity[i] + T * stiff * error[i]) / (1.0 + T * damped + T * T * stiff)
         error[i] = T * velocity[i]
     move_pose_into(model, error, model)

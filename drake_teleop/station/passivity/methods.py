@@ -45,15 +45,15 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    DAMPING,
-    MASS,
+    LAST_PACKET,
     MAX_RETREAT,
     MEMORY_SIZE,
     MOTION_SCALE,
     NUM_PARAMETERS,
-    PACKET,
+    SERVO_D,
+    SERVO_K,
+    SLAVE_MASS,
     STEP_COUNT,
-    STIFFNESS,
     WRENCH_LIMIT,
 )
 from drake_teleop.station.passivity.packet import (
@@ -71,12 +71,12 @@ from drake_teleop.station.passivity.wave import WaveConfig
 
 
 @njit(cache=True)
-def _record_nothing(requested, command, pose, twist, p, memory):
-    """Substitute for `record_command` in methods without one."""
+def _ignore_command_change(requested, command, pose, twist, p, memory):
+    pass
 
 
 class PassivityMethod(NamedTuple):
-    """Both ends of a passivity method, and what it needs from the station.
+    """Functions of a passivity method, and its requirements on the station.
 
     Attributes:
         master_step, slave_step, record_command: compiled functions with the arguments of those of
@@ -85,13 +85,13 @@ class PassivityMethod(NamedTuple):
         config: settings dataclass of a registered method with `pack_into(p)`, or None.
         balance_at_motors: the energy balance is at the slave's motors, not at its command.
         needs_arm_mass: `slave_mass` and servo are by default those of the arm at the start.
-        needs_load_apart: the ends need the load's part of the wrench, `load_wrench_B`.
+        needs_load_apart: the ends need the load's part of the wrench separately.
         speed_limit: function of config and slave mass: largest speed of the slave [m/s, rad/s].
     """
 
     master_step: Any
     slave_step: Any
-    record_command: Any = _record_nothing
+    record_command: Any = _ignore_command_change
     initialize: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
     config: type[Any] | None = None
     balance_at_motors: bool = False
@@ -100,14 +100,14 @@ class PassivityMethod(NamedTuple):
     speed_limit: Callable[[Any, NDArray[np.float64]], NDArray[np.float64]] | None = None
 
 
-_TDPA = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
+_TDPA_METHOD = PassivityMethod(tdpa.master_step, tdpa.slave_step, tdpa.record_command)
 METHODS = Registry(
     "passivity method",
     {
         "none": PassivityMethod(none.master_step, none.slave_step),
         "wave": PassivityMethod(wave.master_step, wave.slave_step),
-        "tdpa": _TDPA,
-        "charged_tdpa": _TDPA,
+        "tdpa": _TDPA_METHOD,
+        "charged_tdpa": _TDPA_METHOD,
         "two_layer": PassivityMethod(
             two_layer.master_step,
             two_layer.slave_step,
@@ -161,11 +161,11 @@ _FIELD_OF_METHOD = {
 }
 
 
-_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
+_DEFAULT_SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
 @dataclass
-class _CommonConfig:
+class _CommonMethodConfig:
     method: str = choice(
         "none",
         (),
@@ -186,14 +186,18 @@ class _CommonConfig:
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
     )
     servo_damping: list[float] = quantity(
-        [3.5e3, 117.0], "N s/m, N m s/rad", 0.0, 1e8, "D of the slave's servo, likewise (E)"
+        [3.5e3, 117.0],
+        "N s/m, N m s/rad",
+        0.0,
+        1e8,
+        "D of the slave's servo, in the slave's units (E)",
     )
     slave_mass: list[float] | None = quantity(
         None,
         "kg, kg m^2",
         1e-6,
         1e6,
-        "mass of arm and tool at the tool, likewise; null: 15.13, 0.5 (E), with ledger"
+        "mass of arm and tool at the tool, in the slave's units; null: 15.13, 0.5 (E), with ledger"
         " mass and servo of the station's arm at the start",
     )
     registered: dict[str, float] = plain({}, "parameters of a registered method, by name")
@@ -201,7 +205,7 @@ class _CommonConfig:
 
 @settings
 @dataclass
-class PassivityConfig(MethodConfigs, _CommonConfig):
+class PassivityConfig(MethodConfigs, _CommonMethodConfig):
     """Method that keeps the station passive, and the parameters of each method.
 
     The servo's force on the slave is K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
@@ -218,9 +222,9 @@ class PassivityConfig(MethodConfigs, _CommonConfig):
         if schema is None:
             if self.registered:
                 raise DrakeTeleopError(
-                    f"'{self.method}' is no registered method",
+                    f"method '{self.method}' takes no parameters here (only registered methods do)",
                     where=f"{where}.registered",
-                    remedy="leave it out; a shipped method has its own block of parameters",
+                    remedy="leave them out; a shipped method has its own block of parameters",
                 )
             return (
                 getattr(self, _FIELD_OF_METHOD[self.method])
@@ -240,7 +244,7 @@ def method_parameters(
     power_scale: Sequence[float] = (1.0, 1.0),
     motion_scale: Sequence[float] = (1.0, 1.0),
 ) -> NDArray[np.float64]:
-    """Return the parameters (PARAMETERS,) of the selected method for the compiled steps.
+    """Return the parameters (NUM_PARAMETERS,) of the selected method for the compiled steps.
 
     Args:
         power_scale: (2,) factors from the slave's wrench to the master's power units, for force and
@@ -249,9 +253,9 @@ def method_parameters(
     """
     p = np.zeros(NUM_PARAMETERS)
     p[WRENCH_LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
-    p[STIFFNESS] = np.multiply(config.servo_stiffness, power_scale)
-    p[DAMPING] = np.multiply(config.servo_damping, power_scale)
-    p[MASS] = np.multiply(config.slave_mass or _SLAVE_MASS, power_scale)
+    p[SERVO_K] = np.multiply(config.servo_stiffness, power_scale)
+    p[SERVO_D] = np.multiply(config.servo_damping, power_scale)
+    p[SLAVE_MASS] = np.multiply(config.slave_mass or _DEFAULT_SLAVE_MASS, power_scale)
     p[MOTION_SCALE] = motion_scale
     p[MAX_RETREAT] = (
         np.multiply(config.retreat, motion_scale) if config.method != "none" else np.inf
@@ -265,14 +269,14 @@ def method_parameters(
 def initial_method_memory(
     method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the memory (MEMORY,) of one end of the channel before its first step.
+    """Return the memory (MEMORY_SIZE,) of one end of the channel before its first step.
 
     `pose` (7,) is the slave's pose X_WS at the start, its command until a packet arrives.
     """
     own = METHODS[METHODS.check(method, "passivity.method")]
     memory = np.zeros(MEMORY_SIZE)
     memory[COMMAND_POSE] = pose
-    memory[PACKET][POSE] = pose
+    memory[LAST_PACKET][POSE] = pose
     if own.initialize is not None:
         own.initialize(parameters, memory)
     return memory
@@ -300,6 +304,7 @@ _master_step, _slave_step, _record_command = map(
 
 
 def steps_of(method: str) -> tuple[int, int, int]:
+    """Return the addresses of a method's compiled functions: master, slave, record."""
     return _addresses_of_functions(*METHODS[method][:3])
 
 
@@ -312,12 +317,12 @@ def _addresses_of_functions(*steps: Any) -> tuple[int, int, int]:
 
 
 @njit(cache=True)
-def _write_packet_number(healthy, memory, packet):
+def _complete_packet(healthy, memory, packet):
     if healthy:
         packet[INPUTS_FINITE] = 1.0
-        copy_into(memory, PACKET.start, packet, 0, PACKET_SIZE)
+        copy_into(memory, LAST_PACKET.start, packet, 0, PACKET_SIZE)
     else:
-        copy_into(packet, 0, memory, PACKET.start, PACKET_SIZE)
+        copy_into(packet, 0, memory, LAST_PACKET.start, PACKET_SIZE)
         packet[INPUTS_FINITE] = 0.0
     packet[PACKET_NUMBER] = memory[STEP_COUNT]
     memory[STEP_COUNT] += 1.0
@@ -357,7 +362,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         limit_retreat_of_hand(twist, T, p, memory, wrench)
-    _write_packet_number(healthy, memory, packet)
+    _complete_packet(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -368,7 +373,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         received, fresh, T, p, memory, packet: as for `master_step`, with the master's packet.
         pose, twist: (7,) and (6,) actual pose X_WS and twist [v; omega] of the slave, in W.
         dx: (6,) increment of this pose since the last step, in W.
-        wrench: (6,) wrench on the slave from contact, with sigma > 0 also from the load, in W.
+        wrench: (6,) wrench on the slave from contact and the rendered part of the load, in W.
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
             finite, it is the last pose with zero twist.
     """
@@ -387,7 +392,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _slave_step(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _write_packet_number(healthy, memory, packet)
+    _complete_packet(healthy, memory, packet)
 
 
 @njit(cache=True)

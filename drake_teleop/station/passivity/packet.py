@@ -18,28 +18,28 @@ from drake_teleop.common.vectors import (
 from drake_teleop.station.passivity.memory import RECEIVED_ENERGY, SlotAllocator
 
 PACKET_SIZE = 38
-_places = SlotAllocator(PACKET_SIZE)
+_layout = SlotAllocator(PACKET_SIZE)
 #: Number of the packet, counted by its sender.
-PACKET_NUMBER = _places.number()
+PACKET_NUMBER = _layout.number()
 #: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
-INPUTS_FINITE = _places.number()
+INPUTS_FINITE = _layout.number()
 #: X_WS [qw qx qy qz px py pz] of the sender.
-POSE = _places.vector(7)
+POSE = _layout.vector(7)
 #: Twist of the sender [v; omega], in W.
-VELOCITY = _places.vector(6)
+VELOCITY = _layout.vector(6)
 #: Wrench at the sender [f; tau], in W, in the master's power units.
-WRENCH = _places.vector(6)
+WRENCH = _layout.vector(6)
 #: Cumulative integral; the method defines it.
-INTEGRAL = _places.vector(6)
+INTEGRAL = _layout.vector(6)
 #: Cumulative energy that the receiver may use, by group [J].
-ENERGY = _places.vector(2)
+ENERGY = _layout.vector(2)
 #: Second energy counter, by group [J].
-OTHER_ENERGY = _places.vector(2)
+SECOND_ENERGY = _layout.vector(2)
 #: 1 while the slave's detector reports contact.
-CONTACT_FLAG = _places.number()
+CONTACT_FLAG = _layout.number()
 #: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
 #: field, because only `ledger` uses it; with other methods it is not transmitted.
-LOAD = _places.vector(6)
+PACKET_LOAD_WRENCH = _layout.vector(6)
 
 #: Largest rate of force and torque at the hand that is not perceived as an impact [N/s, N m/s].
 MAX_WRENCH_RATE = (450.0, 4.5)

@@ -1,6 +1,6 @@
 """Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
-A spring pulls each end to a set position, as near to the requested one as the energy permits.
+A spring pulls each end to a set position as near to the requested one as the energy permits.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -17,11 +17,11 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    DAMPING,
     DISSIPATED_ENERGY,
     HELD_WRENCH,
     SENT_ENERGY,
-    STIFFNESS,
+    SERVO_D,
+    SERVO_K,
     STORED_ENERGY,
     own_memory,
     own_parameters,
@@ -41,18 +41,18 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters, for translation and rotation.
-_places = own_parameters()
-_INITIAL_ENERGY, _MAX_ENERGY = _places.vector(2), _places.vector(2)
-_SPRING, _DAMPER = _places.vector(2), _places.vector(2)
+_layout = own_parameters()
+_INITIAL_ENERGY, _MAX_ENERGY = _layout.vector(2), _layout.vector(2)
+_SPRING, _DAMPER = _layout.vector(2), _layout.vector(2)
 # Memory: set position minus actual position; requested value of this offset.
-_places = own_memory()
-_OFFSET, _REQUESTED = _places.vector(6), _places.vector(6)
+_layout = own_memory()
+_OFFSET, _REQUESTED = _layout.vector(6), _layout.vector(6)
 
 
 @settings
 @dataclass
 class PspmConfig:
-    """Parameters of the passive set-position modulation."""
+    """Parameters of the passivity method "pspm", passive set-position modulation."""
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy E of an end at the start")
     ceiling: list[float] = quantity(
@@ -124,7 +124,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
-    now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
+    now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[SERVO_K], p[SERVO_D]
     before = dot_of_group(offset, offset, 0), dot_of_group(offset, offset, 1)
     pose_difference_into(now, pose, offset)
     copy_into(requested, 0, offset, 0, 6)
@@ -143,7 +143,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
-    K, D = p[STIFFNESS], p[DAMPING]
+    K, D = p[SERVO_K], p[SERVO_D]
     pose_difference_into(command, pose, offset)
     pose_difference_into(requested, pose, other)
     for i in range(6):

@@ -14,8 +14,8 @@ from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
     HAND_VELOCITY,
     HELD_WRENCH,
-    MASS,
     MAX_RETREAT,
+    SLAVE_MASS,
     SlotAllocator,
 )
 from drake_teleop.station.passivity.packet import (
@@ -29,30 +29,27 @@ from drake_teleop.station.passivity.packet import (
 STOP_TIME_S = 0.05  #: time in which a silent end comes to rest [s]
 RESUME_TIME_S = 0.5  #: time of the transition to normal operation [s]
 
-_RETREAT_FILTER_S = 4e-3  # of the velocity: encoders have steps
+_RETREAT_VELOCITY_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_MONITOR_SIZE, SLAVE_MONITOR_SIZE = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
-_places = SlotAllocator(MASTER_MONITOR_SIZE)
-SILENCE_S = _places.number()  #: time without packets [s], also at the slave
-_PRESENT_LIMITS = _places.vector(2)  # present limits
-_LIMIT_FALL_RATE = _places.vector(2)  # their decrease per second
-_CONNECTED_TIME = _places.number()  # time since the last silence
+_layout = SlotAllocator(MASTER_MONITOR_SIZE)
+SILENCE_S = _layout.number()  #: time without packets [s], also at the slave
+_PRESENT_LIMITS = _layout.vector(2)  # present limits
+_LIMIT_FALL_RATE = _layout.vector(2)  # their decrease per second
+_CONNECTED_TIME = _layout.number()  # time since the last silence
 # Monitor state of the slave.
-_places = SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_S + 1)
-_STOPPING_TIME = _places.number()  # time since it began to stop
-_RESUMING_TIME = _places.number()  # time since it began to resume
-_STOP_POSE = _places.vector(7)  # command when it began to stop
-_STOP_VELOCITY = _places.vector(6)  # its velocity
-_LAST_COMMAND, _PREVIOUS_COMMAND = (
-    _places.vector(7),
-    _places.vector(7),
-)  # last command and the one before
+_layout = SlotAllocator(SLAVE_MONITOR_SIZE, SILENCE_S + 1)
+_STOPPING_TIME = _layout.number()  # time since it began to stop
+_RESUMING_TIME = _layout.number()  # time since it began to resume
+_STOP_POSE = _layout.vector(7)  # command when it began to stop
+_STOP_VELOCITY = _layout.vector(6)  # its velocity
+_LAST_COMMAND, _PREVIOUS_COMMAND = _layout.vector(7), _layout.vector(7)
 
 
 def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the silence monitor (MASTER_MONITOR_SIZE,) of the master before the first packet.
 
-    With `full` (2,), the device's limits [N, N m], it is that of normal operation.
+    With the device's limits `full` (2,) [N, N m], return that of normal operation instead.
     """
     watch = np.zeros(MASTER_MONITOR_SIZE)
     if full is None:
@@ -63,7 +60,7 @@ def initial_master_monitor(full: NDArray[np.float64] | None = None) -> NDArray[n
 
 
 def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the silence monitor (SLAVE_MONITOR_SIZE,) of the slave; `pose` (7,): first command."""
+    """Return the slave's silence monitor (SLAVE_MONITOR_SIZE,) at the first command `pose` (7,)."""
     watch = np.zeros(SLAVE_MONITOR_SIZE)
     watch[SILENCE_S] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
@@ -72,7 +69,7 @@ def initial_slave_monitor(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _update_silence(alive, fault, T, watch):
+def _update_silence_time(alive, fault, T, watch):
     if fault:
         watch[SILENCE_S] = np.inf
     else:
@@ -88,7 +85,7 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
     (2,) the device's limits, `held` (6,) the displayed wrench. `watch` is the silence monitor,
     updated.
     """
-    _update_silence(alive, fault, T, watch)
+    _update_silence_time(alive, fault, T, watch)
     connected = watch[SILENCE_S] <= timeout
     watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME_S) if connected else 0.0
     present, fall = watch[_PRESENT_LIMITS], watch[_LIMIT_FALL_RATE]
@@ -113,7 +110,7 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     `requested` (7,) is the pose from the passivity method; other arguments as for
     `master_limits_into`.
     """
-    _update_silence(alive, fault, T, watch)
+    _update_silence_time(alive, fault, T, watch)
     last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]
     start, velocity = watch[_STOP_POSE], watch[_STOP_VELOCITY]
     step = np.empty(6)
@@ -151,14 +148,14 @@ def limit_retreat_of_hand(twist, T, p, memory, wrench):
 
     It falls to 0 for hand speeds along the wrench between `MAX_RETREAT` and twice this.
     """
-    velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)
+    velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_VELOCITY_FILTER_S, 1.0)
     for i in range(6):
         velocity[i] += rate * (twist[i] - velocity[i])
     for g in range(2):
         size = length_of_group(wrench, g)
         if size > 0.0:
             along = dot_of_group(wrench, velocity, g) / size
-            slowing = (along - dot_of_group(wrench, twist, g) / size) / _RETREAT_FILTER_S
-            share = max(2.0 - along / p[MAX_RETREAT][g], p[MASS][g] * slowing / size, 0.0)
+            slowing = (along - dot_of_group(wrench, twist, g) / size) / _RETREAT_VELOCITY_FILTER_S
+            share = max(2.0 - along / p[MAX_RETREAT][g], p[SLAVE_MASS][g] * slowing / size, 0.0)
             scale_group(wrench, g, min(share, 1.0))
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)

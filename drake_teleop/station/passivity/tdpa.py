@@ -18,14 +18,14 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    DAMPING,
     DISSIPATED_ENERGY,
     HELD_WRENCH,
     MOTION_SCALE,
     RECEIVED_ENERGY,
     SENT_ENERGY,
+    SERVO_D,
+    SERVO_K,
     STEP_COUNT,
-    STIFFNESS,
     STORED_ENERGY,
     own_memory,
     own_parameters,
@@ -34,9 +34,9 @@ from drake_teleop.station.passivity.packet import (
     ENERGY,
     INTEGRAL,
     MAX_WRENCH_RATE,
-    OTHER_ENERGY,
     PACKET_NUMBER,
     POSE,
+    SECOND_ENERGY,
     WRENCH,
     credit_new_energy,
     dot_of_group,
@@ -52,43 +52,39 @@ from drake_teleop.station.passivity.packet import (
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
 _RESERVED_INPUT_SHARE = 0.5
 # Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
-_ONSET_S = 0.1
-_END_SHARE = 0.1  # a wrench below this share of the filtered one ends
-_ONSET_COMPLETE = 0.98  # share at which a quick onset is complete
+_SLOW_ONSET_S = 0.1
+_WRENCH_END_SHARE = 0.1  # a wrench below this share of the filtered one ends
+_ONSET_COMPLETE_SHARE = 0.98  # share at which a quick onset is complete
 # Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
 # [m/s, rad/s], for translation and rotation.
 _STIFFNESS_TRAVEL = (1e-3, 1e-2)
-_DRAG_SPEED = (0.02, 0.2)
+_FULL_DRAG_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_NEWEST_MASTER_PACKET, _SLAVE_LEDGER = INTEGRAL.start, OTHER_ENERGY
+_NEWEST_MASTER_PACKET, _SLAVE_LEDGER = INTEGRAL.start, SECOND_ENERGY
 
 # Parameters.
-_places = own_parameters()
-_RELEASE, _DRAIN, _DRIFT_RATE = _places.number(), _places.number(), _places.number()
-_RESERVE, _DRAG, _HAND_STIFFNESS = (
-    _places.vector(2),
-    _places.vector(2),
-    _places.vector(2),
-)  # in power units
-_MAX_SPEED = _places.vector(2)
+_layout = own_parameters()
+_RELEASE, _DRAIN, _DRIFT_RATE = _layout.number(), _layout.number(), _layout.number()
+_RESERVE, _DRAG, _HAND_STIFFNESS = (_layout.vector(2) for _ in range(3))  # in power units
+_MAX_COMMAND_SPEED = _layout.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
-_places = own_memory()
-_WITHHELD_SHARE, _RESERVED_ENERGY = _places.vector(2), _places.vector(2)
+_layout = own_memory()
+_WITHHELD_SHARE, _RESERVED_ENERGY = _layout.vector(2), _layout.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
-_places = own_memory()
-_INPUT, _OUTPUT = _places.vector(2), _places.vector(2)
-_COMMAND_INPUT, _COMMAND_OUTPUT = _places.vector(2), _places.vector(2)
-_WITHHELD_COMMAND, _FILTERED_WRENCH = _places.vector(6), _places.vector(6)
-_STIFFNESS_ESTIMATE, _ONSET_PACKET = _places.vector(2), _places.vector(2)
-_LAST_COMMAND = _places.vector(7)  # the command of the last step
+_layout = own_memory()
+_INPUT, _OUTPUT = _layout.vector(2), _layout.vector(2)
+_COMMAND_INPUT, _COMMAND_OUTPUT = _layout.vector(2), _layout.vector(2)
+_WITHHELD_COMMAND, _FILTERED_WRENCH = _layout.vector(6), _layout.vector(6)
+_STIFFNESS_ESTIMATE, _ONSET_PACKET = _layout.vector(2), _layout.vector(2)
+_LAST_COMMAND = _layout.vector(7)  # the command of the last step
 
 
 @settings
 @dataclass
 class TdpaConfig:
-    """Parameters of the time-domain passivity approach."""
+    """Parameters of the time-domain passivity approach (TDPA)."""
 
     release: float = quantity(
         0.02,
@@ -132,7 +128,7 @@ class TdpaConfig:
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
-        p[_MAX_SPEED] = self.speed
+        p[_MAX_COMMAND_SPEED] = self.speed
 
 
 def charged_tdpa_config() -> TdpaConfig:
@@ -159,7 +155,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         drained = dot_of_group(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
-            share = _permitted_share(
+            share = _permitted_wrench_share(
                 g, drained, drain, stored, share, T, p, memory[HELD_WRENCH], wrench
             )
         withheld[g] = 1.0 - share
@@ -168,7 +164,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         _add_drag_force(g, received[_SLAVE_LEDGER][g], dx, limits, T, p, memory, wrench)
         _balance_hand_work(g, dot_of_group(wrench, dx, g), p, memory)
         if p[_DRAG][g] > 0.0:
-            _send_surplus(g, p, memory)
+            _send_surplus_energy(g, p, memory)
         packet[ENERGY][g] = memory[SENT_ENERGY][g]
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, wrench, packet)
@@ -176,7 +172,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 
 @njit(cache=True)
-def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
+def _permitted_wrench_share(g, drained, drain, stored, share, T, p, held, wrench):
     least, size = (
         length_of_group(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g],
         length_of_group(wrench, g),
@@ -189,14 +185,14 @@ def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
 def _add_drag_force(g, slave_ledger, dx, limits, T, p, memory, wrench):
     drag, level = p[_DRAG][g], memory[STORED_ENERGY][g] + memory[_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
-        damping = drag / max(length_of_group(dx, g), _DRAG_SPEED[g] * T)
+        damping = drag / max(length_of_group(dx, g), _FULL_DRAG_SPEED[g] * T)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
         limit_group(wrench, g, limits[g])
 
 
 @njit(cache=True)
-def _send_surplus(g, p, memory):
+def _send_surplus_energy(g, p, memory):
     ledger = memory[STORED_ENERGY]
     surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
@@ -235,31 +231,31 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         memory[STORED_ENERGY][g] = available
         packet[ENERGY][g] = memory[SENT_ENERGY][g]
         packet[_SLAVE_LEDGER][g] = memory[STORED_ENERGY][g]
-        _filter_wrench(g, received, dx, wrench, T, p, memory)
+        _filter_returned_wrench(g, received, dx, wrench, T, p, memory)
     copy_into(command, 0, memory, COMMAND.start, 13)
     copy_into(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill_packet(pose, twist, memory[_FILTERED_WRENCH], packet)
 
 
 @njit(cache=True)
-def _filter_wrench(g, received, dx, wrench, T, p, memory):
+def _filter_returned_wrench(g, received, dx, wrench, T, p, memory):
     filtered, hand = memory[_FILTERED_WRENCH], p[_HAND_STIFFNESS][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
         gain = max(_estimate_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
         # The servo's lag counts as delay.
         round_trip = max(memory[STEP_COUNT] - received[_NEWEST_MASTER_PACKET], 1.0) * T
-        lag = round_trip + p[DAMPING][g] / p[STIFFNESS][g]
+        lag = round_trip + p[SERVO_D][g] / p[SERVO_K][g]
         size, filtered_size = length_of_group(wrench, g), length_of_group(filtered, g)
-        onset_rate = min(T / _ONSET_S, 1.0)
+        onset_rate = min(T / _SLOW_ONSET_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
-        if size < _END_SHARE * filtered_size:
+        if size < _WRENCH_END_SHARE * filtered_size:
             rate = max(rate, onset_rate)
         else:
-            if filtered_size * (1.0 + gain) < _ONSET_COMPLETE * size:
+            if filtered_size * (1.0 + gain) < _ONSET_COMPLETE_SHARE * size:
                 onset = onset_rate
                 memory[_ONSET_PACKET][g] = memory[STEP_COUNT]
-            if lag > _ONSET_S and received[_NEWEST_MASTER_PACKET] < memory[_ONSET_PACKET][g]:
+            if lag > _SLOW_ONSET_S and received[_NEWEST_MASTER_PACKET] < memory[_ONSET_PACKET][g]:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]
@@ -290,7 +286,7 @@ def _advance_command(received, wrench, T, p, memory):
     for i in range(6):
         step[i] -= remaining_share * withheld[i]
     for g in range(2):
-        limit_group(step, g, p[_MAX_SPEED][g] * T)
+        limit_group(step, g, p[_MAX_COMMAND_SPEED][g] * T)
         pressing, available = (
             -dot_of_group(wrench, step, g),
             max(_energy_available_to_slave(memory, g), 0.0),

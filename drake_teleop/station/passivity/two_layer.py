@@ -1,6 +1,6 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-The tank of each end covers the energy that the wrench can use until the next step.
+The tank of each end must contain the energy that the wrench can use until the next step.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -16,12 +16,12 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    DAMPING,
     DISSIPATED_ENERGY,
     HELD_WRENCH,
-    MASS,
     SENT_ENERGY,
-    STIFFNESS,
+    SERVO_D,
+    SERVO_K,
+    SLAVE_MASS,
     STORED_ENERGY,
     own_memory,
     own_parameters,
@@ -43,20 +43,20 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters; pairs are for translation and rotation.
-_places = own_parameters()
-_SEND_RATE, _DRAIN_RATE = _places.number(), _places.number()
-_INITIAL_ENERGY, _FILL_LEVEL, _CAPACITY = _places.vector(2), _places.vector(2), _places.vector(2)
-_DAMPER, MAX_ACCELERATION = _places.vector(2), _places.vector(2)
-_RESERVE_SHARE = 0.01  # share of the capacity
+_layout = own_parameters()
+_SEND_RATE, _DRAIN_RATE = _layout.number(), _layout.number()
+_INITIAL_ENERGY, _FILL_LEVEL, _CAPACITY = _layout.vector(2), _layout.vector(2), _layout.vector(2)
+_DAMPER, MAX_ACCELERATION = _layout.vector(2), _layout.vector(2)
+_TANK_RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
-_places = own_memory()
-_SPRING_WRENCH, _BRAKE_WRENCH = _places.vector(6), _places.vector(6)
+_layout = own_memory()
+_SPRING_WRENCH, _BRAKE_WRENCH = _layout.vector(6), _layout.vector(6)
 
 
 @settings
 @dataclass
 class TwoLayerConfig:
-    """Parameters of the energy tanks."""
+    """Parameters of the passivity method "two_layer"."""
 
     send_rate: float = quantity(5.0, "1/s", 0.0, 1e6, "share of a tank that is sent in a second")
     drain_rate: float = quantity(
@@ -98,7 +98,7 @@ def _exchange_energy(received, dx, T, p, memory, packet):
     for g in range(2):
         level = ledger[g] - dot_of_group(held, dx, g)
         level += credit_new_energy(g, received, memory)
-        sent = min(T * p[_SEND_RATE], 1.0) * max(level - _RESERVE_SHARE * capacity[g], 0.0)
+        sent = min(T * p[_SEND_RATE], 1.0) * max(level - _TANK_RESERVE_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
@@ -109,7 +109,6 @@ def _exchange_energy(received, dx, T, p, memory, packet):
 
 @njit(cache=True)
 def _max_energy_use(f, dx, g, acceleration, T):
-    """Return the largest energy that the wrench `f` can use until the next step [J]."""
     return dot_of_group(f, dx, g) + length_of_group(f, g) * acceleration * T * T
 
 
@@ -146,24 +145,25 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     if has_arrived(received):
         target = received[POSE]
     pose_difference_into(target, pose, spring)
-    motor_wrench, K, D = memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
+    motor_wrench, K, D = memory[HELD_WRENCH], p[SERVO_K], p[SERVO_D]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             spring[i] *= K[g]
             brake[i] = -D[g] * twist[i]
             motor_wrench[i] = spring[i] + brake[i]
+        mass = p[SLAVE_MASS][g]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
-        available = max(memory[STORED_ENERGY][g] - _RESERVE_SHARE * p[_CAPACITY][g], 0.0)
-        acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / p[MASS][g]
+        available = max(memory[STORED_ENERGY][g] - _TANK_RESERVE_SHARE * p[_CAPACITY][g], 0.0)
+        acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
         if _max_energy_use(motor_wrench, dx, g, acceleration, T) > available:
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(brake, g) / p[MASS][g]
+            acceleration = p[MAX_ACCELERATION][g] + length_of_group(brake, g) / mass
             available -= _max_energy_use(brake, dx, g, acceleration, T)
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(spring, g) / p[MASS][g]
+            acceleration = p[MAX_ACCELERATION][g] + length_of_group(spring, g) / mass
             cost = _max_energy_use(spring, dx, g, acceleration, T)
             share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
                 motor_wrench[i] = share * spring[i] + brake[i]
-            acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / p[MASS][g]
+            acceleration = p[MAX_ACCELERATION][g] + length_of_group(motor_wrench, g) / mass
             _limit_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
             spring[i] = (motor_wrench[i] - brake[i]) / K[g]
@@ -175,7 +175,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def record_command(requested, command, pose, twist, p, memory):
-    spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
+    spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[SERVO_K], p[SERVO_D]
     pose_difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

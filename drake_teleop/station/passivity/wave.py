@@ -1,7 +1,7 @@
-"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991), theory.md (T33) to (T36).
+"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991).
 
-The receiver filters the integral of the wave within the received energy, so jitter and loss create
-no energy.
+docs/theory.md, (T33) to (T36). The receiver filters the integral of the wave within the received
+energy, so jitter and loss create no energy.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -15,11 +15,11 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import copy_into
 from drake_teleop.station.passivity.memory import (
+    CHANNEL_FILL_TIME,
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
     DISSIPATED_ENERGY,
-    FILL_TIME,
     HELD_WRENCH,
     MOTION_SCALE,
     RECEIVED_ENERGY,
@@ -44,16 +44,16 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Parameters.
-_places = own_parameters()
-IMPEDANCE = _places.vector(2)
-_FILTER_TIME, _DAMPER_SHARE = _places.number(), _places.number()
-_MAX_SILENCE, _DRIFT_RATE = _places.number(), _places.number()
+_layout = own_parameters()
+WAVE_IMPEDANCE = _layout.vector(2)
+_FILTER_TIME, _DAMPER_SHARE = _layout.number(), _layout.number()
+_MAX_SILENCE, _DRIFT_RATE = _layout.number(), _layout.number()
 # Memory: integrals of the output wave and of the sent wave; wave of this step; silence [s].
-_places = own_memory()
-_PLAYED_INTEGRAL, _SENT_INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
-_SILENCE, _DRIFT = _places.number(), _places.vector(6)
+_layout = own_memory()
+_PLAYED_INTEGRAL, _SENT_INTEGRAL, _WAVE = _layout.vector(6), _layout.vector(6), _layout.vector(6)
+_SILENCE, _DRIFT = _layout.number(), _layout.vector(6)
 # At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
-_CATCHING_UP, _NEWEST_PACKET = _places.number(), _places.number()
+_CATCHING_UP, _NEWEST_PACKET = _layout.number(), _layout.number()
 
 
 @settings
@@ -86,13 +86,13 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        p[IMPEDANCE], p[_FILTER_TIME], p[_DAMPER_SHARE] = self.impedance, self.filter, self.matching
-        p[_MAX_SILENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
+        p[WAVE_IMPEDANCE], p[_FILTER_TIME] = self.impedance, self.filter
+        p[_DAMPER_SHARE], p[_MAX_SILENCE] = self.matching, self.patience
+        p[_DRIFT_RATE] = self.drift_rate
 
 
 @njit(cache=True)
-def _output_wave(received, T, p, memory, wave):
-    """Write the wave (6,) of this step, the filtered rate of the received wave integral (T34)."""
+def _filter_received_wave(received, T, p, memory, wave):
     ledger, played = memory[STORED_ENERGY], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
@@ -112,13 +112,13 @@ def _output_wave(received, T, p, memory, wave):
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
-    _output_wave(received, T, p, memory, wave)
+    _filter_received_wave(received, T, p, memory, wave)
     catching_up, newest = memory[_CATCHING_UP], received[PACKET_NUMBER]
     if newest > memory[_NEWEST_PACKET] + 1.0:
         catching_up = 1.0
     memory[_CATCHING_UP], memory[_NEWEST_PACKET] = 0.0 if fresh else 1.0, newest
     for g in range(2):
-        b = p[IMPEDANCE][g]
+        b = p[WAVE_IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = math.sqrt(2.0 * b) * wave[i] - b * dx[i] / T
             # The integral ignores the wrench limit, so that no momentum is missing on the line.
@@ -159,20 +159,20 @@ def _limit_wrench_change(g, energy, dx, most, held, wrench):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
-    if memory[FILL_TIME] > 0.0:
-        memory[FILL_TIME] -= T
+    if memory[CHANNEL_FILL_TIME] > 0.0:
+        memory[CHANNEL_FILL_TIME] -= T
         step[:] = 0.0
-        _reflect_while_filling(received, wrench, T, p, memory)
+        _reflect_wave_while_filling(received, wrench, T, p, memory)
     elif memory[_SILENCE] <= p[_MAX_SILENCE]:
         _reflect_wave(received, wrench, T, p, memory)
         if has_arrived(received):
-            _correct_drift(received, wrench, T, p, memory)
+            _correct_pose_drift(received, wrench, T, p, memory)
         move_pose_into(now, step, now)
         for i in range(6):
             step[i] /= T
     else:
         step[:] = 0.0
-        _output_wave_at_rest(wrench, T, p, memory)
+        _reflect_wave_at_rest(wrench, T, p, memory)
     copy_into(packet, INTEGRAL.start, memory, _SENT_INTEGRAL.start, 6)
     copy_into(packet, ENERGY.start, memory, SENT_ENERGY.start, 2)
     copy_into(command, 0, memory, COMMAND.start, 13)
@@ -183,9 +183,9 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 @njit(cache=True)
 def _reflect_wave(received, wrench, T, p, memory):
     wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_SENT_INTEGRAL]
-    _output_wave(received, T, p, memory, wave)
+    _filter_received_wave(received, T, p, memory, wave)
     for g in range(2):
-        b, damper = p[IMPEDANCE][g], p[_DAMPER_SHARE] * p[IMPEDANCE][g]
+        b, damper = p[WAVE_IMPEDANCE][g], p[_DAMPER_SHARE] * p[WAVE_IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             step[i] = T * (math.sqrt(2.0 * b) * wave[i] + wrench[i]) / (b + damper)
             integral[i] += T * wave[i] + math.sqrt(2.0 / b) * (T * wrench[i] - damper * step[i])
@@ -196,12 +196,12 @@ def _reflect_wave(received, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _output_wave_at_rest(wrench, T, p, memory):
+def _reflect_wave_at_rest(wrench, T, p, memory):
     wave, ledger = memory[_WAVE], memory[STORED_ENERGY]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
-            wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
+            wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
         energy = 0.5 * T * dot_of_group(wave, wave, g)
         if energy <= ledger[g]:
             ledger[g] -= energy
@@ -212,13 +212,13 @@ def _output_wave_at_rest(wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _reflect_while_filling(received, wrench, T, p, memory):
+def _reflect_wave_while_filling(received, wrench, T, p, memory):
     wave, ledger, accounted = memory[_WAVE], memory[STORED_ENERGY], memory[RECEIVED_ENERGY]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
         accounted[g] = max(accounted[g], received[ENERGY][g])
         for i in range(3 * g, 3 * g + 3):
-            wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
+            wave[i] = -wrench[i] / math.sqrt(2.0 * p[WAVE_IMPEDANCE][g])
             integral[i] -= T * wave[i]
             played[i] = received[INTEGRAL][i] - p[_FILTER_TIME] * wave[i]
         memory[SENT_ENERGY][g] += 0.5 * T * dot_of_group(wave, wave, g)
@@ -226,7 +226,7 @@ def _reflect_while_filling(received, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _correct_drift(received, wrench, T, p, memory):
+def _correct_pose_drift(received, wrench, T, p, memory):
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
     pose_difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):

@@ -1,4 +1,4 @@
-"""Estimated motion of the sensor frame S (long: each source with its delay and noise).
+"""Estimated motion of the sensor frame S (long: one file for sources, their delays and noise).
 
 Sources of specific force s of So, angular velocity omega and acceleration alpha:
 
@@ -44,7 +44,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     settle_low_pass,
     shift_delay_line,
 )
-from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, sensor_motion
+from drake_teleop.station.slave.arm import FRAME_STATE_SIZE, GRAVITY_COLUMN, sensor_motion
 
 _MOTION_SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
@@ -55,31 +55,29 @@ _MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 # Constants: period, whether the encoders are the only source, whether they correct the
 # accelerometer, waits of wrench, acceleration and angles (fractional) in samples.
-_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _DELAYS = 0, 1, 2, 3
-_POSITION = 6  # (3,) position of the accelerometer
-_ORIENTATION = _POSITION + 3  # (3, 3)
-_LOW_PASSES = _ORIENTATION + 9  # (4, 5) low-passes of the angles: the sensor's and `encoders`'
+_PERIOD_INDEX, _USE_ENCODERS_INDEX, _USE_FUSION_INDEX, _PATH_WAITS = 0, 1, 2, 3
+_ACCELEROMETER_POSITION = 6  # (3,)
+_ACCELEROMETER_AXES = _ACCELEROMETER_POSITION + 3  # (3, 3)
+_ANGLE_LOW_PASSES = _ACCELEROMETER_AXES + 9  # (4, 5) the sensor's and those of `encoders`
 _NUM_FILTER_SECTIONS = 4
-_ANGULAR_GAINS = _LOW_PASSES + 5 * _NUM_FILTER_SECTIONS
+_ANGULAR_GAINS = _ANGLE_LOW_PASSES + 5 * _NUM_FILTER_SECTIONS
 _LINEAR_GAINS = _ANGULAR_GAINS + 3
-# Memory: samples taken, samples for which the flag stays; state of `_update_filters` for angle and
-# displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
+# Memory: samples taken, samples for which the flag stays; state of `_update_fusion_filters` for
+# angle and displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
-_FLAG_SAMPLES = 1
+_FLAG_SAMPLES_LEFT = 1
 _ANGULAR_FILTER_START = 2
-_FILTER_SIZE = 24
-_LINEAR_FILTER_START = _ANGULAR_FILTER_START + _FILTER_SIZE
-_MOTION = _LINEAR_FILTER_START + _FILTER_SIZE
-_JOINTS = _MOTION + FRAME_STATE_SIZE
+_FUSION_FILTER_SIZE = 24
+_LINEAR_FILTER_START = _ANGULAR_FILTER_START + _FUSION_FILTER_SIZE
+_KINEMATICS_SCRATCH = _LINEAR_FILTER_START + _FUSION_FILTER_SIZE
+_JOINT_START = _KINEMATICS_SCRATCH + FRAME_STATE_SIZE
 _NUM_VALUES_PER_JOINT = 5 + 2 * _NUM_FILTER_SECTIONS
-#: Index of the gravity vector in the last row of `ArmModel.table`.
-_GRAVITY = 22
 
 
 @settings
 @dataclass
 class MotionEstimationConfig:
-    """Source of the estimated motion of the sensor."""
+    """Settings of the motion estimation of the sensor frame S."""
 
     source: str = choice(
         "accelerometer", _MOTION_SOURCES, "source of angular velocity and accelerations"
@@ -161,7 +159,7 @@ def path_delays(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> PathDelays:
     wrench, acceleration, encoders = sensor.delays(period)
-    encoders += _group_delay(_low_pass_filters_of_paths(config, sensor, period)) * period
+    encoders += _group_delay_samples(_low_pass_filters_of_paths(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
@@ -173,7 +171,7 @@ def fusion_filters(
 ) -> tuple[SteadyStateFilter, SteadyStateFilter]:
     """Return the Kalman filters of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
-    angle_std, drift = _angle_std(sensor, num_joints), config.angular_acceleration_drift
+    angle_std, drift = _encoder_angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
         steady_state_kalman_filter(angle_std, alpha_std.mean(), drift, period),
         steady_state_kalman_filter(
@@ -185,7 +183,7 @@ def fusion_filters(
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> NDArray[np.float64]:
-    """Return standard deviations (9,) of s [m/s^2], omega (exact) [rad/s] and alpha [rad/s^2]."""
+    """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
         return np.concatenate([s_std, np.zeros(3), alpha_std])
@@ -198,12 +196,12 @@ def estimated_motion_std(
     power = np.mean(np.abs(np.prod(response, axis=0) * differenced) ** 2)
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
-    alpha = _angle_std(sensor, num_joints) * np.sqrt(power)
+    alpha = _encoder_angle_std(sensor, num_joints) * np.sqrt(power)
     return np.repeat([alpha * _RMS_LEVER_M, 0.0, alpha], 3)
 
 
-def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the encoders' rounding error as rotation about any axis of S, 1 sigma [rad]."""
+def _encoder_angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
+    """Return the standard deviation [rad] of the rotation of S by the encoders' rounding."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
@@ -211,7 +209,7 @@ def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
 def _accelerometer_std(
     sensor: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return standard deviations (3,) of the specific force at So, and (3,) of alpha."""
+    """Return standard deviations (3,) of specific force at So, (3,) of angular acceleration."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
@@ -223,6 +221,7 @@ def _accelerometer_std(
 def motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return constants and initial memory of `estimate_sample_into`."""
     delays = path_delays(config, sensor, period)
     paths = np.array([delays.wrench, delays.acceleration, delays.encoders])
     used = np.array([True, config.source != "encoders", True])
@@ -245,7 +244,7 @@ def motion_estimator(
     )
     rows = int(np.ceil(waits.max())) + 1
     return constants, np.zeros(
-        _JOINTS + _NUM_VALUES_PER_JOINT * num_joints + rows * (12 + num_joints)
+        _JOINT_START + _NUM_VALUES_PER_JOINT * num_joints + rows * (12 + num_joints)
     )
 
 
@@ -259,8 +258,8 @@ def _low_pass_filters_of_paths(
     if config.source == "encoders":
         if config.encoder_bandwidth_hz >= 0.45 / period:
             raise DrakeTeleopError(
-                f"{config.encoder_bandwidth_hz:g} Hz is too near to half of the sensor's rate "
-                f"({1 / period:g} Hz)",
+                f"a bandwidth of {config.encoder_bandwidth_hz:g} Hz is too near to half of the "
+                f"sensor's rate ({1 / period:g} Hz)",
                 where="motion_estimation.encoder_bandwidth_hz",
                 remedy="lower the bandwidth below 0.45 of the sensor's rate",
             )
@@ -268,14 +267,14 @@ def _low_pass_filters_of_paths(
     return filters
 
 
-def _group_delay(sections: NDArray[np.float64]) -> float:
+def _group_delay_samples(sections: NDArray[np.float64]) -> float:
     b0, b1, b2, a1, a2 = sections.T
     return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
 
 
 @njit(cache=True)
 def estimate_sample_into(constants, memory, arm, reading, sample):
-    """Convert one reading of the sensor, one per period, to a sample of a single instant.
+    """Convert one reading of the sensor per period to a sample whose values have the same instant.
 
     Args:
         constants, memory: results of `motion_estimator`; memory is updated.
@@ -283,9 +282,10 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
         sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
-    motion, joints = memory[_MOTION:_JOINTS], memory[_JOINTS:][: _NUM_VALUES_PER_JOINT * n]
+    motion = memory[_KINEMATICS_SCRATCH:_JOINT_START]
+    joints = memory[_JOINT_START:][: _NUM_VALUES_PER_JOINT * n]
     angles = sample[SAMPLE_JOINT_POSITION]
-    _align_paths(constants, memory, n, reading, sample)
+    _align_signal_paths(constants, memory, n, reading, sample)
     if memory[0] == 0.0:
         for i in range(3 * n):
             joints[2 * n + i] = angles[i % n]
@@ -294,7 +294,7 @@ def estimate_sample_into(constants, memory, arm, reading, sample):
     if constants[_USE_ENCODERS_INDEX] != 0.0:
         copy_into(sample, SAMPLE_MOTION.start, motion, 0, 9)
     else:
-        _convert_accelerometer(constants, memory, arm[n, _GRAVITY:], motion, sample)
+        _convert_accelerometer(constants, memory, arm[n, GRAVITY_COLUMN:], motion, sample)
     memory[0] += 1.0
 
 
@@ -305,28 +305,28 @@ def estimate_sample_with_gyroscope_into(constants, memory, reading, sample):
     The first three of the n "joint angles" are the measured angular velocity of S, in S [rad/s].
     """
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
-    motion = memory[_MOTION:_JOINTS]
-    _align_paths(constants, memory, n, reading, sample)
+    motion = memory[_KINEMATICS_SCRATCH:_JOINT_START]
+    _align_signal_paths(constants, memory, n, reading, sample)
     copy_into(motion, 3, sample, SAMPLE_JOINT_POSITION.start, 3)
     _convert_accelerometer(constants, memory, motion[:3], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
-def _align_paths(constants, memory, n, reading, sample):
-    sections, angles = constants[_LOW_PASSES:_ANGULAR_GAINS], sample[SAMPLE_JOINT_POSITION]
-    filtered = memory[_JOINTS:][: _NUM_VALUES_PER_JOINT * n][5 * n :]
+def _align_signal_paths(constants, memory, n, reading, sample):
+    sections, angles = constants[_ANGLE_LOW_PASSES:_ANGULAR_GAINS], sample[SAMPLE_JOINT_POSITION]
+    filtered = memory[_JOINT_START:][: _NUM_VALUES_PER_JOINT * n][5 * n :]
     copy_into(angles, 0, reading, READ_ANGLES.start, n)
     if memory[0] == 0.0:
         settle_low_pass(sections, filtered, angles)
     low_pass_in_place(sections, filtered, angles)
-    _delay_paths(constants, memory, n, reading, sample)
+    _delay_signal_paths(constants, memory, n, reading, sample)
 
 
 @njit(cache=True)
-def _delay_paths(constants, memory, n, reading, sample):
+def _delay_signal_paths(constants, memory, n, reading, sample):
     angles, width = sample[SAMPLE_JOINT_POSITION], 12 + n
-    line = memory[_JOINTS + _NUM_VALUES_PER_JOINT * n :]
+    line = memory[_JOINT_START + _NUM_VALUES_PER_JOINT * n :]
     rows = line.shape[0] // width
     shift_delay_line(line, width)
     for i in range(12):
@@ -336,21 +336,21 @@ def _delay_paths(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         for k in range(1, rows):
             copy_into(line, k * width, line, 0, width)
-    wrench = int(constants[_DELAYS]) * width
-    acceleration = int(constants[_DELAYS + 1]) * width
+    wrench = int(constants[_PATH_WAITS]) * width
+    acceleration = int(constants[_PATH_WAITS + 1]) * width
     waited, read = sample[SAMPLE_WRENCH], sample[SAMPLE_MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
-    wait = int(constants[_DELAYS + 2])
-    older = constants[_DELAYS + 2] - wait
+    wait = int(constants[_PATH_WAITS + 2])
+    older = constants[_PATH_WAITS + 2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES] - 1.0
-    memory[_FLAG_SAMPLES] = max(flagged, 0.0)
-    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAG_SAMPLES] > 0.0 else 0.0
+    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES_LEFT] - 1.0
+    memory[_FLAG_SAMPLES_LEFT] = max(flagged, 0.0)
+    sample[SATURATION_FLAG_INDEX] = 1.0 if memory[_FLAG_SAMPLES_LEFT] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -376,7 +376,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
         sample[SAMPLE_ANGULAR_VELOCITY],
         sample[SAMPLE_ANGULAR_ACCELERATION],
     )
-    R_SA, R = matrix_at(constants, _ORIENTATION), motion[12:21]
+    R_SA, R = matrix_at(constants, _ACCELEROMETER_AXES), motion[12:21]
     alpha[0], alpha[1], alpha[2] = apply_matrix(R_SA, vector_at(omega, 0))
     s[0], s[1], s[2] = apply_matrix(R_SA, vector_at(s, 0))
     for i in range(3):
@@ -384,7 +384,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
 
     angular, linear = (
         memory[_ANGULAR_FILTER_START:_LINEAR_FILTER_START],
-        memory[_LINEAR_FILTER_START:_MOTION],
+        memory[_LINEAR_FILTER_START:_KINEMATICS_SCRATCH],
     )
     if fused:
         if starts:
@@ -394,7 +394,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
         copy_into(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
-        _update_filters(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
+        _update_fusion_filters(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
         for i in range(3):
             angular[12 + i] -= motion[i]
             alpha[i] += motion[i]
@@ -402,7 +402,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
             omega[i] = angular[3 + i] + 0.5 * period * alpha[i]
 
     # From Ao to So, with r = p_SoAo_S.
-    r, w = vector_at(constants, _POSITION), vector_at(omega, 0)
+    r, w = vector_at(constants, _ACCELEROMETER_POSITION), vector_at(omega, 0)
     s[0], s[1], s[2] = minus(s, add_cross_product(cross(alpha, r), w, cross(w, r)))
     if fused:
         if starts:
@@ -413,7 +413,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
             s[i] -= linear[12 + i]
         a_W = motion[3:6]  # reuses the encoders' omega
         a_W[0], a_W[1], a_W[2] = plus(apply_matrix(R, s), gravity)
-        _update_filters(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
+        _update_fusion_filters(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
         correction = apply_matrix(transposed(R), motion)
         for i in range(3):
             linear[12 + i] -= correction[i]
@@ -432,7 +432,7 @@ def _rotation_vector_into(before, R, angle):
 
 
 @njit(cache=True)
-def _update_filters(gains, period, moved, acceleration, kept):
+def _update_fusion_filters(gains, period, moved, acceleration, kept):
     for i in range(3):
         mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0
         rate = kept[3 + i] + period * mean

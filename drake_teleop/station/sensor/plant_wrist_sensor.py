@@ -1,7 +1,7 @@
 """Wrist sensor at a weld of any MultibodyPlant, continuous or discrete.
 
-With sampled output ports, reaction and acceleration belong to the state before a step; the block
-holds pose and velocity of this state to pair them.
+If the plant's output ports are sampled, reaction and acceleration belong to the state before a
+step; the block holds pose and velocity of this state to pair them.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     LOST_FLAG_SAMPLES,
     NOISE_SIZE,
     SAMPLES_PER_NOISE_BLOCK,
-    TRUE_ANGLES,
+    TRUE_JOINT_ANGLES,
     WristSensorConfig,
     is_plausible,
     read_sensor_into,
@@ -72,7 +72,7 @@ Array = NDArray[np.float64]
 
 _NAME_IN_ERRORS = "AddWristSensor"
 #: Default sampling period for continuous plants [s].
-_DEFAULT_PERIOD = 1e-3
+_DEFAULT_PERIOD_S = 1e-3
 #: Tolerance of whole multiples of the plant's time step, in steps.
 _STEP_TOLERANCE = 1e-6
 # Geometry of the sensor at its weld: p_BoSo_B, R_BS, R_SJc, p_SoJc_S, gravity in W, and the sign
@@ -86,7 +86,7 @@ _POSITION, _ORIENTATION, _JOINT_ORIENTATION, _JOINT_POSITION, _GRAVITY, _WRENCH_
     27,
 )
 # Configuration: R_WB, angular velocity of B in W, joint positions.
-_POSE_SIZE = 12
+_BODY_MOTION_SIZE = 12
 
 
 class _SensorWeld(NamedTuple):
@@ -159,14 +159,14 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         - reaction_forces
         - noise: (NOISE_SIZE,) standard normal numbers (not if the sensor is ideal)
         output_ports:
-        - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So, Eq. (1) [N, N m]
+        - measured_wrench_S: (6,) [f; tau] of the sensor on the load about So [N, N m]
         - specific_force_S: (3,) a - g of So [m/s^2]
         - angular_velocity_S: (3,) [rad/s], of an ideal gyroscope with the encoders' delay
         - angular_acceleration_S: (3,) [rad/s^2]
         - status: 0 valid; 1 a channel is saturated; 2 and above no sample yet, or an impossible one
         - joint_position: (n,) positions q
         - sample_time: instant of the sample [s]
-        - sample: the parts above side by side, as `ForceScaling` reads them
+        - sample: the outputs above in one vector, for `ForceScaling`
     """
 
     __slots__ = ONE_DICT
@@ -180,7 +180,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         model_instance: ModelInstanceIndex | None = None,
     ) -> None:
         super().__init__()
-        S, joint = _sensor_frame(plant, joint_or_frame)
+        S, joint = _frame_and_weld(plant, joint_or_frame)
         self._weld = _weld_properties(plant, S, joint)
         step = plant.time_step() or None
         self._step_s, self._steps_per_sample = _event_period_and_count(step, period)
@@ -193,7 +193,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         motion, estimator = motion_estimator(MotionEstimationConfig(), config, 3 + n, self.period)
         sample = np.zeros(sample_size(n) + 1)
         sample[SATURATION_FLAG_INDEX] = LOST_SAMPLE_FLAG
-        held = np.full(_POSE_SIZE + n, np.nan)
+        held = np.full(_BODY_MOTION_SIZE + n, np.nan)
         ends = np.cumsum([len(held), len(sample), len(chain), len(estimator)]).tolist()
         self._held, self._sample = slice(0, ends[0]), slice(ends[0], ends[1])
         self._sensor = (constants, motion, ends[2] - ends[1], config.ideal)
@@ -213,7 +213,7 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         noise = None if config.ideal else self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self._noise = noise
         self.DeclareDiscreteState(np.concatenate([held, sample, chain, estimator]))
-        self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(self._step_s, 0.0, self._update_state)
         if self._pairs_steps:
             self.DeclareInitializationDiscreteUpdateEvent(self._hold_configuration)
         first = 0
@@ -235,23 +235,23 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
 
         self.DeclareVectorOutputPort(name, size, calc_part_of_sample, {self.xd_ticket()})
 
-    def _configuration(self, context: Context) -> Array:
+    def _evaluate_configuration(self, context: Context) -> Array:
         _, body, _ = self._weld
         R_WB = self._poses.Eval(context)[body].rotation().matrix()
         omega_WB = self._velocities.Eval(context)[body].rotational()
         return np.concatenate([R_WB.ravel(), omega_WB, self._state.Eval(context)[: self._n]])
 
     def _hold_configuration(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.get_mutable_value(0)[self._held] = self._configuration(context)
+        discrete_state.get_mutable_value(0)[self._held] = self._evaluate_configuration(context)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_state(self, context: Context, discrete_state: DiscreteValues) -> None:
         step = round(context.get_time() / self._step_s)
         held = discrete_state.value(0)[self._held].copy()
         if self._pairs_steps and (step + 1) % self._steps_per_sample == 0:
             # Drake has updated the plant: the state is that of the step's end.
             self._hold_configuration(context, discrete_state)
         if step % self._steps_per_sample == 0:
-            configuration = held if self._pairs_steps else self._configuration(context)
+            configuration = held if self._pairs_steps else self._evaluate_configuration(context)
             memory = discrete_state.get_mutable_value(0)
             self._take_sample(context, configuration, memory)
 
@@ -260,10 +260,11 @@ class PlantWristSensor(DoubleOnly, LeafSystem):
         acceleration = self._accelerations.Eval(context)[body].get_coeffs()
         force = self._reactions.Eval(context)[reaction].get_coeffs()
         noise = self._no_noise if self._noise is None else self._noise.Eval(context)
-        truth = np.empty(TRUE_ANGLES.start + 3 + self._n)
+        truth = np.empty(TRUE_JOINT_ANGLES.start + 3 + self._n)
         _true_values_into(geometry, configuration, acceleration, force, truth)
         sample = memory[self._sample]
-        _sample_into(self._sensor, truth, noise, memory[self._filters], sample[:SAMPLE_TIME_INDEX])
+        filters = memory[self._filters]
+        _measure_sample_into(self._sensor, truth, noise, filters, sample[:SAMPLE_TIME_INDEX])
         sample[SAMPLE_TIME_INDEX] = context.get_time()
 
 
@@ -289,15 +290,14 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
         truth[SAMPLE_WRENCH.start + i] = geometry[_WRENCH_SIGN] * f[i]
         truth[SAMPLE_WRENCH.start + 3 + i] = geometry[_WRENCH_SIGN] * tau[i]
         truth[SAMPLE_SPECIFIC_FORCE.start + i] = s[i]
-        truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
+        truth[SAMPLE_ANGULAR_VELOCITY.start + i] = truth[TRUE_JOINT_ANGLES.start + i] = omega[i]
         truth[SAMPLE_ANGULAR_ACCELERATION.start + i] = alpha[i]
-    copy_into(
-        truth, TRUE_ANGLES.start + 3, configuration, _POSE_SIZE, configuration.shape[0] - _POSE_SIZE
-    )
+    n = configuration.shape[0] - _BODY_MOTION_SIZE
+    copy_into(truth, TRUE_JOINT_ANGLES.start + 3, configuration, _BODY_MOTION_SIZE, n)
 
 
 @njit(cache=True)
-def _sample_into(sensor, truth, noise, memory, sample):
+def _measure_sample_into(sensor, truth, noise, memory, sample):
     constants, motion_constants, end, ideal = sensor
     n = sample.shape[0] - SAMPLE_JOINT_POSITION.start
     if not is_plausible(constants, truth):  # keeps it out of the filters
@@ -307,7 +307,7 @@ def _sample_into(sensor, truth, noise, memory, sample):
     if ideal:
         copy_into(sample, 0, truth, 0, SAMPLE_WRENCH_AND_MOTION.stop)
         sample[SATURATION_FLAG_INDEX] = 0.0
-        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_ANGLES.start + 3, n)
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start + 3, n)
     else:
         reading, estimate = np.empty(truth.shape[0] - 2), np.empty(truth.shape[0] + 1)
         read_sensor_into(constants, memory[:end], noise, truth, reading)
@@ -337,27 +337,29 @@ def _check_plant(builder: DiagramBuilder, plant: MultibodyPlant) -> None:
 def _event_period_and_count(step: float | None, period: float | None) -> tuple[float, int]:
     if period is not None and not 0.0 < period < np.inf:
         raise DrakeTeleopError(
-            f"{period} s is not positive and finite",
+            f"a sampling period of {period} s is not positive and finite",
             where=f"{_NAME_IN_ERRORS}: period",
             remedy="give the time between samples [s]",
         )
     if step is None:
-        return period or _DEFAULT_PERIOD, 1
+        return period or _DEFAULT_PERIOD_S, 1
     count = (period or step) / step
     if count < 1 - _STEP_TOLERANCE or abs(count - round(count)) > _STEP_TOLERANCE:
         raise DrakeTeleopError(
-            f"{period:g} s is no multiple of the plant's time step {step:g} s",
+            f"sampling period {period:g} s is no multiple of the plant's time step {step:g} s",
             where=f"{_NAME_IN_ERRORS}: period",
             remedy=f"choose a multiple, such as {max(1, round(count)) * step:g} s",
         )
     return step, round(count)
 
 
-def _sensor_frame(plant: MultibodyPlant, joint_or_frame: Joint | Frame) -> tuple[Frame, WeldJoint]:
+def _frame_and_weld(
+    plant: MultibodyPlant, joint_or_frame: Joint | Frame
+) -> tuple[Frame, WeldJoint]:
     expect_type((Joint, Frame), joint_or_frame, f"{_NAME_IN_ERRORS}: joint_or_frame")
     if joint_or_frame.GetParentPlant() is not plant:
         raise DrakeTeleopError(
-            f"'{joint_or_frame.name()}' belongs to another plant",
+            f"joint or frame '{joint_or_frame.name()}' belongs to another plant",
             where=f"{_NAME_IN_ERRORS}: joint_or_frame",
             remedy="pass a joint or frame of this plant",
         )

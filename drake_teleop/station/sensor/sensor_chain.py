@@ -1,4 +1,4 @@
-"""Wrist sensor as a chain from truth to readings (long: parameters beside their functions)::
+"""Wrist sensor as a chain from truth to readings (long: one file for parameters and chain)::
 
     wrench at So in S        -> calibration errors ----.
     motion of S -> moved to Ao, turned into A          |
@@ -109,10 +109,10 @@ class WristSensorConfig:
     )
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
-    force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white, 1 sigma of each raw sample")
-    torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "white, 1 sigma of each raw sample")
-    acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "white, 1 sigma")
-    angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "white, 1 sigma")
+    force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white noise of raw samples, 1 sigma")
+    torque_noise: float = quantity(0.012, "N m", 0.0, 10.0, "white noise of raw samples, 1 sigma")
+    acceleration_noise: float = quantity(0.06, "m/s^2", 0.0, 100.0, "white noise, 1 sigma")
+    angular_acceleration_noise: float = quantity(1.5, "rad/s^2", 0.0, 1e3, "white noise, 1 sigma")
     force_walk: float = quantity(0.002, "N/sqrt(s)", 0.0, 10.0, "random walk")
     torque_walk: float = quantity(4e-5, "N m/sqrt(s)", 0.0, 1.0, "random walk")
     acceleration_walk: float = quantity(6e-4, "m/s^2/sqrt(s)", 0.0, 10.0, "random walk")
@@ -136,19 +136,21 @@ class WristSensorConfig:
     encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
 
     saturates: bool = plain(True, "readings are limited to the ranges and flagged by `saturated`")
-    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "fx, fy, fz")
-    torque_range: list[float] = quantity([12.0, 12.0, 12.0], "N m", 0.01, 1e4, "about So")
-    acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "specific force")
-    angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "each axis")
+    force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "range of fx, fy, fz")
+    torque_range: list[float] = quantity(
+        [12.0, 12.0, 12.0], "N m", 0.01, 1e4, "range of tx, ty, tz about So"
+    )
+    acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "range of each axis")
+    angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "range of each axis")
 
     force_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "of force and torque, rounded to whole samples"
+        0.0, "s", 0.0, 0.1, "latency of force and torque, rounded to whole samples"
     )
     acceleration_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "of accelerations, rounded to whole samples"
+        0.0, "s", 0.0, 0.1, "latency of accelerations, rounded to whole samples"
     )
     encoder_latency: float = quantity(
-        0.0, "s", 0.0, 0.1, "of joint angles, rounded to whole samples"
+        0.0, "s", 0.0, 0.1, "latency of joint angles, rounded to whole samples"
     )
 
     def noise_std(self) -> NDArray[np.float64]:
@@ -176,12 +178,12 @@ class WristSensorConfig:
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
-        """Return standard deviations (6,) of force and torque by noise and quantum [N, N m]."""
+        """Return standard deviations (6,) of force and torque by noise, quantisation [N, N m]."""
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> NDArray[np.float64]:
-        """Return standard deviations of s [m/s^2], omega (exact) and alpha [rad/s^2], (9,)."""
+        """Return standard deviations (9,) of specific force, omega (exact: 0), alpha [SI units]."""
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
@@ -218,7 +220,7 @@ class WristSensorConfig:
         filtered = not self.ideal and self.low_pass != "none"
         if filtered and self.bandwidth_hz >= 0.45 * rate_hz:
             raise DrakeTeleopError(
-                f"{self.bandwidth_hz:g} Hz is too near to half of the sensor's rate "
+                f"a bandwidth of {self.bandwidth_hz:g} Hz is too near to half of the sensor's rate "
                 f"({rate_hz:g} Hz)",
                 where=f"{where}.bandwidth_hz",
                 remedy="lower the bandwidth below 0.45 of the sensor's rate, or set low_pass: none",
@@ -251,14 +253,15 @@ PARTS: dict[str, dict[str, Any]] = {
 def without_parts(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
     """Return a copy of the configuration without some parts of the sensor (keys of `PARTS`).
 
-    >>> without(WristSensorConfig(), "noise", "offset").force_noise 0.0
+    >>> without_parts(WristSensorConfig(), "noise", "offset").force_noise
+    0.0
     """
     changes = {name: value for part in parts for name, value in PARTS[part].items()}
     return dataclasses.replace(config, **copy.deepcopy(changes))
 
 
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
-    """Return the sections (2, 5) [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass."""
+    """Return two second-order sections [b0, b1, b2, a1, a2] of a 4th-order Butterworth low-pass."""
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_NUM_LOW_PASS_SECTIONS, 5))
     for row, angle in enumerate((np.pi / 8, 3 * np.pi / 8)):
@@ -277,7 +280,7 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 def calibration_matrices(
     config: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return matrices that multiply true values by the calibration errors, drawn with seed `unit`.
+    """Return matrices from true values to values with calibration errors; seed: `config.unit`.
 
     They are (6, 6) for [f; tau] in S, (3, 3) for specific force and (3, 3) for angular acceleration
     in A.
@@ -303,21 +306,21 @@ def _rotation_matrix(axis: NDArray[np.float64], angle: float) -> NDArray[np.floa
 #: Constants: offset of force and torque, which may change during a run.
 OFFSET_CONSTANTS = slice(0, 6)
 # True values: as a sample (`drake_teleop.load.regressor`) without the flag.
-TRUE_ANGLES = slice(15, None)
+TRUE_JOINT_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
 READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 # Constants: 12 offsets, 12 drifts per sample, then these.
 _DRIFT, _NOISE, _WALK, _QUANTUM_START, _RANGE_START = range(12, 72, 12)
-_WRENCH = 72  # (6, 6)
-_MOTION = _WRENCH + 36  # (2, 3, 3) from S into A, for s and alpha
-_POSITION = _MOTION + 18  # (3,)
-_FILTER = _POSITION + 3  # (2, 5)
-_LOW_PASS_STAGE = _FILTER + 5 * _NUM_LOW_PASS_SECTIONS
-_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
-_ENCODER = _LATENCIES + 3
-_IS_IDEAL = _ENCODER + 1
-_OVERLOADS = _IS_IDEAL + 1  # (6,)
+_WRENCH_CALIBRATION = 72  # (6, 6)
+_MOTION_CALIBRATION = _WRENCH_CALIBRATION + 36  # (2, 3, 3) from S into A, for s and alpha
+_ACCELEROMETER_POSITION = _MOTION_CALIBRATION + 18  # (3,)
+_LOW_PASS_START = _ACCELEROMETER_POSITION + 3  # (2, 5)
+_LOW_PASS_STAGE = _LOW_PASS_START + 5 * _NUM_LOW_PASS_SECTIONS
+_PATH_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
+_ENCODER_STEP = _PATH_LATENCIES + 3
+_IS_IDEAL = _ENCODER_STEP + 1
+_OVERLOAD_LIMITS = _IS_IDEAL + 1  # (6,)
 _BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
@@ -332,7 +335,7 @@ def sensor_chain_constants(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `read_sensor_into` for an arm with n joints.
 
-    `constants[OFFSET]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
+    `constants[OFFSET_CONSTANTS]` is the wrench's offset [N, N m]. `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer()
@@ -374,7 +377,7 @@ def is_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor."""
     good = True
     for i in range(6):
-        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOADS + i]
+        good = good and abs(truth[i] + constants[i]) <= constants[_OVERLOAD_LIMITS + i]
     for i in range(6, truth.shape[0]):
         good = good and abs(truth[i]) <= LARGEST_PORT_VALUE
     return good
@@ -392,7 +395,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
             in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
-    angles = truth[TRUE_ANGLES]
+    angles = truth[TRUE_JOINT_ANGLES]
     if constants[_IS_IDEAL] != 0.0:
         copy_into(reading, READ_WRENCH.start, truth, SAMPLE_WRENCH.start, 6)
         copy_into(reading, READ_ACCELERATION.start, truth, SAMPLE_SPECIFIC_FORCE.start, 3)
@@ -410,7 +413,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         memory[_RANDOM_WALK_START:FILTER_MEMORY_START],
         memory[FILTER_MEMORY_START:_DELAY_LINE_START],
     )
-    sections, place = constants[_FILTER:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
+    sections, place = constants[_LOW_PASS_START:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
     if count % SAMPLES_PER_NOISE_BLOCK == 0:
         for i in range(_NUM_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_NUM_CHANNELS * SAMPLES_PER_NOISE_BLOCK + i]
@@ -431,7 +434,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
     row[_NUM_CHANNELS + 1] = _quantize(constants, 6, 12, channels)
     if place == _AFTER_CONVERTER:
         low_pass_in_place(sections, filtered, channels)
-    quantum = constants[_ENCODER]
+    quantum = constants[_ENCODER_STEP]
     for i in range(_DELAY_LINE_ROW, width):
         angle = angles[i - _DELAY_LINE_ROW]
         row[i] = quantum * np.rint(angle / quantum) if quantum > 0.0 else angle
@@ -440,7 +443,7 @@ def read_sensor_into(constants, memory, noise, truth, reading):
         for k in range(1, rows):
             copy_into(memory, _DELAY_LINE_START + k * width, row, 0, width)
     memory[0] += 1.0
-    late = constants[_LATENCIES:_ENCODER]
+    late = constants[_PATH_LATENCIES:_ENCODER_STEP]
     force = _DELAY_LINE_START + int(late[0]) * width
     acceleration = _DELAY_LINE_START + int(late[1]) * width
     encoders = _DELAY_LINE_START + int(late[2]) * width
@@ -469,12 +472,12 @@ def _apply_calibration_errors(constants, truth, out):
     for i in range(6):
         value = 0.0
         for j in range(6):
-            value += constants[_WRENCH + 6 * i + j] * wrench[j]
+            value += constants[_WRENCH_CALIBRATION + 6 * i + j] * wrench[j]
         out[i] = value
-    r = vector_at(constants, _POSITION)
+    r = vector_at(constants, _ACCELEROMETER_POSITION)
     at_Ao = add_cross_product(add_cross_product(s, alpha, r), omega, cross(omega, r))
-    out[6], out[7], out[8] = apply_matrix(matrix_at(constants, _MOTION), at_Ao)
-    out[9], out[10], out[11] = apply_matrix(matrix_at(constants, _MOTION + 9), alpha)
+    out[6], out[7], out[8] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION), at_Ao)
+    out[9], out[10], out[11] = apply_matrix(matrix_at(constants, _MOTION_CALIBRATION + 9), alpha)
 
 
 @njit(cache=True)
@@ -515,7 +518,7 @@ def low_pass_in_place(sections, memory, values):
 
 @njit(cache=True)
 def settle_low_pass(sections, memory, values):
-    """Set the memory of the filter `low_pass` to its steady state at `values` (n,)."""
+    """Set the memory of `low_pass_in_place` to its steady state at `values` (n,)."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):
         b1, b2 = sections[5 * k + 1], sections[5 * k + 2]

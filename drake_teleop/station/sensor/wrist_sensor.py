@@ -1,9 +1,9 @@
-"""Wrist sensor in the station: sampling instants, samples (long: the step and its block).
+"""Wrist sensor in the station (long: one file for the compiled step and its Drake block).
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
 The state at each sampling instant is interpolated within an integration step. With contact outside
-the compiled law (`ToolContactModel.beyond`) each sample is an event at the end of a step.
+the compiled contact law (`ToolContactModel.beyond`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     NOISE_SIZE,
     OFFSET_CONSTANTS,
     SAMPLES_PER_NOISE_BLOCK,
-    TRUE_ANGLES,
+    TRUE_JOINT_ANGLES,
     WristSensorConfig,
     is_plausible,
     read_sensor_into,
@@ -103,7 +103,7 @@ _NO_GIVEN_WRENCH = np.zeros(0)
 
 @njit(cache=True)
 def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Write the true wrench and motion [f, tau, s, omega, alpha] of S into `out` (15,).
+    """Write the true wrench, specific force, omega and alpha of S into `out` (15,).
 
     `contact_W` (6,) is the wrench of the environment on the tool about the world's origin, in W;
     `phi` (10,) are the tool's inertial parameters.
@@ -125,7 +125,7 @@ def true_sample_into(arm, phi, q, v, vdot, contact_W, motion, out):
 
 
 @njit(cache=True)
-def _interpolate(h, u, x, xdot, end, end_dot, out):
+def _interpolate_state(h, u, x, xdot, end, end_dot, out):
     half = x.shape[0] // 2
     for i in range(half):
         q, v, a = x[i], x[half + i], xdot[half + i]
@@ -150,7 +150,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     v, vdot = x[half : half + n], xdot[half : half + n]
     rigid = truth[SAMPLE_WRENCH_AND_MOTION]
     true_sample_into(arm, phi, x[:n], v, vdot, wrench_W, np.empty(FRAME_STATE_SIZE), rigid)
-    copy_into(truth, TRUE_ANGLES.start, x, 0, n)
+    copy_into(truth, TRUE_JOINT_ANGLES.start, x, 0, n)
     size = FIRST_JOINT_INDEX + n
     sample = memory[:size]
     copy_into(memory, size, memory, 0, size)
@@ -167,7 +167,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
             SAMPLE_WRENCH_AND_MOTION.stop,
         )
         sample[SATURATION_FLAG_INDEX] = 0.0
-        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_ANGLES.start, n)
+        copy_into(sample, SAMPLE_JOINT_POSITION.start, truth, TRUE_JOINT_ANGLES.start, n)
     else:
         reading = np.empty(13 + n)
         read_sensor_into(constants, memory[2 * size : middle], noise, truth, reading)
@@ -195,8 +195,7 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 
 
 @njit(cache=True)
-def _torque_after_into(held, after, torque):
-    """Write the motor torque (n,) at the time now + `after` [s]."""
+def _torque_at_offset_into(held, after, torque):
     copy_into(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -210,17 +209,17 @@ def take_due_samples(
     """Take the samples that are due in the integration steps since the last call.
 
     Args:
-        physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
-            acceleration by gravity; `JointTable` of other moving bodies, wrenches from Drake).
-        sensor: (chain's constants, estimator's constants, start of its memory, start of the tail,
-            ideal).
+        physics: (arm's table, phi of the tool, contact pairs, sheet spring (4,): mass, stiffness,
+            damping, gravity; `JointTable` of other moving bodies, wrenches from Drake).
+        sensor: (constants of sensor chain and of motion estimator, start of the estimator's memory
+            and of `tail`, ideal).
         time: present time [s], the end of a step.
         state: (2 n,) present state [q; v] of the arm.
         around: present [deflection and rate of the sheet, plant's state if other bodies move].
         held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
         applied_W: (6,) additional wrench on the tool.
-        memory: [last two samples (16 + n each) | chain's | estimator's | tail: samples taken,
-            length of the queue, time and x of each step's end in it].
+        memory: [last two samples (16 + n each) | sensor chain | motion estimator | `tail`:
+            number of samples, number of queued steps, time and state of each queued step's end].
         touching_W: (6,) contact wrench on the tool about the world's origin, in W; or (0,) to
             calculate it with `physics`.
         result: written: [last sample before now (16 + n) | its time [s] | memory].
@@ -240,7 +239,7 @@ def take_due_samples(
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     assemble_plant_state(state, around, now)
     copy_into(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
-    _torque_after_into(held, 0.0, tau)
+    _torque_at_offset_into(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
         environment_wrench(
@@ -258,19 +257,19 @@ def take_due_samples(
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
         if (count + _TIME_TOLERANCE) * period >= until:
             continue
-        _torque_after_into(held, start[0] - time, tau)
+        _torque_at_offset_into(held, start[0] - time, tau)
         plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
         if k < queued - 1:
-            _torque_after_into(held, until - time, tau)
+            _torque_at_offset_into(held, until - time, tau)
             plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
         while (count + _TIME_TOLERANCE) * period < until:
             u = (count * period - start[0]) / h
-            _interpolate(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
+            _interpolate_state(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
                 at_start, at_end = start[width - extra :], end[2 * half :]
                 interpolate_joint_state(joints, h, u, at_start, at_end, between[2 * half :])
-            _torque_after_into(held, count * period - time, tau)
+            _torque_at_offset_into(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
             _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
@@ -383,9 +382,9 @@ class WristSensor(LeafSystem):
             "step", len(self._result), weak_callback(self._calc_step), tickets
         )
         if self._beyond_contact_law:
-            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+            self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update_memory)
         else:
-            self.DeclarePerStepDiscreteUpdateEvent(self._update)
+            self.DeclarePerStepDiscreteUpdateEvent(self._update_memory)
         self.DeclarePeriodicPublishEvent(_CHECK_PERIOD_S, 0.0, self._check_acceleration)
 
     @property
@@ -425,7 +424,7 @@ class WristSensor(LeafSystem):
     def take_samples(self, context: Context) -> None:
         seen = self._arm_state_and_surroundings(context)
         self._take_samples(
-            context, seen, self._contact_level(*seen), False, _NO_GIVEN_WRENCH, self._result
+            context, seen, self._contact_proximity(*seen), False, _NO_GIVEN_WRENCH, self._result
         )
         context.SetDiscreteState(self._result[self._memory_slice])
 
@@ -437,17 +436,17 @@ class WristSensor(LeafSystem):
         append_step_to_queue(tail, time, *self._arm_state_and_surroundings(context))
 
     def _arm_state_and_surroundings(self, context: Context) -> tuple[Array, Array]:
-        return self._state.Eval(context), self._surroundings(context)
+        return self._state.Eval(context), self._evaluate_surroundings(context)
 
-    def _surroundings(self, context: Context) -> Array:
+    def _evaluate_surroundings(self, context: Context) -> Array:
         if self._plant is not None:
             self._around[2:] = self._plant.Eval(context)
         return self._around if self._sheet is None else self._sheet.Eval(context)
 
-    def _applied_W(self, context: Context) -> Array:
+    def _evaluate_applied_wrench(self, context: Context) -> Array:
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
-    def _contact_level(self, state: Array, around: Array) -> int:
+    def _contact_proximity(self, state: Array, around: Array) -> int:
         if self._contacts is None:
             return PROXIMITY_FAR
         if self._beyond_contact_law:
@@ -456,12 +455,12 @@ class WristSensor(LeafSystem):
         q = state[: self._n]
         return tool_proximity(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
-    def _plant_contact_W(self, context: Context) -> Array:
+    def _plant_contact_about_world(self, context: Context) -> Array:
         assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
-    def _plant_contact_So_W(self, context: Context) -> Array:
-        wrench_W = self._plant_contact_W(context).copy()
+    def _plant_contact_about_So(self, context: Context) -> Array:
+        wrench_W = self._plant_contact_about_world(context).copy()
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
@@ -478,18 +477,18 @@ class WristSensor(LeafSystem):
                 self._torque.Eval(context),
                 self._no_rate if self._rate is None else self._rate.Eval(context),
             ),
-            self._applied_W(context),
+            self._evaluate_applied_wrench(context),
             self._no_noise if self._noise is None else self._noise.Eval(context),
             context.get_discrete_state_vector().value(),
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
         seen = self._arm_state_and_surroundings(context)
-        near = self._contact_level(*seen)
+        near = self._contact_proximity(*seen)
         if near == PROXIMITY_FAR:
             touching_W = self._zero_wrench
         elif near == PROXIMITY_NEAR_MONITORED or self._uses_plant_contact:
-            touching_W = self._plant_contact_W(context)
+            touching_W = self._plant_contact_about_world(context)
         else:
             touching_W = _NO_GIVEN_WRENCH
         self._take_samples(context, seen, near, True, touching_W, output.get_mutable_value())
@@ -522,10 +521,10 @@ class WristSensor(LeafSystem):
             asked = told[0, 2:]
             told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update_memory(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._max_queued_steps > 1 and not self._are_samples_due(context.get_time()):
             seen = self._arm_state_and_surroundings(context)
-            if not self._watched.size or self._contact_level(*seen) != PROXIMITY_NEAR_MONITORED:
+            if not self._watched.size or self._contact_proximity(*seen) != PROXIMITY_NEAR_MONITORED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
                 if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
                     return
@@ -545,13 +544,13 @@ class WristSensor(LeafSystem):
         assemble_plant_state(state, around, x)
         if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
-        torque, applied = self._torque.Eval(context), self._applied_W(context)
+        torque, applied = self._torque.Eval(context), self._evaluate_applied_wrench(context)
         physics = self._physics
         if (
             self._beyond_contact_law
-            or self._contact_level(state, around) == PROXIMITY_NEAR_MONITORED
+            or self._contact_proximity(state, around) == PROXIMITY_NEAR_MONITORED
         ):
-            applied = applied + self._plant_contact_So_W(context)
+            applied = applied + self._plant_contact_about_So(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
@@ -559,7 +558,8 @@ class WristSensor(LeafSystem):
             1.0 + np.abs(vdot).max()
         ):
             raise DrakeTeleopError(
-                f"at {context.get_time():g} s the slave is moved by a force that is not connected",
+                f"at {context.get_time():g} s a force moves the slave, but the wrist sensor does "
+                "not receive it",
                 where="wrist_sensor.applied_wrench_W",
                 remedy="connect every wrench on the tool to this port",
             )
